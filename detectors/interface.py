@@ -1,0 +1,86 @@
+"""What every detector is: a cloud goes in, scored evidence comes out; the threshold belongs to the caller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from harness.vocabulary.capture import Cloud
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a detector knows about each pixel of a cloud before any threshold is applied.
+
+    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion
+    (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
+    surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score means.
+    """
+
+    score: np.ndarray
+    residual_m: np.ndarray
+    surface_z_m: np.ndarray
+    scale_m: float
+    notes: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One cluster of damaged pixels. ``score``: the highest threshold at which it would still be found."""
+
+    score: float
+    pixels: np.ndarray
+    """(n,) flat indices into the cloud's (h, w) grid, ascending."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Size and place of one detection, camera frame, metres; NaN where an estimate could not be made (``model_note``).
+
+    ``extent_*``: the thesis' measure from the extreme points. ``model_*``: from the model of a blurred hole, with
+    standard errors. ``depth_m`` is measured along the viewing axis from the fitted surface, positive behind it.
+    """
+
+    u_px: float
+    v_px: float
+    points: int
+    score: float
+    extent_diameter_m: float
+    extent_centre_m: np.ndarray
+    model_diameter_m: float
+    model_diameter_se_m: float
+    model_depth_m: float
+    model_depth_se_m: float
+    model_centre_m: np.ndarray
+    model_centre_se_m: float
+    volume_m3: float
+    model_note: str = ""
+
+
+class Detector(Protocol):
+    """A detector sees a cloud and never the truth. Its settings are a `harness.vocabulary.config.Config`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def version(self) -> int:
+        """Raised by every change that can change a number."""
+        ...
+
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score every pixel. Raises UserError where the cloud cannot be judged (empty crop, too few points)."""
+        ...
+
+    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+        """Clusters at a threshold, strongest first."""
+        ...
+
+    def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
+        """The lowest threshold at which `find` returns nothing."""
+        ...
+
+    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+        """Size and place of one detection."""
+        ...

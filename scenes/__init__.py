@@ -1,0 +1,1 @@
+"""Everything up to a frame: target, light transport, camera models. Knows nothing of detectors."""
