@@ -16,7 +16,7 @@ class Evidence:
 
     ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion
     (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
-    surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score means.
+    surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score is.
     """
 
     score: np.ndarray

@@ -1,1 +1,1 @@
-"""The leaf: words that every room shares (captures, lenses, geometry, units, errors, seeds, files). Imports no other room."""
+"""The leaf: words that every room shares: captures, lenses, geometry, units, errors, seeds, files."""

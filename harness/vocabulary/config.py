@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 class Config(BaseModel):
     """A declaration. Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused.
 
-    Fields carry their unit in their name (``width_mm``). Defaults make every field optional where a default is sensible.
+    Fields carry their unit in their name (``width_mm``).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

@@ -1,4 +1,4 @@
-"""The user's mistakes. A UserError is one clear message and exit code 2; any other exception is a bug and keeps its traceback."""
+"""The user's mistakes: one clear message and exit code 2. Any other exception is a bug and keeps its traceback."""
 
 from __future__ import annotations
 

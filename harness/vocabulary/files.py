@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one, and so that a full disk or a locked folder is a clear message."""
+"""Writing files: a reader never sees half of one; a full disk or a locked folder is a clear message."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Rigid transforms and pixel regions.
 
 Frames. ``camera``: x right, y down, z along the optical axis, origin at the depth lens (OpenCV's convention), metres.
-``board``: x along the row of holes, y up the face, z out of the face towards the camera, origin at the face's centre, metres.
+``board``: x along the row of holes, y up the face, z out of the face to the camera, origin at the centre, metres.
 ``T_a_b`` maps co-ordinates in b to co-ordinates in a.
 """
 

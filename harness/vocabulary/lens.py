@@ -17,7 +17,7 @@ UNDISTORT_STEPS = 200
 class Lens:
     """A central camera: pinhole with OpenCV's rational and Brown-Conrady distortion.
 
-    ``distortion`` is (k1, k2, p1, p2, k3, k4, k5, k6); zeros mean none. Pixel (0, 0) is the *centre* of the first pixel.
+    ``distortion`` is (k1, k2, p1, p2, k3, k4, k5, k6); zeros mean none. Pixel (0, 0) is the centre of the first pixel.
     Not modelled: tilted sensors, thin-prism terms, anything that is not a single centre of projection.
     """
 

@@ -1,0 +1,121 @@
+"""A target as a Mitsuba scene in the camera's frame, and the questions that light transport asks of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scenes.sensor.camera import AmcwCamera
+from scenes.target.mesh import Part
+
+
+def facing(interaction: Any) -> Any:
+    """The geometric normal on the side from which the ray came."""
+    import drjit as dr
+
+    return dr.mulsign(interaction.n, interaction.wi.z)
+
+
+@dataclass(frozen=True)
+class LitScene:
+    """A Mitsuba scene with the emitter described beside it: a point with uniform intensity in a soft-edged cone.
+
+    ``names`` are the surfaces in order; `surface_index` maps a hit to them. Mitsuba supplies geometry, textures and
+    visibility; the emitter stays outside so that its phase and its connection to each vertex are ours.
+    """
+
+    mi: Any
+    scene: Any
+    names: tuple[str, ...]
+    emitter_m: np.ndarray
+    cos_full: float
+    cos_cutoff: float
+    _identity: Any
+
+    def surface_index(self, interaction: Any) -> Any:
+        """Index into ``names`` of each hit; meaningless where the ray met nothing."""
+        import drjit as dr
+
+        return dr.gather(self.mi.UInt32, self._identity, dr.reinterpret_array(self.mi.UInt32, interaction.shape))
+
+    def arriving(self, interaction: Any, active: Any) -> tuple[Any, Any]:
+        """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
+
+        irradiance = cone(direction) cos(incidence) / d^2, and 0 behind an occluder.
+        """
+        import drjit as dr
+
+        mi = self.mi
+        towards = mi.Point3f(*self.emitter_m.tolist()) - interaction.p
+        squared = dr.squared_norm(towards)
+        distance = dr.sqrt(squared)
+        towards /= distance
+        cosine = dr.dot(facing(interaction), towards)
+        on_axis = -towards.z
+        cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
+        lit = active & (cosine > 0) & (cone > 0)
+        ray = interaction.spawn_ray_to(mi.Point3f(*self.emitter_m.tolist()))
+        lit &= ~self.scene.ray_test(ray, lit)
+        return dr.select(lit, cone * cosine / squared, 0), distance
+
+
+def lit_scene(mi: Any, parts: Sequence[Part], camera: AmcwCamera) -> LitScene:
+    """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo."""
+    import drjit as dr
+
+    description: dict[str, Any] = {"type": "scene"}
+    names = tuple(part.name for part in parts)
+    for part in parts:
+        description[part.name] = _mesh(mi, part)
+    scene = mi.load_dict(description)
+    shapes = scene.shapes()
+    registered = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+    identity = np.zeros(int(registered.max()) + 1, np.uint32)
+    for shape, number in zip(shapes, registered, strict=True):
+        identity[number] = names.index(shape.id())
+    emitter = camera.emitter
+    return LitScene(
+        mi=mi,
+        scene=scene,
+        names=names,
+        emitter_m=camera.emitter_position_m,
+        cos_full=float(np.cos(np.deg2rad(emitter.full_half_angle_deg.value))),
+        cos_cutoff=float(np.cos(np.deg2rad(emitter.cutoff_half_angle_deg.value))),
+        _identity=mi.UInt32(identity),
+    )
+
+
+def _mesh(mi: Any, part: Part) -> Any:
+    """One part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
+    material = mi.load_dict(
+        {"type": "twosided", "material": {"type": "diffuse", "reflectance": _reflectance(mi, part)}}
+    )
+    properties = mi.Properties()
+    properties["material"] = material
+    vertices = np.asarray(part.mesh.vertices, np.float32)
+    faces = np.asarray(part.mesh.faces, np.uint32)
+    mesh = mi.Mesh(
+        part.name,
+        vertex_count=len(vertices),
+        face_count=len(faces),
+        has_vertex_texcoords=part.uv is not None,
+        props=properties,
+    )
+    mesh.set_id(part.name)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = vertices.ravel()
+    parameters["faces"] = faces.ravel()
+    if part.uv is not None:
+        parameters["vertex_texcoords"] = np.asarray(part.uv, np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+def _reflectance(mi: Any, part: Part) -> dict[str, Any]:
+    if part.texture_850 is None:
+        return {"type": "uniform", "value": float(part.albedo_850)}
+    bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}

@@ -1,0 +1,271 @@
+"""The continuous-wave imager against closed forms and brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness.vocabulary.capture import Reason
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Region
+from harness.vocabulary.seeds import random_stream
+from scenes.render.closed_form import plane_view
+from scenes.sensor import kernels
+from scenes.sensor.amcw import AmcwImager
+from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_signal
+from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, load_camera, read_camera
+from scenes.sensor.source import SimulatedUnit
+from scenes.sensor.unwrap import unwrap_table
+
+f4 = np.float32
+CAMERA = load_camera("azure_kinect_nfov")
+NEAR_AXIS = Region(300, 360, 280, 360)
+QUIET = CameraConfig(noise=False, fixed_pattern_scale=0.0)
+CLEAN = CameraConfig(fixed_pattern_scale=0.0)
+
+
+def unit_at(distance_m: float, albedo: float = 0.6, config: CameraConfig = CLEAN, region: Region = NEAR_AXIS):
+    return SimulatedUnit(CAMERA, config, plane_view(CAMERA, region, distance_m, albedo, 0.05, 0.02))
+
+
+def stack(unit: SimulatedUnit, frames: int, seed: int = 1) -> np.ndarray:
+    return np.stack([f.z_m for f in unit.capture(frames, seed).frames()]).astype(float)
+
+
+def test_noise_free_range_is_exact_up_to_rounding():
+    unit = unit_at(0.7, config=QUIET)
+    truth = (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
+    z = stack(unit, 1)[0]
+    assert np.isfinite(z).all()
+    # half a millimetre of rounding, and what a 5x5 window makes of the plane's perspective curvature
+    assert np.abs(z - truth).max() < 0.5e-3 + 0.05e-3
+
+
+def test_output_is_whole_millimetres():
+    z = stack(unit_at(0.9), 1)
+    assert np.abs(z * 1000 - np.round(z * 1000)).max() < 1e-3
+
+
+def test_gain_meets_the_calibration_point():
+    electrons = calibrated_signal_electrons(CAMERA, frames=100, seed=5)
+    assert CAMERA.photons.signal_electrons.value == pytest.approx(electrons, rel=0.03)
+    assert temporal_sigma_m(CAMERA, 1.5, 0.8, 100, seed=6) == pytest.approx(0.89e-3, rel=0.02)
+
+
+def test_phase_noise_follows_the_closed_form():
+    """sigma_phi = sqrt(2/N) sqrt(Ns + 2 s^2) / (C Ns), before the filter, for each frequency."""
+    view = plane_view(CAMERA, NEAR_AXIS, 1.0, 0.6)
+    imager = AmcwImager(CAMERA, CLEAN, NEAR_AXIS, view.slopes)
+    exposure = imager.expose(view)
+    phases = []
+    rng = random_stream(3)
+    for _ in range(60):
+        unit, _amplitude = exposed(imager, exposure, rng)
+        phases.append(np.angle((unit[0] + 1j * unit[1]) * np.exp(-1j * np.angle(view.phasor.reshape(3, -1)))))
+    measured = np.std(phases, axis=0, ddof=1)
+    electrons = CAMERA.photons.signal_electrons.value * view.intensity.ravel()
+    for f, contrast in enumerate(CAMERA.modulation.contrast.value):
+        expected = np.sqrt(2 / 3) * np.sqrt(electrons + 2 * 3.2**2) / (contrast * electrons)
+        assert np.sqrt((measured[f] ** 2).mean() / (expected**2).mean()) == pytest.approx(1, abs=0.015)
+
+
+def exposed(imager: AmcwImager, exposure, rng):
+    n = exposure.sigma.size
+    unit, amplitude = np.empty((2, 3, n), f4), np.empty((3, n), f4)
+    normals = rng.standard_normal((3, 3, n), dtype=f4)
+    kernels.expose(
+        exposure.means,
+        exposure.sigma,
+        normals,
+        f4(256),
+        f4(32704),
+        imager._cosines,
+        imager._sines,
+        unit,
+        amplitude,
+        np.empty(n, np.uint8),
+    )
+    return unit, amplitude
+
+
+@pytest.mark.parametrize("electrons", [40.0, 400.0])
+def test_normal_samples_match_true_poisson_wells(electrons):
+    """The real part of the demodulated phasor: two Poisson wells and two read noises against the kernel's normals.
+
+    Two-sample Kolmogorov-Smirnov at alpha 0.001 on 40,000 draws each, and variances within 3 %.
+    """
+    rng = np.random.default_rng(11)
+    n, contrast, phase, read = 40_000, 0.9, 0.7, 3.2
+    steps = 2 * np.pi * np.arange(3) / 3
+    modulated = contrast * np.cos(phase - steps)[:, None]
+    wells = rng.poisson(electrons * (1 + modulated) / 2, (3, n)) - rng.poisson(electrons * (1 - modulated) / 2, (3, n))
+    wells = wells + rng.normal(0, read * np.sqrt(2), (3, n))
+    true_re = (2 / 3 * np.cos(steps) @ wells).ravel()
+    means = np.broadcast_to((electrons * modulated).astype(f4), (3, n))[None]
+    unit, amplitude = np.empty((2, 1, n), f4), np.empty((1, n), f4)
+    kernels.expose(
+        np.ascontiguousarray(means),
+        np.full(n, np.sqrt(electrons + 2 * read**2), f4),
+        rng.standard_normal((1, 3, n)).astype(f4),
+        f4(256),
+        f4(32704),
+        np.cos(steps).astype(f4),
+        np.sin(steps).astype(f4),
+        unit,
+        amplitude,
+        np.empty(n, np.uint8),
+    )
+    ours = unit[0, 0] * amplitude[0]
+    assert ours.var() == pytest.approx(true_re.var(), rel=0.03)
+    # the kernel rounds samples to whole units; a uniform dither of that size makes both continuous
+    assert stats.ks_2samp(ours + rng.uniform(-0.3, 0.3, n), true_re + rng.uniform(-0.3, 0.3, n)).pvalue > 0.001
+
+
+@pytest.mark.parametrize(("size", "step"), [(100, 1), (300, 1), (600, 2), (1500, 4), (20_000, 64)])
+def test_companding_steps_double_with_each_octave(size, step):
+    value = f4(size + 0.37 * step)
+    cosines, sines = np.array([1, 0, 0], f4), np.zeros(3, f4)
+    unit, amplitude, saturated = np.empty((2, 1, 1), f4), np.empty((1, 1), f4), np.empty(1, np.uint8)
+    means = np.array([[[value], [0], [0]]], f4)
+    args = (np.zeros(1, f4), np.zeros((1, 3, 1), f4), f4(256), f4(32704), cosines, sines, unit, amplitude, saturated)
+    kernels.expose(means, *args)
+    assert amplitude[0, 0] * 1.5 == pytest.approx(step * np.floor(value / step + 0.5), abs=1e-2)
+    assert saturated[0] == 0
+
+
+@pytest.mark.parametrize("bright", [True, False])
+def test_bilateral_filter_equals_brute_force(bright):
+    rng = np.random.default_rng(2)
+    h, w = 9, 14
+    phase = np.where(np.arange(w) < 7, 0.3, 1.4) + 0.2 * rng.standard_normal((h, w))
+    unit = np.stack([np.cos(phase), np.sin(phase)]).astype(f4)
+    amplitude = rng.uniform(50, 90, (h, w)).astype(f4) if bright else rng.uniform(1, 20, (h, w)).astype(f4)
+    filtered, edge = np.empty((3, h, w), f4), np.empty((h, w), f4)
+    kernels.joint_bilateral(unit, amplitude, 2, f4(3.6067), f4(24), filtered, edge)
+    phasor = unit[0] + 1j * unit[1]
+    for y in range(h):
+        for x in range(w):
+            near = (slice(max(y - 2, 0), y + 3), slice(max(x - 2, 0), x + 3))
+            gap = 1 - np.real(phasor[near] * np.conj(phasor[y, x]))
+            weight = np.exp(-3.6067 * gap) if bright else np.ones_like(gap)
+            expected = (weight * phasor[near]).sum()
+            assert filtered[0, y, x] + 1j * filtered[1, y, x] == pytest.approx(expected, rel=1e-4, abs=1e-4)
+            assert filtered[2, y, x] == pytest.approx((weight * amplitude[near]).sum() / weight.sum(), rel=1e-4)
+            assert edge[y, x] == pytest.approx(gap.sum() / 2, rel=1e-3, abs=1e-4)
+
+
+def test_noise_is_as_smooth_as_a_box_of_five_makes_it():
+    """Correlation .80 .60 .40 .20 0 where phase noise is small; without the rounding, which is white."""
+    step = CAMERA.engine.output_step_mm.model_copy(update={"value": 1e-3})
+    fine = CAMERA.model_copy(update={"engine": CAMERA.engine.model_copy(update={"output_step_mm": step})})
+    region = Region(250, 400, 200, 400)
+    z = stack(SimulatedUnit(fine, CLEAN, plane_view(fine, region, 0.8, 0.8, 0.05, 0.02)), 60)
+    d = z - z.mean(axis=0)
+    variance = (d**2).mean()
+    for lag, expected in enumerate([0.8, 0.6, 0.4, 0.2, 0.0], start=1):
+        assert (d[..., lag:] * d[..., :-lag]).mean() / variance == pytest.approx(expected, abs=0.02)
+        assert (d[:, lag:] * d[:, :-lag]).mean() / variance == pytest.approx(expected, abs=0.02)
+
+
+def test_unwrapping_recovers_every_distance():
+    table = unwrap_table(CAMERA.frequencies_hz)
+    assert sorted(map(tuple, np.abs(table.combination))) == [(3, 2, 4), (3, 4, 3)]
+    assert table.metres_per_turn * 1000 == pytest.approx([381.18, 363.85, 103.96], abs=0.01)
+    half_path = np.linspace(0.06, 13.9, 20_000)
+    turn = (half_path[:, None] / table.unambiguous_m * table.lattice) % 1
+    parts = (table.combination, table.table, table.offset, table.metres_per_turn, table.lattice)
+    found = [kernels._half_path(f4(a), f4(b), f4(c), parts) for a, b, c in turn]
+    assert np.abs(np.array([f[0] for f in found]) - half_path).max() < 5e-6
+    assert max(f[1] for f in found) < 1e-10
+
+
+def test_unrelated_frequencies_are_refused():
+    with pytest.raises(UserError, match="share no base frequency"):
+        unwrap_table((100e6, 100e6 * np.sqrt(2), 57.3e6))
+
+
+def test_emitter_beside_the_lens_is_corrected_for():
+    region = Region(240, 280, 110, 150)
+    unit = SimulatedUnit(CAMERA, QUIET, plane_view(CAMERA, region, 0.3, 0.3))
+    z = stack(unit, 1)[0]
+    # uncorrected, half the path of a point seen 30 degrees off the axis at 0.35 m would be off by some 4 mm
+    assert np.abs(z - 0.3).max() <= 0.5e-3 + 1e-6
+
+
+def test_fixed_pattern_has_the_size_and_length_of_its_facts():
+    config = CameraConfig(unit_seed=4)
+    lens = CAMERA.nominal_lens
+    imager = AmcwImager(CAMERA, config, lens.whole, lens.region_slopes(lens.whole))
+    pattern = imager.fixed_pattern_m
+    smooth, pixel = CAMERA.fixed_pattern.smooth_mm.value, CAMERA.fixed_pattern.pixel_mm.value
+    assert pattern.std() * 1e3 == pytest.approx(np.hypot(smooth, pixel), rel=0.05)
+    for lag in (3, 6, 12):
+        expected = smooth**2 * np.exp(-(lag**2) / (2 * 6.3**2))
+        assert (pattern[:, lag:] * pattern[:, :-lag]).mean() * 1e6 == pytest.approx(expected, abs=0.02)
+
+
+def test_fixed_pattern_belongs_to_the_unit_not_to_the_region():
+    small, large = Region(300, 340, 300, 360), Region(290, 350, 280, 380)
+    views = [plane_view(CAMERA, region, 0.8, 0.6, 0.05, 0.02) for region in (small, large)]
+    a, b = (SimulatedUnit(CAMERA, CameraConfig(noise=False), view) for view in views)
+    assert np.array_equal(stack(a, 1)[0], stack(b, 1)[0][a.region.within(b.region)])
+
+
+def test_shorter_captures_are_prefixes_and_streams_are_repeatable():
+    unit = unit_at(0.8)
+    long, short = stack(unit, 4), stack(unit, 2)
+    assert np.array_equal(long[:2], short)
+    assert not np.array_equal(long[0], long[1])
+    assert not np.array_equal(stack(unit, 1, seed=2)[0], long[0])
+
+
+def reasons_of(unit: SimulatedUnit) -> set[Reason]:
+    frame = next(iter(unit.capture(1, 1).frames()))
+    assert np.array_equal(np.isnan(frame.z_m), frame.reason != Reason.VALID)
+    return {Reason(code) for code in np.unique(frame.reason)}
+
+
+def test_each_gate_names_its_reason():
+    assert reasons_of(unit_at(0.8)) == {Reason.VALID}
+    assert reasons_of(unit_at(0.8, albedo=0.0, config=QUIET)) == {Reason.LOW_AMPLITUDE}
+    # bright enough for the converter's gates, too dark for its distance: albedo 0.005 at 0.3 m
+    assert Reason.LOW_REFLECTIVITY in reasons_of(unit_at(0.3, albedo=0.005, config=QUIET))
+    assert reasons_of(unit_at(0.1, albedo=1.0)) == {Reason.SATURATED}
+    assert Reason.OUTSIDE_MASK in reasons_of(unit_at(0.8, region=Region(0, 40, 0, 60)))
+
+
+def test_mixed_phasors_are_told_by_residual_ratio_or_edge():
+    view = plane_view(CAMERA, NEAR_AXIS, 0.7, 0.6)
+    far = plane_view(CAMERA, NEAR_AXIS, 1.3, 0.6)
+    columns = np.arange(NEAR_AXIS.shape[1])
+    share = np.clip((columns - 39.5) / 1.0, 0, 1)
+    mixed = view.phasor * (1 - share) + far.phasor * share
+    object.__setattr__(view, "phasor", mixed)
+    unit = SimulatedUnit(CAMERA, QUIET, view)
+    frame = next(iter(unit.capture(1, 1).frames()))
+    found = {Reason(code) for code in np.unique(frame.reason)}
+    assert Reason.EDGE in found
+    open_gate = SimulatedUnit(CAMERA, QUIET.model_copy(update={"edge_gate": False}), view)
+    without = next(iter(open_gate.capture(1, 1).frames()))
+    assert (without.reason == Reason.VALID).sum() > (frame.reason == Reason.VALID).sum()
+    assert Reason.EDGE not in {Reason(code) for code in np.unique(without.reason)}
+
+
+def test_more_light_less_noise():
+    """Shot-limited: four times the light halves the deviation (rounding and read noise allow 10 %)."""
+    dim, bright = (temporal_sigma_m(with_signal(CAMERA, e), 2.5, 0.5, 60, 1) for e in (1000, 4000))
+    assert dim / bright == pytest.approx(2, rel=0.1)
+
+
+def test_camera_file_errors_name_file_and_key(tmp_path):
+    text = read_text = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace("fx_px: {value: 504.647", "fx_px: {value: 0.0"))
+    with pytest.raises(UserError, match=r"mine\.yaml(.|\n)*lens\.fx_px must be above 0"):
+        read_camera(path)
+    path.write_text(read_text.replace("  window_px:", "  widow_px:"))
+    with pytest.raises(UserError, match=r"engine\.widow_px(.|\n)*engine\.window_px|engine\.window_px(.|\n)*widow_px"):
+        read_camera(path)
+    with pytest.raises(UserError, match="did you mean 'azure_kinect_nfov'"):
+        load_camera("azure_kinect_nfv")
