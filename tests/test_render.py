@@ -12,8 +12,9 @@ from scenes.render.cache import cached_view, read_view, render_key
 from scenes.render.direct import cast, direct_light
 from scenes.render.indirect import gather_at_points, gather_in_pixels
 from scenes.render.scene import lit_scene
+from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
-from scenes.render.view import RenderConfig, render_view, target_region
+from scenes.render.view import render_view, target_region
 from scenes.sensor.camera import AmcwCamera, load_camera
 from scenes.target.declaration import TargetConfig, ThesisTargetConfig
 from scenes.target.mesh import Part, build_target

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Config(BaseModel):
@@ -16,15 +15,27 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_are_tuples(cls, data: Any) -> Any:
+        # Strict mode takes no list for a tuple, and YAML and JSON have nothing but lists.
+        if not isinstance(data, dict):
+            return data
+        return {key: _as_tuple(value) for key, value in data.items()}
+
     @classmethod
     def from_data(cls, data: Any) -> Self:
         """Validate plain data (dicts, lists, numbers, text: what YAML and JSON hold).
 
-        Goes through JSON because pydantic's strict mode takes a list for a tuple there and nowhere else.
         Raises pydantic.ValidationError, whose ``loc`` paths match the data's.
         """
-        return cls.model_validate_json(json.dumps(data))
+        return cls.model_validate(data)
 
     def to_data(self) -> dict[str, Any]:
         """Plain data with every default filled in; ``from_data`` inverts it."""
         return self.model_dump(mode="json")
+
+
+def _as_tuple(value: Any) -> Any:
+    """Lists within lists become tuples within tuples; what is inside a mapping is the business of its own model."""
+    return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value

@@ -14,7 +14,8 @@ import numpy as np
 from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import digest
-from scenes.render.view import RENDER_VERSION, RenderConfig, render_view
+from scenes.render.settings import RenderConfig
+from scenes.render.view import RENDER_VERSION, render_view
 from scenes.sensor.camera import AmcwCamera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import build_target

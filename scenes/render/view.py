@@ -6,9 +6,7 @@ import time
 
 import cv2
 import numpy as np
-from pydantic import Field
 
-from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, invert, rotate_vectors, transform_points
 from harness.vocabulary.lens import Lens
@@ -16,6 +14,7 @@ from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
 from scenes.render.direct import DirectLight, direct_light, surface_rgb
 from scenes.render.indirect import face_interpolator, gather_at_points, gather_in_pixels
 from scenes.render.scene import LitScene, lit_scene
+from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
 from scenes.sensor.camera import AmcwCamera
 from scenes.target.mesh import Target
@@ -26,17 +25,6 @@ RENDER_VERSION = 1
 
 RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
-
-
-class RenderConfig(Config):
-    """How much work goes into the indirect light. ``bounces`` 0 leaves direct light only."""
-
-    bounces: int = Field(5, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 5 % after 5")
-    face_spacing_mm: float = Field(30.0, gt=0, description="grid of nodes on the face")
-    face_samples: int = Field(8192, ge=8, description="paths for each node on the face")
-    hole_samples: int = Field(512, ge=8, description="paths for each pixel inside the board's outline but off its face")
-    rest_samples: int = Field(32, ge=8, description="paths for each pixel around the board")
-    seed: int = Field(1, ge=0)
 
 
 def target_region(target: Target, camera: AmcwCamera) -> Region:

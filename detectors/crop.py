@@ -1,0 +1,276 @@
+"""Which pixels belong to the target: a box, a polygon in the image, or the largest smooth surface."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field, model_validator
+
+from detectors.segment import euclidean_clusters
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.units import MM
+
+MAX_SURFACE_TILT = 6.0
+"""tan(80.5 degrees): a steeper step between neighbouring pixels is an edge, not a surface."""
+STEP_SIGMAS = 6.0
+"""Of the noise of a difference between neighbours: below this a step may be noise."""
+
+
+class _Crop(Config):
+    """``inset_px``: take so many pixels off the target's outer rim, where pixels mix target and background. Holes
+    inside the target do not grow; the edge of the image is no rim."""
+
+    inset_px: int = Field(default=0, ge=0, le=200)
+
+
+class NoCrop(_Crop):
+    """Every valid pixel."""
+
+    kind: Literal["none"] = "none"
+
+
+class BoxCrop(_Crop):
+    """Points inside an open box in the camera's frame; the defaults are the thesis'.
+
+    ``range_max_m`` limits sqrt(x^2 + z^2). ``keep_fraction`` then multiplies the remaining points' extreme x and y, as
+    the thesis' fit script does with 0.75: it shortens a target that surrounds the optical axis on all four sides.
+    """
+
+    kind: Literal["box"] = "box"
+    x_mm: tuple[float, float] = (-500.0, 400.0)
+    y_mm: tuple[float, float] = (-300.0, 190.0)
+    z_mm: tuple[float, float] = (0.0, 1100.0)
+    range_max_m: float | None = Field(default=1.0, gt=0)
+    keep_fraction: float = Field(default=1.0, gt=0, le=1)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> BoxCrop:
+        for name in ("x_mm", "y_mm", "z_mm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name}: the lower limit {low:g} must be below the upper limit {high:g}")
+        return self
+
+
+class PolygonCrop(_Crop):
+    """Pixels whose centre lies inside a polygon of sensor pixel positions [u, v] (even-odd rule)."""
+
+    kind: Literal["polygon"] = "polygon"
+    vertices_px: tuple[tuple[float, float], ...] = Field(min_length=3)
+
+
+class AutoCrop(_Crop):
+    """The largest smooth surface: neighbours are joined where the step in z is no more than a tilted surface and noise
+    explain and the surface does not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, so
+    that damage and whatever lies inside its outline stay. Without a pixel grid: the largest cluster at
+    ``link_distance_mm`` (default: three times the usual distance between neighbours), which does not stop at creases.
+    """
+
+    kind: Literal["auto"] = "auto"
+    crease_deg: float = Field(default=35.0, gt=0, le=90)
+    smooth_px: int = Field(default=9, ge=3, le=99)
+    link_distance_mm: float | None = Field(default=None, gt=0)
+
+
+CropConfig = Annotated[NoCrop | BoxCrop | PolygonCrop | AutoCrop, Field(discriminator="kind")]
+"""A crop as the user writes it: ``kind: none | box | polygon | auto`` and that kind's fields."""
+
+
+def crop(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> np.ndarray:
+    """(h, w) bool: the valid pixels that belong to the target.
+
+    Raises UserError where nothing is left, with the cloud's actual extent, and for a polygon on a cloud without a grid.
+    """
+    if not cloud.valid.any():
+        raise UserError("the cloud has no valid point to crop", fix="check the capture")
+    if isinstance(config, BoxCrop):
+        mask = _box(cloud, config)
+    elif isinstance(config, PolygonCrop):
+        mask = _polygon(cloud, config)
+    elif isinstance(config, AutoCrop):
+        mask = _largest_surface(cloud, config)
+    else:
+        mask = cloud.valid
+    if config.inset_px and cloud.organised:
+        mask = _inset(mask, config.inset_px)
+    if not mask.any():
+        raise _empty(cloud, config)
+    return mask
+
+
+def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
+    x, y, z = np.moveaxis(cloud.points_m, -1, 0)
+    inside = cloud.valid
+    with np.errstate(invalid="ignore"):
+        for values, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm)):
+            inside = inside & (values > low * MM) & (values < high * MM)
+        if config.range_max_m is not None:
+            inside &= np.hypot(x, z) < config.range_max_m
+        if config.keep_fraction < 1.0 and inside.any():
+            part = config.keep_fraction
+            limits = [(v, part * v[inside].min(), part * v[inside].max()) for v in (x, y)]
+            for values, low, high in limits:
+                inside = inside & (values > low) & (values < high)
+    return inside
+
+
+def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
+    if not cloud.organised:
+        raise UserError(
+            "a polygon in pixels cannot crop a cloud without a pixel grid", legal="crop.kind none, box or auto"
+        )
+    v, u = np.mgrid[cloud.region.row0 : cloud.region.row1, cloud.region.col0 : cloud.region.col1].astype(float)
+    inside = np.zeros(u.shape, dtype=bool)
+    corners = np.array(config.vertices_px)
+    for (u0, v0), (u1, v1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if v0 == v1:
+            continue
+        crossing = u0 + (v - v0) / (v1 - v0) * (u1 - u0)
+        inside ^= ((v0 <= v) != (v1 <= v)) & (u < crossing)
+    return inside & cloud.valid
+
+
+def _inset(mask: np.ndarray, pixels: int) -> np.ndarray:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    # OpenCV's default border never erodes: the edge of the image is not the target's rim
+    return mask & cv2.erode(_holes_filled(mask).astype(np.uint8), kernel).astype(bool)
+
+
+def _holes_filled(mask: np.ndarray) -> np.ndarray:
+    """The mask with everything that it encloses."""
+    outside = np.pad(~mask, 1, constant_values=True).astype(np.uint8)
+    _, labels = cv2.connectedComponents(outside, connectivity=4)
+    filled: np.ndarray = (labels != labels[0, 0])[1:-1, 1:-1]
+    return filled
+
+
+# ---------------------------------------------------------------- largest smooth surface
+
+
+def _largest_surface(cloud: Cloud, config: AutoCrop) -> np.ndarray:
+    if not cloud.organised:
+        return _largest_cluster(cloud, config)
+    valid = cloud.valid
+    bend = _creases(cloud, config)
+    right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), bend)
+    down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), bend)
+    largest = _largest_component(valid & ~bend, right, down)
+    # smoothing and comparing flag smooth_px - 1 pixels on each side of a crease or rim: given back where no step parts
+    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=config.smooth_px - 1)
+    rim = _largest_component(valid & (grown > 0), *_steps_only(cloud))
+    return _holes_filled(largest | (rim & (grown > 0))) & valid
+
+
+def _steps_only(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    flat = np.zeros(cloud.valid.shape, dtype=bool)
+    right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), flat)
+    down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), flat)
+    return right, down
+
+
+def _joined(cloud: Cloud, here: tuple[slice, slice], there: tuple[slice, slice], crease: np.ndarray) -> np.ndarray:
+    """Whether two neighbours lie on one surface: the step in z is within tilt and noise, and neither is a crease."""
+    step = cloud.points_m[there] - cloud.points_m[here]
+    allowed = MAX_SURFACE_TILT * np.hypot(step[..., 0], step[..., 1]) + STEP_SIGMAS * _step_noise(cloud)
+    with np.errstate(invalid="ignore"):
+        joined: np.ndarray = np.abs(step[..., 2]) <= allowed
+    return joined & ~crease[here] & ~crease[there]
+
+
+def _step_noise(cloud: Cloud) -> float:
+    """Standard deviation of a difference between neighbours, from the quieter quarter of the second differences of z
+    along rows (three quarters of the picture may be rubble); at least a rounding step's."""
+    z = cloud.points_m[..., 2]
+    bends = z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2]
+    bends = bends[np.isfinite(bends)]
+    # the second difference of white noise has sqrt(6) of its sigma, the first sqrt(2)
+    noise = float(np.quantile(np.abs(bends), 0.25)) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
+    return max(noise, cloud.z_step_m * np.sqrt(2.0 / 12.0))
+
+
+def _creases(cloud: Cloud, config: AutoCrop) -> np.ndarray:
+    """(h, w) bool: the smoothed surface's normal turns by more than ``crease_deg`` across ``smooth_px``."""
+    size = config.smooth_px
+    normals = _smooth_normals(cloud, size)
+    crease = np.zeros(cloud.valid.shape, dtype=bool)
+    limit = np.cos(np.deg2rad(config.crease_deg))
+    half = max(size // 2, 1)
+    for axis in (0, 1):
+        if normals.shape[axis] <= 2 * half:
+            continue
+        n = np.moveaxis(normals, axis, 0)
+        cosine = np.einsum("ijk,ijk->ij", n[2 * half :], n[: -2 * half])
+        np.moveaxis(crease, axis, 0)[half:-half] |= cosine < limit
+    return crease
+
+
+def _smooth_normals(cloud: Cloud, size: int) -> np.ndarray:
+    """(h, w, 3) unit normals of points averaged over ``size`` x ``size`` valid neighbours."""
+    valid = cloud.valid.astype(np.float64)
+    weight = cv2.blur(valid, (size, size), borderType=cv2.BORDER_REFLECT)
+    points = np.nan_to_num(cloud.points_m)
+    smooth = cv2.blur(points, (size, size), borderType=cv2.BORDER_REFLECT) / np.maximum(weight, 1e-12)[..., None]
+    du = np.gradient(smooth, axis=1) if smooth.shape[1] > 1 else np.zeros_like(smooth)
+    dv = np.gradient(smooth, axis=0) if smooth.shape[0] > 1 else np.zeros_like(smooth)
+    normals = np.cross(du, dv)
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-15)
+
+
+def _largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """The largest set of nodes joined by links, by labelling a picture in which every link is a pixel of its own."""
+    h, w = nodes.shape
+    picture = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
+    picture[::2, ::2] = nodes
+    picture[::2, 1::2] = right & nodes[:, :-1] & nodes[:, 1:]
+    picture[1::2, ::2] = down & nodes[:-1] & nodes[1:]
+    _, labels = cv2.connectedComponents(picture, connectivity=4)
+    at_nodes = labels[::2, ::2]
+    sizes = np.bincount(at_nodes[nodes], minlength=2)
+    sizes[0] = 0
+    largest: np.ndarray = at_nodes == int(np.argmax(sizes))
+    return largest & nodes
+
+
+def _largest_cluster(cloud: Cloud, config: AutoCrop) -> np.ndarray:
+    from scipy.spatial import cKDTree
+
+    mask = cloud.valid.copy()
+    points = cloud.points_m[mask]
+    if config.link_distance_mm is not None:
+        distance = config.link_distance_mm * MM
+    else:
+        some = points[:: max(1, len(points) // 2000)]
+        to_nearest = cKDTree(points).query(some, k=min(2, len(points)))[0].reshape(len(some), -1)[:, -1]
+        distance = max(3.0 * float(np.quantile(to_nearest, 0.9)), 1e-6)
+    labels = euclidean_clusters(points, distance)
+    mask[mask] = labels == np.argmax(np.bincount(labels))
+    return mask
+
+
+def _empty(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> UserError:
+    points = cloud.points_m[cloud.valid]
+    (x0, y0, z0), (x1, y1, z1) = points.min(axis=0) / MM, points.max(axis=0) / MM
+    extent = f"x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f}, z {z0:.0f} to {z1:.0f} mm"
+    if isinstance(config, BoxCrop):
+        asked = ", ".join(
+            f"{n} {r[0]:g} to {r[1]:g}" for n, r in zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
+        )
+        asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+        unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
+        return UserError(
+            f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}",
+            legal=f"limits that meet the cloud: {extent}",
+            fix="change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto",
+        )
+    where = (
+        f"columns {cloud.region.col0} to {cloud.region.col1 - 1}, rows {cloud.region.row0} to {cloud.region.row1 - 1}"
+    )
+    return UserError(
+        f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points",
+        legal=f"a crop that meets the cloud: {where}; {extent}",
+        fix="change the crop or lower crop.inset_px",
+    )

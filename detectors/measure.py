@@ -1,0 +1,308 @@
+"""Size and place of a detection: the thesis' extents, and beside them the model of a blurred hole.
+
+Depths are measured along the optical axis from the fitted surface, positive behind it; a hole at an angle is deeper
+along this axis than along its own by 1 / cos. Sizes are measured on the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from pydantic import Field, field_validator
+
+from detectors.hole_model import HoleFit, Patch, blurred_disc, fit_hole
+from detectors.interface import Detection, Evidence, Measurement
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.config import Config
+from harness.vocabulary.geometry import Region
+from harness.vocabulary.units import MM
+
+NOWHERE = np.full(3, np.nan)
+OTHER_DAMAGE_SIGMAS = 5.0
+"""Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
+CONTOUR_ZOOM = 4
+"""Sub-pixels of the half-depth contour along each axis."""
+
+
+class HoleModelConfig(Config):
+    """What the model of a blurred hole takes for granted.
+
+    ``blur_px``: side of the square over which the camera averages: 5 for the Azure Kinect's depth engine (5x5
+    bilateral on phasors, OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``linear_depth_mm``: beyond it the
+    filter loses deep neighbours (weight 0.74 at 50 mm for 198 MHz) and the contour at half depth is the better measure.
+    ``largest_invalid``: the part of the disc that may lack a range. ``largest_relative_error``: of the diameter; beyond
+    it diameter and depth cannot be told apart.
+    """
+
+    blur_px: int = Field(default=5, ge=1, le=31)
+    linear_depth_mm: float = Field(default=50.0, gt=0)
+    largest_invalid: float = Field(default=0.1, ge=0, le=1)
+    largest_relative_error: float = Field(default=0.3, gt=0)
+
+    @field_validator("blur_px")
+    @classmethod
+    def _odd(cls, blur_px: int) -> int:
+        if blur_px % 2 == 0:
+            raise ValueError("blur_px must be odd (1, 3, 5 ...): the filter has a centre pixel")
+        return blur_px
+
+
+def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
+    """The thesis' size and centre of a cluster (n, 3): (diameter, centre (3,)), metres.
+
+    Size: mean of the distances in space between the extreme points in x and between those in y; centre: mean of these
+    four points. Of equal extremes the first counts, as in MATLAB.
+    """
+    x, y = points_m[:, 0], points_m[:, 1]
+    west, east, north, south = points_m[[int(x.argmin()), int(x.argmax()), int(y.argmin()), int(y.argmax())]]
+    diameter = 0.5 * (float(np.linalg.norm(east - west)) + float(np.linalg.norm(south - north)))
+    return diameter, (west + east + north + south) / 4.0
+
+
+def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig) -> Measurement:
+    """Both measures of one detection; NaN and a note where one cannot be made."""
+    points = cloud.points_m.reshape(-1, 3)[detection.pixels]
+    diameter, centre = extents(points)
+    blank = Measurement(
+        u_px=np.nan,
+        v_px=np.nan,
+        points=len(points),
+        score=detection.score,
+        extent_diameter_m=diameter,
+        extent_centre_m=centre,
+        model_diameter_m=np.nan,
+        model_diameter_se_m=np.nan,
+        model_depth_m=np.nan,
+        model_depth_se_m=np.nan,
+        model_centre_m=NOWHERE,
+        model_centre_se_m=np.nan,
+        volume_m3=np.nan,
+        model_note="no pixel grid: extents only",
+    )
+    if not cloud.organised:
+        return blank
+    rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+    placed = replace(blank, u_px=float(columns.mean()) + cloud.region.col0, v_px=float(rows.mean()) + cloud.region.row0)
+    around = _Surroundings.of(cloud, evidence, rows, columns, config)
+    if around is None:
+        return replace(placed, model_note="too few valid pixels around for a model")
+    fit, doubt = _modelled(around, config)
+    if fit is None or doubt:
+        return _by_contour(placed, around, doubt)
+    return _by_model(placed, around, fit)
+
+
+# ---------------------------------------------------------------- the neighbourhood
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    """A detection and its neighbourhood. ``own`` (h, w): the detection's pixels, ``invalid`` (h, w): without a range.
+
+    ``origin_m`` is the surface's point at patch pixel (``u0``, ``v0``), ``per_px_m`` (2, 3) its derivatives by u and v.
+    """
+
+    patch: Patch
+    own: np.ndarray
+    invalid: np.ndarray
+    offset_m: float
+    sign: float
+    peak_m: float
+    u0: float
+    v0: float
+    origin_m: np.ndarray
+    per_px_m: np.ndarray
+
+    @classmethod
+    def of(
+        cls, cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
+    ) -> _Surroundings | None:
+        """Twice the blur of margin on each side; None where the surface around cannot be placed."""
+        h, w = cloud.valid.shape
+        tight = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
+        corner = tight.grown(2 * config.blur_px + 2, h, w)
+        cut = corner.within(Region(0, h, 0, w))
+        residual = evidence.residual_m[cut]
+        own = np.zeros(residual.shape, dtype=bool)
+        own[rows - corner.row0, columns - corner.col0] = True
+        finite = np.isfinite(residual)
+        ring = finite & ~_grown(own, config.blur_px // 2 + 1)
+        if ring.sum() < 12:
+            return None
+        offset, noise = _level(residual[ring])
+        plane = _local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own)
+        if plane is None:
+            return None
+        used = finite & ~_other_damage(residual - offset, own, noise, config.blur_px)
+        deviations = residual[own] - offset
+        sign = 1.0 if deviations.sum() >= 0 else -1.0
+        peak = max(float(np.quantile(sign * deviations, 0.9)), 1e-9)
+        metric = plane[1] @ plane[1].T
+        patch = Patch(residual, used, metric, config.blur_px)
+        invalid = ~cloud.valid[cut]
+        v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
+        return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])
+
+    @property
+    def surface_area_m2(self) -> float:
+        """Of one pixel, on the surface."""
+        return float(np.linalg.norm(np.cross(self.per_px_m[0], self.per_px_m[1])))
+
+    @property
+    def facing_area_m2(self) -> float:
+        """Of one pixel, across the optical axis."""
+        (ax, ay, _), (bx, by, _) = self.per_px_m
+        return float(abs(ax * by - ay * bx))
+
+    def place_m(self, u: float, v: float) -> np.ndarray:
+        """The surface's point (3,) at a patch position, camera frame."""
+        place: np.ndarray = self.origin_m + (u - self.u0) * self.per_px_m[0] + (v - self.v0) * self.per_px_m[1]
+        return place
+
+
+def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    side = 2 * pixels + 1
+    grown: np.ndarray = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    return grown
+
+
+def _level(values: np.ndarray) -> tuple[float, float]:
+    """Median and robust standard deviation."""
+    middle = float(np.median(values))
+    return middle, float(np.median(np.abs(values - middle))) / 0.6745
+
+
+def _local_plane(
+    points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression.
+
+    Directions x/z and y/z and the surface's z are each linear in the pixel over a patch; then the product rule.
+    """
+    v, u = np.nonzero(finite)
+    v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
+    design = np.column_stack([np.ones(len(u)), u - u0, v - v0])
+    p = points[finite]
+    targets = np.column_stack([p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], surface_z[finite]])
+    try:
+        beta = np.linalg.solve(design.T @ design, design.T @ targets)
+    except np.linalg.LinAlgError:
+        return None
+    slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
+    per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
+    if not np.linalg.norm(np.cross(per_px[0], per_px[1])) > 1e-12:
+        return None
+    return slopes * z, per_px
+
+
+def _other_damage(deviation: np.ndarray, own: np.ndarray, noise: float, blur_px: int) -> np.ndarray:
+    """Pixels that stand out without touching the detection, with the blur around them."""
+    stands_out = (np.abs(np.nan_to_num(deviation)) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
+    count, labels = cv2.connectedComponents(stands_out.astype(np.uint8), connectivity=8)
+    touching = np.zeros(count, dtype=bool)
+    touching[labels[own]] = True
+    others = stands_out & ~touching[labels]
+    return _grown(others, blur_px // 2) & ~own if others.any() else others
+
+
+# ---------------------------------------------------------------- the model, and what to do without it
+
+
+def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit | None, str]:
+    """The fitted hole, and the reason to doubt it ('' for none)."""
+    inside = around.own | (around.invalid & _grown(around.own, 1))
+    if float((around.invalid & inside).sum()) > config.largest_invalid * float(inside.sum()):
+        return None, "part of the hole has no range"
+    if around.peak_m > config.linear_depth_mm * MM:
+        return None, f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
+    fit = fit_hole(around.patch, *_start(around))
+    h, w = around.own.shape
+    reach = np.pad(_grown(around.own, config.blur_px // 2 + 1), 1)
+    at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
+    if not (fit.converged and reach[at[0], at[1]]):
+        return None, "the model of a blurred hole does not fit"
+    disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, around.patch.metric_m2, 1)[0]
+    if float(disc[around.invalid].sum()) > config.largest_invalid * float(disc.sum()):
+        return None, "part of the hole has no range"
+    error = float(np.sqrt(fit.covariance[2, 2])) / fit.radius_m
+    if not error < config.largest_relative_error:
+        return None, "diameter and depth cannot be told apart through the blur (the diameter is an upper limit)"
+    return fit, ""
+
+
+def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
+    """(u, v, radius, depth, offset): centroid of the deviation, peak depth, and the radius that gives the volume."""
+    near = _grown(around.own, around.patch.blur_px // 2) & around.patch.used
+    deviation = np.where(near, around.sign * (around.patch.residual_m - around.offset_m), 0.0)
+    weights = np.maximum(deviation, 0.0)
+    v, u = np.nonzero(near)
+    weight = weights[near]
+    total = max(float(weight.sum()), 1e-12)
+    radius = np.sqrt(total * around.surface_area_m2 / (np.pi * around.peak_m))
+    u0, v0 = float(weight @ u) / total, float(weight @ v) / total
+    return u0, v0, float(radius), around.sign * around.peak_m, around.offset_m
+
+
+def _by_model(blank: Measurement, around: _Surroundings, fit: HoleFit) -> Measurement:
+    errors = np.sqrt(np.diag(fit.covariance))
+    spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
+    return replace(
+        blank,
+        u_px=fit.u_px - around.u0 + blank.u_px,
+        v_px=fit.v_px - around.v0 + blank.v_px,
+        model_diameter_m=2.0 * fit.radius_m,
+        model_diameter_se_m=2.0 * float(errors[2]),
+        model_depth_m=fit.depth_m,
+        model_depth_se_m=float(errors[3]),
+        model_centre_m=around.place_m(fit.u_px, fit.v_px),
+        # per axis: the two axes on the surface share the trace
+        model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
+        volume_m3=_volume(around),
+        model_note="",
+    )
+
+
+def _by_contour(blank: Measurement, around: _Surroundings, doubt: str) -> Measurement:
+    """The contour at half of the depth; pixels without a range that touch the detection count as inside."""
+    residual = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
+    hollow = around.invalid & _reached(around.own | around.invalid, around.own)
+    residual[hollow] = around.peak_m
+    residual[~around.patch.used & ~hollow] = 0.0
+    fine = cv2.resize(residual, None, fx=CONTOUR_ZOOM, fy=CONTOUR_ZOOM, interpolation=cv2.INTER_LINEAR)
+    seeds = cv2.resize(
+        around.own.astype(np.uint8), None, fx=CONTOUR_ZOOM, fy=CONTOUR_ZOOM, interpolation=cv2.INTER_NEAREST
+    )
+    inside = _reached(fine > 0.5 * around.peak_m, seeds > 0)
+    volume = _volume(around)
+    if not inside.any():
+        return replace(blank, volume_m3=volume, model_note=doubt + "; no half-depth contour")
+    v, u = ((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5 for axis in np.nonzero(inside))
+    area = inside.sum() / CONTOUR_ZOOM**2 * around.surface_area_m2
+    return replace(
+        blank,
+        u_px=float(u) - around.u0 + blank.u_px,
+        v_px=float(v) - around.v0 + blank.v_px,
+        model_diameter_m=2.0 * float(np.sqrt(area / np.pi)),
+        model_depth_m=np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m,
+        model_centre_m=around.place_m(float(u), float(v)),
+        volume_m3=volume,
+        model_note=doubt + "; from the contour at half depth, without standard errors",
+    )
+
+
+def _reached(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected parts of the mask that hold a seed."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    wanted = np.zeros(count, dtype=bool)
+    wanted[labels[seeds & mask]] = True
+    wanted[0] = False
+    reached: np.ndarray = wanted[labels]
+    return reached
+
+
+def _volume(around: _Surroundings) -> float:
+    """Sum of the deviation times the pixel's area across the axis, over the detection and the blur around it."""
+    near = _grown(around.own, around.patch.blur_px // 2 + 1) & around.patch.used
+    return float((around.patch.residual_m[near] - around.offset_m).sum()) * around.facing_area_m2

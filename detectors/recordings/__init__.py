@@ -1,0 +1,8 @@
+"""Real captures as sources of frames: depth pictures, arrays, MATLAB files, point clouds, Azure Kinect recordings."""
+
+from __future__ import annotations
+
+from detectors.recordings.opening import LEGAL_FORMATS, open_capture
+from detectors.recordings.recording import Recording
+
+__all__ = ["LEGAL_FORMATS", "Recording", "open_capture"]

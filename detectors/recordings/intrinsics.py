@@ -1,0 +1,195 @@
+"""The lens of a capture from a file: plain JSON, Open3D, OpenCV, ROS camera_info, or an Azure Kinect calibration."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from detectors.recordings.azure_calibration import depth_lens, depth_mode_of_size, parse_calibration
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.lens import Lens
+
+LEGAL_LENS = (
+    "JSON or YAML with fx, fy, cx, cy in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
+    "OpenCV's or ROS' camera_info YAML; an Azure Kinect's calibration.json"
+)
+FOUND_BESIDE = (
+    "intrinsic",
+    "intrinsics",
+    "camera_intrinsic",
+    "camera_intrinsics",
+    "camera",
+    "camera_info",
+    "calibration",
+)
+"""Stems of the files that are taken for the lens of the frames beside or below them."""
+
+DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
+
+
+def lens_file_beside(folder: Path) -> Path | None:
+    """The file in ``folder`` that holds its frames' lens, None where there is none."""
+    candidates = (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def no_lens(name: str) -> UserError:
+    """The message for depth images whose lens nobody stated."""
+    return UserError(
+        f"{name}: nothing says which lens took these depth images, and without it they are no points",
+        legal=LEGAL_LENS,
+        fix="pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough",
+    )
+
+
+def read_lens(path: Path, width: int, height: int) -> Lens:
+    """The lens in a file, for images of ``width`` x ``height``.
+
+    Raises UserError where the file is missing, unreadable, of another image size, or of a lens model that is not known.
+    """
+    data = _parsed(path)
+    if "CalibrationInformation" in data:
+        mode = depth_mode_of_size(width, height)
+        if mode is None:
+            raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
+        return depth_lens(str(path), parse_calibration(str(path), path.read_bytes()), mode)
+    data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
+    stated = _stated_size(data)
+    if stated not in (None, (width, height)):
+        raise UserError(
+            f"{path}: is for images of {stated[0]} x {stated[1]} pixels, but the depth images have {width} x {height}",
+            fix="give the lens of the depth images themselves (or of the colour camera that they are aligned to)",
+        )
+    fx, fy, cx, cy = _centre_and_focal(path, data)
+    _refuse_odd_numbers(path, (fx, fy, cx, cy), width, height)
+    return Lens(width, height, fx, fy, cx, cy, _distortion(path, data))
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    """The file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file", legal=LEGAL_LENS) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read ({error})", legal=LEGAL_LENS) from error
+    data = _parse_json(path, text) if text.lstrip().startswith("{") else _parse_yaml(path, text)
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: holds no names with values", legal=LEGAL_LENS)
+    return data
+
+
+def _parse_json(path: Path, text: str) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        for key, _ in pairs:
+            if sum(key == other for other, _ in pairs) > 1:
+                raise UserError(f"{path}: the key {key} stands twice", fix="keep one of them")
+        return dict(pairs)
+
+    try:
+        return json.loads(text, object_pairs_hook=unique)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
+
+
+def _parse_yaml(path: Path, text: str) -> Any:
+    from ruamel.yaml import YAML, YAMLError
+    from ruamel.yaml.constructor import SafeConstructor
+    from ruamel.yaml.nodes import MappingNode
+
+    class Constructor(SafeConstructor):
+        """Knows OpenCV's matrices as plain mappings."""
+
+    def opencv_matrix(constructor: SafeConstructor, node: MappingNode) -> dict[str, Any]:
+        return {str(k.value): constructor.construct_object(v, deep=True) for k, v in node.value}
+
+    Constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", opencv_matrix)
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = Constructor
+    # OpenCV's first line, "%YAML:1.0", is no directive of YAML.
+    body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+    try:
+        return yaml.load(body)
+    except YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or str(error)
+        raise UserError(f"{path}{where}: {problem}", legal=LEGAL_LENS) from error
+
+
+def _stated_size(data: dict[str, Any]) -> tuple[int, int] | None:
+    for across, down in (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px")):
+        if across in data and down in data:
+            return data[across], data[down]
+    return None
+
+
+def _centre_and_focal(path: Path, data: dict[str, Any]) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy from whichever of the known forms the file has."""
+    if all(key in data for key in ("fx", "fy", "cx", "cy")):
+        return tuple(_number(path, key, data[key]) for key in ("fx", "fy", "cx", "cy"))  # type: ignore[return-value]
+    if "intrinsic_matrix" in data:  # Open3D: column by column
+        m = _numbers(path, "intrinsic_matrix", data["intrinsic_matrix"], 9)
+        return m[0], m[4], m[6], m[7]
+    for key in ("camera_matrix", "K", "k"):  # OpenCV and ROS: row by row
+        if key in data:
+            m = _numbers(path, key, data[key], 9)
+            return m[0], m[4], m[2], m[5]
+    raise UserError(f"{path}: holds no lens (its keys: {', '.join(map(str, data)) or 'none'})", legal=LEGAL_LENS)
+
+
+def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
+    """OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
+    model = str(data.get("distortion_model", ""))
+    if model.lower() not in KNOWN_MODELS:
+        raise UserError(f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:]))
+    key = next((k for k in ("distortion", "distortion_coefficients", "D", "d") if k in data), None)
+    if key is None:
+        return (0.0,) * 8
+    if isinstance(data[key], dict) and "data" not in data[key]:
+        unknown = set(data[key]) - set(DISTORTION_NAMES)
+        if unknown:
+            raise UserError(f"{path}: {key} has {', '.join(sorted(unknown))}", legal=", ".join(DISTORTION_NAMES))
+        return tuple(_number(path, f"{key}.{name}", data[key].get(name, 0.0)) for name in DISTORTION_NAMES)
+    numbers = _numbers(path, key, data[key], None)
+    if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):
+        raise UserError(
+            f"{path}: {key} has {len(numbers)} numbers",
+            legal="0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt",
+        )
+    return (numbers + (0.0,) * 8)[:8]
+
+
+def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float, ...]:
+    """Numbers from a flat list, a list of rows, or an OpenCV matrix (``data``)."""
+    value = value.get("data") if isinstance(value, dict) else value
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
+        value = [x for row in value for x in row]
+    if not isinstance(value, list) or (count is not None and len(value) != count):
+        raise UserError(f"{path}: {key} is no list of {count or ''} numbers".replace("  ", " "), legal=LEGAL_LENS)
+    return tuple(_number(path, key, x) for x in value)
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{path}: {key} is {value!r}", legal="a finite number")
+    return float(value)
+
+
+def _refuse_odd_numbers(path: Path, numbers: tuple[float, ...], width: int, height: int) -> None:
+    """Refuse what no lens of these images has: a mirrored or normalised focal length, a centre far outside."""
+    fx, fy, cx, cy = numbers
+    if not (0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
+        raise UserError(
+            f"{path}: focal length fx = {fx:g}, fy = {fy:g} for an image {width} pixels wide",
+            legal=f"pixels, {0.1 * width:g} to {100 * width:g}",
+            fix="multiply a normalised focal length by the image's width",
+        )
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise UserError(
+            f"{path}: principal point cx = {cx:g}, cy = {cy:g} for {width} x {height} pixels",
+            legal="pixels from the centre of the first one, near the image's centre",
+        )

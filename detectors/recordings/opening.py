@@ -1,0 +1,86 @@
+"""Recognise a capture by what it is, and open it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from detectors.recordings.arrays import load_npy, load_npz, open_stack
+from detectors.recordings.azure_mkv import open_mkv
+from detectors.recordings.depth_images import open_depth_folder, open_depth_list
+from detectors.recordings.distances import metres_per_unit
+from detectors.recordings.matlab import load_mat
+from detectors.recordings.pointclouds import open_clouds
+from detectors.recordings.recording import Recording
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.lens import Lens
+
+STACKS = {".npy": load_npy, ".npz": load_npz, ".mat": load_mat}
+CLOUDS = (".ply", ".pcd")
+LEGAL_FORMATS = (
+    "a folder or list of 16-bit depth .png, a folder or list of .ply or .pcd, or one .npy, .npz, .mat or .mkv file"
+)
+
+
+def open_capture(
+    paths: Sequence[Path],
+    *,
+    unit: str | None = None,
+    intrinsics: Path | None = None,
+    lens: Lens | None = None,
+    frames: slice | None = None,
+) -> Recording:
+    """Open a real capture as a source of frames; its first frame is read and checked.
+
+    ``unit`` of the stored distances (mm, m, cm, um, tum, N/m) where the format's usual one is wrong. ``intrinsics``: a
+    file with the depth pixels' lens, which counts before one found beside the frames or attached to them; ``lens`` the
+    same as a value. ``frames`` selects frames by number. Raises UserError for every fault of the files.
+    """
+    paths = [Path(path) for path in paths]
+    if not paths:
+        raise UserError("no capture named", legal=LEGAL_FORMATS)
+    missing = next((path for path in paths if not path.exists()), None)
+    if missing is not None:
+        raise UserError(f"{missing}: no such file or folder", legal=LEGAL_FORMATS)
+    scale_m = metres_per_unit(unit) if unit else None
+    recording = _open_files(paths, scale_m, intrinsics, lens)
+    recording = replace(recording, selection=frames)
+    recording.first_frame()
+    return recording
+
+
+def _open_files(paths: list[Path], scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:
+    suffixes = {path.suffix.lower() for path in paths if path.is_file()}
+    if len(paths) == 1 and paths[0].is_dir():
+        return _open_folder(paths[0], scale_m, intrinsics, lens)
+    if any(path.is_dir() for path in paths):
+        raise UserError(f"{len(paths)} paths with folders among them", legal=LEGAL_FORMATS, fix="name one folder alone")
+    if suffixes == {".png"}:
+        return open_depth_list(paths, scale_m, intrinsics, lens)
+    if len(suffixes) == 1 and suffixes <= set(CLOUDS):
+        return open_clouds(paths, scale_m, _list_name(paths))
+    if len(paths) > 1:
+        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted(suffixes))}", legal=LEGAL_FORMATS)
+    (suffix,) = suffixes
+    if suffix in STACKS:
+        return open_stack(paths[0], scale_m, intrinsics, lens, STACKS[suffix])
+    if suffix == ".mkv":
+        return open_mkv(paths[0], scale_m, intrinsics, lens)
+    raise UserError(f"{paths[0]}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS)
+
+
+def _open_folder(folder: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:
+    try:
+        inside = sorted(folder.iterdir())
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
+    for suffix in CLOUDS:
+        clouds = [path for path in inside if path.suffix.lower() == suffix]
+        if clouds:
+            return open_clouds(clouds, scale_m, folder.name)
+    return open_depth_folder(folder, scale_m, intrinsics, lens)
+
+
+def _list_name(paths: list[Path]) -> str:
+    return paths[0].name if len(paths) == 1 else f"{paths[0].name} .. {paths[-1].name}"

@@ -1,0 +1,204 @@
+"""The thesis' detector: a surface through the cropped cloud, points farther from it than k standard deviations,
+clusters of them at 10 mm.
+
+The text's variant: robust cubic by least absolute residuals, k robust standard deviations of the residual. The
+script's (``variant: script``): least squares without cross terms, 1.2 standard deviations of the *raw z*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from detectors.crop import BoxCrop, CropConfig, crop
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.measure import HoleModelConfig, measure_detection
+from detectors.segment import euclidean_clusters
+from detectors.surface import SurfaceConfig, fit_surface
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.config import Config
+from harness.vocabulary.units import MM
+
+SCRIPT_VARIANT: dict[str, Any] = {
+    "surface": {"degree": 3, "method": "least_squares", "drop_cross_terms": True},
+    "scale": "raw_z_std",
+}
+SCRIPT_THRESHOLD = 1.2
+"""The script's k, in standard deviations of the raw z."""
+
+
+class ThesisConfig(Config):
+    """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
+
+    ``scale``: the standard deviation that one unit of score means: ``mad`` (median |residual| / 0.6745),
+    ``residual_std`` or ``raw_z_std``. ``min_points``: clusters with fewer points are no detections.
+    """
+
+    variant: Literal["text", "script"] = "text"
+    crop: CropConfig = Field(default_factory=BoxCrop)
+    surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
+    scale: Literal["mad", "residual_std", "raw_z_std"] = "mad"
+    min_points: int = Field(default=1, ge=1)
+    cluster_distance_mm: float = Field(default=10.0, gt=0)
+    hole_model: HoleModelConfig = Field(default_factory=HoleModelConfig)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("variant") != "script":
+            return data
+        filled = {**SCRIPT_VARIANT, **data}
+        if isinstance(data.get("surface"), dict):
+            filled["surface"] = {**SCRIPT_VARIANT["surface"], **data["surface"]}
+        return filled
+
+
+class ThesisDetector:
+    """Implements `detectors.interface.Detector`."""
+
+    settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
+    name = "thesis"
+    version = 1
+
+    def __init__(self, settings: ThesisConfig) -> None:
+        self.settings = settings
+
+    @property
+    def default_threshold(self) -> float | None:
+        """The k that the thesis states: 1.2 for the script; None for the text, whose k is set by hand or calibrated."""
+        return SCRIPT_THRESHOLD if self.settings.variant == "script" else None
+
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score |residual| / scale of every pixel in the crop; a pixel is damage if its score is *above* k.
+
+        Raises UserError on an empty crop and where the points do not determine the surface.
+        """
+        mask = crop(cloud, self.settings.crop)
+        x, y, z = cloud.points_m[mask].T
+        surface = fit_surface(x, y, z, self.settings.surface)
+        fitted = surface.evaluate(x, y)
+        residual = z - fitted
+        floor = rounding_floor(cloud, mask)
+        spread = _spread(residual, z, self.settings.scale)
+        scale = max(spread, floor)
+        notes = {
+            "surface": surface.note,
+            "surface_iterations": surface.iterations,
+            "surface_converged": surface.converged,
+            "points": len(z),
+            "spread_m": spread,
+            "floor_m": floor,
+        }
+        return Evidence(
+            score=_spread_out(np.abs(residual) / scale, mask),
+            residual_m=_spread_out(residual, mask),
+            surface_z_m=_spread_out(fitted, mask),
+            scale_m=scale,
+            notes=notes,
+        )
+
+    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+        """Clusters of pixels whose score is above the threshold, strongest first."""
+        pixels = _above(evidence, threshold)
+        labels = self._clusters(cloud, pixels)
+        clusters = [pixels[labels == label] for label in range(labels.max(initial=-1) + 1)]
+        found = [Detection(self._strength(cloud, evidence, cluster), cluster) for cluster in clusters]
+        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
+
+    def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
+        """The lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
+        return self._strength(cloud, evidence, _above(evidence, 0.0))
+
+    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+        """The thesis' extents, and the model of a blurred hole."""
+        return measure_detection(cloud, evidence, detection, self.settings.hole_model)
+
+    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+        points = cloud.points_m.reshape(-1, 3)[pixels]
+        return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+
+    def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
+        """The lowest threshold at which no cluster of ``min_points`` is left among these pixels.
+
+        Raising the threshold only takes points away and only splits clusters, so the answer is the score of the point,
+        in falling order, that completes the first cluster: found by doubling and bisection.
+        """
+        if len(pixels) < self.settings.min_points:
+            return 0.0
+        scores = evidence.score.reshape(-1)[pixels]
+        if self.settings.min_points == 1:
+            return float(scores.max())
+        falling = np.argsort(-scores, kind="stable")
+
+        def completes(count: int) -> bool:
+            return bool((self._clusters(cloud, pixels[falling[:count]]) >= 0).any())
+
+        count = _first_true(completes, self.settings.min_points, len(pixels))
+        return 0.0 if count is None else float(scores[falling[count - 1]])
+
+
+def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
+    """The standard deviation that the rounding of z leaves in the average, metres: the least credible scale.
+
+    Rounding to a step q errs by q / sqrt(12). Noise of deviation s before the rounding (a dither) turns part of that
+    into noise, which averages out, and leaves a fixed pattern with the variance
+    b^2 = (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2 (q^2 / 12 at s = 0, next to nothing from s = q / 2).
+    So after n frames the rounding's variance is b^2 + (q^2 / 12 - b^2) / n. s^2 is the frames' median variance less
+    q^2 / 12; on a surface so quiet that most pixels never change it is 0 and the floor stays q / sqrt(12), 0.29 mm
+    for 1 mm; likewise where the averaged z still lies on the steps, as a median does. Without a step, z is taken to
+    have been stored as float32.
+    """
+    z = cloud.points_m[mask][:, 2]
+    step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
+    whole = step**2 / 12.0
+    if cloud.n_frames > 2 and _on_half_steps(z, step):
+        return float(np.sqrt(whole))
+    variances = cloud.variance_m2[mask]
+    variances = variances[np.isfinite(variances)]
+    dither = max(float(np.median(variances)) - whole, 0.0) if len(variances) else 0.0
+    k = np.arange(1, 200)
+    fixed = (step / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither / step**2) / k**2).sum())
+    fixed = min(fixed, whole)
+    return float(np.sqrt(fixed + (whole - fixed) / max(cloud.n_frames, 1)))
+
+
+def _on_half_steps(z: np.ndarray, step: float) -> bool:
+    """Whether nine in ten of some points lie on multiples of half a step (the median of an even number of frames)."""
+    some = z[:: max(1, len(z) // 1000)] / (0.5 * step)
+    return bool(np.mean(np.abs(some - np.round(some)) < 0.01) > 0.9)
+
+
+def _spread(residual: np.ndarray, z: np.ndarray, scale: str) -> float:
+    if scale == "mad":
+        return float(np.median(np.abs(residual))) / 0.6745
+    values = z if scale == "raw_z_std" else residual
+    # MATLAB's std divides by n - 1
+    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def _spread_out(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    image = np.full(mask.shape, np.nan)
+    image[mask] = values
+    return image
+
+
+def _above(evidence: Evidence, threshold: float) -> np.ndarray:
+    """Flat indices, ascending, of the pixels whose score exceeds the threshold."""
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero(evidence.score.reshape(-1) > threshold)
+
+
+def _first_true(test: Callable[[int], bool], low: int, high: int) -> int | None:
+    """The least n in low..high at which a test that never turns false again is true; None if it never is."""
+    trial = low
+    while not test(trial):
+        if trial == high:
+            return None
+        low, trial = trial + 1, min(2 * trial, high)
+    while low < trial:
+        middle = (low + trial) // 2
+        low, trial = (low, middle) if test(middle) else (middle + 1, trial)
+    return trial

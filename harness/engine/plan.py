@@ -1,0 +1,121 @@
+"""What an experiment costs before it runs: set-ups to render, trials to run, and which points share their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from harness.engine.journal import JOURNAL_VERSION
+from harness.engine.setup import SetUpRef
+from harness.engine.trial import PointTask, Role, TrialTask
+from harness.experiment.points import Experiment, Point
+from harness.experiment.schema import SimulatedSource
+from harness.vocabulary.seeds import canonical_json, digest
+from harness.vocabulary.units import MM
+from scenes.render.cache import render_key
+from scenes.render.settings import RenderConfig
+from scenes.sensor.camera import load_camera
+from scenes.target.custom import TargetConfig
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """One view to render, or to find in the cache."""
+
+    target: TargetConfig
+    camera: str
+    config: RenderConfig
+    folder: Path
+
+    @cached_property
+    def path(self) -> Path:
+        """Where the cache keeps it."""
+        return self.folder / f"{render_key(self.target, load_camera(self.camera), self.config)}.npz"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them."""
+
+    points: tuple[Point, ...]
+    damaged: RenderJob
+    hole_free: RenderJob
+    set_up: SetUpRef
+    seed: int
+
+    def repeats(self, role: Role, point: Point) -> int:
+        """How many trials of a role a point wants. With a given threshold, as many hole-free ones as damaged ones."""
+        calibrate = point.config.threshold.calibrate
+        if role == "hole_free" and calibrate is not None:
+            return calibrate.repeats
+        return point.config.repeats
+
+    def trials(self, role: Role, thresholds: Mapping[str, float]) -> Iterator[tuple[str, TrialTask]]:
+        """(journal key, task) of each trial of a role. ``thresholds`` by point digest, empty while calibrating."""
+        for repeat in range(max(self.repeats(role, point) for point in self.points)):
+            wanted = tuple(
+                _point_task(point, thresholds.get(point.digest, point.config.threshold.k))
+                for point in self.points
+                if repeat < self.repeats(role, point)
+            )
+            task = TrialTask(self.set_up, self.seed, role, repeat, wanted)
+            yield self._key(task), task
+
+    def _key(self, task: TrialTask) -> str:
+        asked = [[point.digest, point.variant, point.threshold] for point in task.points]
+        content = [JOURNAL_VERSION, self.damaged.path.stem, self.hole_free.path.stem, task.role, task.repeat, asked]
+        return f"{task.role}-{task.repeat:05d}-{digest(content)}"
+
+
+def _point_task(point: Point, threshold: float | None) -> PointTask:
+    config = point.config
+    return PointTask(
+        digest=point.digest,
+        variant=point.variant,
+        frames=config.capture.frames,
+        detector=config.detector.name,
+        settings_json=canonical_json(config.detector.settings),
+        average=config.capture.average,
+        radius_m=config.matching.radius_mm * MM,
+        threshold=threshold,
+    )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All groups of an experiment with a simulated source."""
+
+    groups: tuple[Group, ...]
+
+    @property
+    def renders(self) -> tuple[RenderJob, ...]:
+        """The distinct views, in the order in which trials need them."""
+        jobs = {job.path: job for group in self.groups for job in (group.hole_free, group.damaged)}
+        return tuple(jobs.values())
+
+    @property
+    def trial_count(self) -> int:
+        """Trials of both roles."""
+        roles: tuple[Role, ...] = ("hole_free", "damaged")
+        return sum(max(g.repeats(role, p) for p in g.points) for g in self.groups for role in roles)
+
+
+def plan_of(experiment: Experiment, cache: Path) -> Plan:
+    """Group the points of an experiment by the frames that they share."""
+    by_frames: dict[str, list[Point]] = {}
+    for point in experiment.points:
+        by_frames.setdefault(point.frames_key, []).append(point)
+    return Plan(tuple(_group(tuple(points), cache) for points in by_frames.values()))
+
+
+def _group(points: tuple[Point, ...], cache: Path) -> Group:
+    source = points[0].config.source
+    assert isinstance(source, SimulatedSource)
+    target = source.target.declare()
+    damaged, hole_free = (
+        RenderJob(declared, source.camera.name, source.render, cache) for declared in (target, target.hole_free())
+    )
+    ref = SetUpRef(str(damaged.path), str(hole_free.path), source.camera, target)
+    return Group(points, damaged, hole_free, ref, points[0].config.seed)

@@ -1,0 +1,161 @@
+"""A study with a simulated camera, from a validated experiment to its folder of results."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from harness.engine.console import progress_display
+from harness.engine.examples import examples_of
+from harness.engine.journal import Journal
+from harness.engine.plan import Plan, plan_of
+from harness.engine.run import Outcome, pending_counts, run_plan
+from harness.engine.tables import Tables, tables_of
+from harness.experiment.load import resolved_yaml
+from harness.experiment.points import MAIN, Experiment
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import atomic_path, write_text
+from harness.vocabulary.provenance import commit_and_dirty, machine, versions
+from harness.vocabulary.units import MM
+from scenes.render.cache import read_view
+
+RESULTS_VERSION = 1
+"""Stands in every result folder; raised when the tables' meaning changes."""
+
+
+def dry_run(experiment: Experiment, out: Path, jobs: int) -> int:
+    """Say what would be run."""
+    folder = experiment.folder(out)
+    plan = plan_of(experiment, _cache(out))
+    print(f"{experiment.config.name}: valid; {len(experiment.points)} points in {len(plan.groups)} set-ups")
+    for what, planned, there in pending_counts(plan, Journal(folder / "journal")):
+        print(f"  {what}: {planned}, {there} already there")
+    print(f"  trials of both kinds: {plan.trial_count}, on {jobs} processes")
+    print(f"  results would go to {folder}")
+    return 0
+
+
+def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int:
+    """Run, write tables and report, print the summary. Returns 0, or 1 where trials failed."""
+    began = time.perf_counter()
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    folder = experiment.folder(out)
+    plan = plan_of(experiment, _cache(out))
+    # The first file written: an unwritable folder shows before any work is done.
+    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+    try:
+        with progress_display() as show:
+            outcome = run_plan(plan, Journal(folder / "journal"), jobs, show)
+    except KeyboardInterrupt:
+        print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
+        return 130
+    if not outcome.records or not outcome.thresholds:
+        raise UserError(f"no trial of {experiment.config.name} succeeded: {_reasons(outcome)}")
+    tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
+    provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
+    _write_tables(folder, tables, provenance)
+    _write_report(folder, experiment, plan, outcome, tables, provenance)
+    _conclude(folder, tables, outcome)
+    return 1 if outcome.failures else 0
+
+
+def _cache(out: Path) -> Path:
+    return out / ".cache" / "renders"
+
+
+def _reasons(outcome: Outcome) -> str:
+    return "; ".join(sorted({failure.why for failure in outcome.failures})[:3]) or "nothing was planned"
+
+
+def _provenance(
+    experiment: Experiment, plan: Plan, outcome: Outcome, command: str, started: str, seconds: float
+) -> dict[str, Any]:
+    """Everything that a reader needs to repeat the numbers or to doubt them."""
+    commit, dirty = commit_and_dirty()
+    runs = [row for record in outcome.records.values() for row in record["runs"]]
+    main = next((g for g in plan.groups if any(p.variant == MAIN for p in g.points)), plan.groups[0])
+    view = read_view(main.damaged.path)
+    noise = {}
+    if view is not None:
+        for index, name in enumerate(view.surface_names):
+            here = view.surface == index
+            if here.any():
+                noise[name] = round(float(pd.Series(view.indirect_noise_m[here]).median()) / MM, 4)
+    return {
+        "results_version": RESULTS_VERSION,
+        "command": command,
+        "experiment": experiment.config.name,
+        "digest": experiment.digest,
+        "seed": experiment.config.seed,
+        "commit": commit,
+        "dirty": dirty,
+        "versions": versions(),
+        "mitsuba_variant": view.variant if view is not None else None,
+        "machine": machine(),
+        "started": started,
+        "seconds": {
+            "in all": round(seconds, 1),
+            "renders (not cached)": round(outcome.render_seconds, 1),
+            "frames (all workers)": round(sum(row["seconds_frames"] for row in runs), 1),
+            "detection and measurement (all workers)": round(sum(row["seconds_detect"] for row in runs), 1),
+        },
+        "renders": {"done": outcome.renders_done, "cached": outcome.renders_cached},
+        "trials": {"done": outcome.trials_done, "resumed": outcome.trials_resumed},
+        "indirect_noise_mm": noise,
+        "failures": [{"what": failure.what, "why": failure.why} for failure in outcome.failures],
+    }
+
+
+def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> None:
+    """Parquet with the provenance in its schema, the summary as CSV, the provenance as JSON."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from harness.evaluation.summary import summarise_holes
+
+    numbers = {k: provenance[k] for k in ("results_version", "experiment", "digest", "seed", "commit", "dirty")}
+    note = json.dumps({**numbers, "versions": provenance["versions"]}, sort_keys=True)
+    for name, table in (("trials", tables.holes), ("runs", tables.runs), ("probes", tables.probes)):
+        stored = pa.Table.from_pandas(table, preserve_index=False)
+        stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
+        with atomic_path(folder / f"{name}.parquet") as path:
+            pq.write_table(stored, path)
+    buffer = io.StringIO()
+    summarise_holes(tables.holes).to_csv(buffer, index=False, float_format="%.6g")
+    write_text(folder / "summary.csv", buffer.getvalue())
+    write_text(folder / "provenance.json", json.dumps(provenance, indent=2) + "\n")
+
+
+def _write_report(
+    folder: Path, experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
+) -> None:
+    from harness.report.page import write_report
+
+    variants = {point.variant: group for group in reversed(plan.groups) for point in group.points}
+    examples = [e for variant, group in variants.items() for e in examples_of(group, outcome.thresholds, variant)]
+    title = experiment.config.title or experiment.config.name
+    write_report(folder, tables, examples, provenance, resolved_yaml(experiment), title)
+
+
+def _conclude(folder: Path, tables: Tables, outcome: Outcome) -> None:
+    """The final table, the failures, and where to look."""
+    from harness.evaluation.summary import summarise_holes
+    from harness.report.terminal import terminal_table, terminal_text
+
+    summary = summarise_holes(tables.holes)
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(terminal_table(summary))
+    else:
+        print(terminal_text(summary))
+    if outcome.failures:
+        print(f"{len(outcome.failures)} trials failed: {_reasons(outcome)}", file=sys.stderr)
+    print(f"report: {folder / 'report.html'}")

@@ -1,0 +1,27 @@
+"""Which detection is which damage: nearest centre within a stated radius, one to one; the rest are false calls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def match(truth_m: np.ndarray, found_m: np.ndarray, radius_m: float) -> dict[int, int]:
+    """Pairs {index of truth: index of finding}, closest pairs first, none farther apart than ``radius_m``.
+
+    ``truth_m`` (n, d) and ``found_m`` (m, d) are centres in one frame; findings with NaN match nothing. Ties go to the
+    lower index of truth, then of finding.
+    """
+    if len(truth_m) == 0 or len(found_m) == 0:
+        return {}
+    distance = np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1)
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    order = np.argsort(np.where(np.isfinite(distance), distance, np.inf), axis=None, kind="stable")
+    for flat in order:
+        t, f = divmod(int(flat), len(found_m))
+        if not distance[t, f] <= radius_m:
+            break
+        if t not in pairs and f not in taken:
+            pairs[t] = f
+            taken.add(f)
+    return pairs

@@ -1,0 +1,147 @@
+"""From rows per trial to rates, means and intervals: the numbers of summary.csv, the report and the final table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from harness.evaluation import intervals
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+HoleState = Literal["found", "missed", "undecided"]
+Measure = Literal["extent", "model"]
+
+MAIN = "main"
+"""The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
+STATES = ("found", "wrong depth", "invalid", "invisible")
+"""What the pixels of a hole tell, whatever the detector says."""
+FOUND_RULE = (
+    "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
+    "as missed when it lies below, else as undecided."
+)
+GROUP = ["variant", "frames", "hole"]
+
+
+@dataclass(frozen=True)
+class ResultTables:
+    """What an experiment leaves: one row per trial and hole, per run, per probe pixel, per variant.
+
+    ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
+    ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
+    quiet_threshold, scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
+    ``probes``: variant, frames, pixel, true_z_mm, mean_error_mm, temporal_std_mm, repeats; pixels in sensor order.
+    ``variants``: variant, reason, settings (JSON text).
+    """
+
+    holes: pd.DataFrame
+    runs: pd.DataFrame
+    probes: pd.DataFrame
+    variants: pd.DataFrame
+
+
+def by_hole(names: pd.Series) -> pd.Series:
+    """Sort key: holes by number where they have one ("2" before "11"), the others after them by name."""
+    return names.map(lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name)))
+
+
+def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
+    """One row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval.
+
+    Columns beside the group and the truth: ``n`` trials, ``detected`` of them, ``rate`` with Wilson's interval
+    ``rate_low``/``rate_high`` and ``status`` by `FOUND_RULE`; for the thesis' measure (``extent_``) and the model's
+    (``model_``): ``measured`` trials with a finite diameter, ``diameter_mean_mm``, ``diameter_std_mm`` (n - 1),
+    ``bias_mm`` with Student's interval, ``offset_mean_mm``, ``offset_std_mm``, ``offset_bias_mm``, ``error_mean_mm``;
+    and ``share_*``, the share of trials in each of `STATES`. Means are over the detected trials only, so they
+    are conditional on detection: a hole detected in few trials shows the sizes of its lucky trials.
+    """
+    import pandas as pd
+
+    groups = holes.groupby(GROUP, sort=False)
+    truth = ["kind", "true_diameter_mm", "true_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
+    out = groups[truth].first()
+    out["n"] = groups.size()
+    out["detected"] = groups["detected"].sum().astype(int)
+    out["rate"] = out["detected"] / out["n"]
+    out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
+    out["status"] = [status_of(low, high) for low, high in zip(out["rate_low"], out["rate_high"], strict=True)]
+    for measure in ("extent", "model"):
+        out = pd.concat([out, _measured(groups, out, measure)], axis=1)
+    out["median_residual_mm"] = groups["median_residual_mm"].mean()
+    out["invalid_fraction"] = groups["invalid_fraction"].mean()
+    for state in STATES:
+        out[f"share_{state.replace(' ', '_')}"] = (holes["state"] == state).groupby([holes[c] for c in GROUP]).mean()
+    return out.reset_index().sort_values(GROUP, key=_order, kind="stable").reset_index(drop=True)
+
+
+def status_of(rate_low: float, rate_high: float) -> HoleState:
+    """`FOUND_RULE` for one interval of a detection rate."""
+    if rate_low > 0.5:
+        return "found"
+    return "missed" if rate_high < 0.5 else "undecided"
+
+
+def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
+    """Each hole's status by `FOUND_RULE`, in the holes' order; empty where the variant lacks these frames."""
+    rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
+    return dict(zip(rows["hole"], rows["status"], strict=True))
+
+
+def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
+    """One row per (variant, frames, role): runs, false calls, their rate per run with Garwood's Poisson interval.
+
+    The hole-free runs set the threshold, so they are quiet by construction; only the damaged runs test it.
+    """
+    groups = runs.groupby(["variant", "frames", "role"], sort=False)
+    out = groups.agg(
+        runs=("repeat", "size"),
+        false_calls=("false_calls", "sum"),
+        threshold=("threshold", "mean"),
+        surface_noise_mm=("surface_noise_mm", "mean"),
+        frames_used=("frames_used", "mean"),
+        left_out=("left_out", "sum"),
+    )
+    in_mm = (runs["threshold"] * runs["scale_mm"]).groupby([runs[c] for c in ("variant", "frames", "role")], sort=False)
+    out["threshold_mm"] = in_mm.mean()
+    out["per_run"] = out["false_calls"] / out["runs"]
+    out["per_run_low"], out["per_run_high"] = intervals.poisson_rate(out["false_calls"], out["runs"])
+    return (
+        out.reset_index().sort_values(["variant", "frames", "role"], key=_order, kind="stable").reset_index(drop=True)
+    )
+
+
+def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+    """Means, standard deviations and biases of one measure's diameters and offsets."""
+    import pandas as pd
+
+    diameter, offset = groups[f"{measure}_diameter_mm"], groups[f"{measure}_offset_mm"]
+    out = pd.DataFrame(index=truth.index)
+    out["measured"] = diameter.count()
+    out["diameter_mean_mm"], out["diameter_std_mm"] = diameter.mean(), diameter.std()
+    out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
+    out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(out["bias_mm"], out["diameter_std_mm"], out["measured"])
+    out["offset_mean_mm"], out["offset_std_mm"] = offset.mean(), offset.std()
+    out["offset_bias_mm"] = out["offset_mean_mm"] - truth["true_offset_mm"]
+    out["offset_measured"] = offset.count()
+    out["error_mean_mm"] = groups[f"{measure}_error_mm"].mean()
+    return out.add_prefix(f"{measure}_")
+
+
+def _order(column: pd.Series) -> pd.Series:
+    """Sort key of one group column: the main variant first, holes by number, frames as numbers."""
+    if column.name == "hole":
+        return by_hole(column)
+    if column.name == "variant":
+        first_seen = {name: place for place, name in enumerate(dict.fromkeys(column))}
+        return column.map(lambda name: -1 if name == MAIN else first_seen[name])
+    return column
+
+
+def bounded(value: float, low: float, high: float, digits: int = 2) -> str:
+    """An estimate with its interval as text: ``0.50 (0.37 to 0.63)``; a dash where unknown."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"

@@ -1,0 +1,107 @@
+"""What concerns several keys of one experiment together, or things outside the file: names, files, parts that fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import combinations
+from math import dist
+from pathlib import Path
+
+from detectors import detector_names
+from harness.experiment import shape
+from harness.experiment.declared import DETECTOR_NAME
+from harness.experiment.diagnose import nearest, wrong_choice
+from harness.experiment.problems import Problem
+from harness.experiment.recorded import recording_of
+from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
+from harness.experiment.yaml_source import Source
+from harness.vocabulary.errors import UserError
+from scenes.sensor.camera import camera_names
+from scenes.target.checks import check_target
+from scenes.target.declaration import TargetConfig
+
+CAMERA_NAME = ("source", "camera", "name")
+
+
+def name_problems(source: Source) -> Iterator[Problem]:
+    """Names of cameras and detectors that do not exist; from plain data, so that it works beside other problems."""
+    for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
+        name = shape.get(source.data, path)
+        if isinstance(name, str) and name not in legal:
+            yield wrong_choice(path, name, legal, source.place_of(path))
+
+
+def joint_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
+    """Everything that a valid declaration can still get wrong."""
+    if config.capture.average.frames is not None:
+        place = source.key_place_of(("capture", "average", "frames"))
+        yield Problem("an experiment counts its frames by `capture.frames`", place, fix="remove this key")
+    if isinstance(config.source, SimulatedSource):
+        yield from _target_problems(config, config.source, source)
+    else:
+        yield from _capture_problems(config, config.source, source)
+
+
+def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+    target = simulated.target.declare()
+    mistake = _target_mistake(target)
+    if mistake:
+        place = source.place_of(("source", "target"))
+        yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
+    pitch_mm = _smallest_pitch_mm(target)
+    if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
+        yield Problem(
+            f"a matching radius of {config.matching.radius_mm:g} mm reaches beyond half the way to the next damage, so "
+            "that a detection could count for either",
+            source.place_of(("matching", "radius_mm")),
+            legal=f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart",
+        )
+
+
+@lru_cache(maxsize=10_000)
+def _target_mistake(target: TargetConfig) -> UserError | None:
+    try:
+        check_target(target)
+    except UserError as error:
+        return error
+    return None
+
+
+def _smallest_pitch_mm(target: TargetConfig) -> float | None:
+    centres = [hole.centre_mm for hole in target.holes] + [dent.centre_mm for dent in target.dents]
+    return min((dist(a, b) for a, b in combinations(centres, 2)), default=None)
+
+
+def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
+    missing = list(_missing_files(capture, source))
+    yield from missing
+    mistake = None if missing else _recording_mistake(capture)
+    if mistake:
+        yield Problem(mistake.message, source.place_of(("source", "paths")), legal=mistake.legal, fix=mistake.fix)
+    if config.threshold.calibrate is not None:
+        yield Problem(
+            "a threshold can be calibrated only on hole-free repeats, which a capture does not have",
+            source.place_of(("threshold", "calibrate")),
+            legal="a given threshold, such as `k: 3.5`",
+        )
+
+
+def _recording_mistake(capture: CaptureSource) -> UserError | None:
+    try:
+        recording_of(capture)
+    except UserError as error:
+        return error
+    return None
+
+
+def _missing_files(capture: CaptureSource, source: Source) -> Iterator[Problem]:
+    for index, name in enumerate(capture.paths):
+        if not Path(name).exists():
+            near = nearest(Path(name).name, [one.name for one in Path(name).parent.glob("*")])
+            place = source.place_of(("source", "paths", index))
+            yield Problem(f"{name}: there is no such file or folder", place, nearest=near)
+    place = source.place_of(("source", "intrinsics"))
+    if capture.intrinsics and capture.intrinsics not in camera_names() and not Path(capture.intrinsics).is_file():
+        legal = f"a file, or one of {', '.join(camera_names())}"
+        yield Problem(f"{capture.intrinsics}: neither a file nor a camera", place, legal)

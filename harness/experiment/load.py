@@ -1,0 +1,74 @@
+"""From a YAML file and ``--set`` overrides to an experiment, or to everything that is wrong with it. Runs nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.experiment import checks, shape
+from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, splices_of
+from harness.experiment.diagnose import validated
+from harness.experiment.dotted import OPTION, overridden, set_path
+from harness.experiment.points import Experiment
+from harness.experiment.problems import ExperimentError
+from harness.experiment.schema import ExperimentConfig, ValuesVariation
+from harness.experiment.unfold import unfolded
+from harness.experiment.yaml_source import KeyPath, Source, read_yaml, to_yaml
+
+
+def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
+    """Read, override (``path=value`` each), validate and unfold. Raises ExperimentError with all problems at once."""
+    source, problems = overridden(read_yaml(Path(path)), overrides, declared_of)
+    source = _with_absolute_paths(source, Path(path).resolve().parent)
+    config, invalid = validated(ExperimentConfig, source, splices_of(source.data))
+    problems += invalid
+    problems += checks.name_problems(source)
+    if config is not None and not problems:
+        problems += checks.joint_problems(config, source)
+    points, unfolding = unfolded(source, None if problems else config)
+    if problems or unfolding or config is None:
+        raise ExperimentError(str(path), [*problems, *unfolding])
+    return Experiment(config, points, _resolved_data(config, source), source)
+
+
+def resolved_yaml(experiment: Experiment) -> str:
+    """The experiment with every default written out; loading it again gives the same points."""
+    return to_yaml(dict(experiment.data))
+
+
+def _resolved_data(config: ExperimentConfig, source: Source) -> dict[str, Any]:
+    """Every default written out; but where keys of the detector are varied its settings stay as they are written.
+
+    A detector may fill some settings from others (a preset); written out they would count beside a varied preset.
+    """
+    data = config.to_data()
+    study = config.sensitivity
+    varied = [*config.sweep]
+    for variation in study.vary if study else ():
+        varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
+    if any(path.startswith("detector") for path in varied):
+        data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
+    return data
+
+
+def _with_absolute_paths(source: Source, folder: Path) -> Source:
+    """Paths of a real capture, made absolute: they count from the YAML's folder, in ``--set`` from the current one."""
+    data = source.data
+    if shape.get(data, ("source", "kind")) != "capture":
+        return source
+    listed = shape.get(data, ("source", "paths"))
+    names: list[KeyPath] = [
+        ("source", "paths", index) for index in range(len(listed) if isinstance(listed, list) else 0)
+    ]
+    lens = shape.get(data, ("source", "intrinsics"))
+    if isinstance(lens, str) and lens not in checks.camera_names():
+        names.append(("source", "intrinsics"))
+    for at in names:
+        data = _absolute(data, at, Path.cwd() if source.place_of(at).origin == OPTION else folder)
+    return Source(source.origin, source.text, data, source.values, source.keys)
+
+
+def _absolute(data: Any, at: KeyPath, folder: Path) -> Any:
+    name = shape.get(data, at)
+    return set_path(data, at, str(folder / Path(name).expanduser())) if isinstance(name, str) and name else data

@@ -1,0 +1,104 @@
+"""One point of an experiment: everything that decides its numbers, and the digests that name them.
+
+A digest covers content that can change a number and nothing else: not the name, the number of repeats, or what the
+other points are. So adding a value to an axis leaves every other point, its seeds and its finished trials as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.experiment import recorded
+from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
+from harness.experiment.yaml_source import Source
+from harness.vocabulary.seeds import digest
+from scenes.sensor.camera import camera_digest, load_camera
+
+MAIN = "main"
+"""The variant of every point that is not a variation of the sensitivity study."""
+
+NO_NUMBERS = ("name", "title", "repeats", "sweep", "sensitivity")
+"""Keys that decide which trials are run, not what a trial gives."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
+
+    ``variant`` is "main" or the label of a variation; ``label`` tells points apart in tables. ``digest`` names the
+    point's numbers, ``frames_key`` those of its frames (source and seed), ``render_key`` those of its render.
+    """
+
+    label: str
+    variant: str
+    values: Mapping[str, Any]
+    config: ExperimentConfig
+    digest: str
+    render_key: str
+    frames_key: str
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A valid experiment, unfolded. ``data`` is the resolved declaration as plain data, ``source`` what was read."""
+
+    config: ExperimentConfig
+    points: tuple[Point, ...]
+    data: Mapping[str, Any]
+    source: Source
+
+    @property
+    def digest(self) -> str:
+        """Names the experiment's results: all points with their repeats, in order."""
+        return digest([[point.variant, point.label, point.digest, point.config.repeats] for point in self.points])
+
+    def folder(self, results: Path) -> Path:
+        """Where the results go: ``results/<name>/<digest>``; the name's legal letters keep it inside ``results``."""
+        return Path(results) / self.config.name / self.digest
+
+
+def point_of(
+    label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig, detector_version: int
+) -> Point:
+    """A point from its resolved declaration. The detector's version counts, because it can change numbers."""
+    source = source_content(config.source)
+    numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
+    return Point(
+        label,
+        variant,
+        values,
+        config,
+        digest=digest({**numbers, "source": source, "detector_version": detector_version}),
+        render_key=digest(render_content(config.source)),
+        frames_key=digest({"source": source, "seed": config.seed}),
+    )
+
+
+def source_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
+    """What decides the frames of a source, seeds aside: the full target and the camera's numbers, or files' content."""
+    if isinstance(source, SimulatedSource):
+        camera = {**source.camera.to_data(), "facts": camera_digest(load_camera(source.camera.name))}
+        return {
+            "kind": source.kind,
+            "target": source.target.declare().to_data(),
+            "camera": camera,
+            "render": source.render.to_data(),
+        }
+    return recorded.content_of(source)
+
+
+def render_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
+    """What decides the noise-free render: the target, the lens, the emitter, the modulation and the window's margin."""
+    if not isinstance(source, SimulatedSource):
+        return source_content(source)
+    camera = load_camera(source.camera.name)
+    optics = [camera.lens, camera.emitter, camera.modulation]
+    return {
+        "target": source.target.declare().to_data(),
+        "optics": [part.to_data() for part in optics],
+        "margin_px": camera.margin_px,
+        "render": source.render.to_data(),
+    }

@@ -1,0 +1,133 @@
+"""What an experiment's YAML may say. Ranges of single fields are here; what concerns several together in `checks`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from detectors.average import AverageConfig
+from harness.vocabulary.config import Config
+from scenes.render.settings import RenderConfig
+from scenes.sensor.camera import CameraConfig
+from scenes.target.declaration import AnyTargetConfig
+
+MAX_FRAMES = 10_000
+MAX_REPEATS = 100_000
+
+Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
+Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
+AxisValues = Annotated[
+    tuple[Any, ...],
+    Field(min_length=1, max_length=1000),
+    # strict mode takes no list for a tuple, and within a mapping nothing has made one of it yet
+    BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values),
+]
+DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
+Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
+Reason = Annotated[str, Field(min_length=1, max_length=1000)]
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+class SimulatedSource(Config):
+    """Frames come from a simulated camera that looks at a declared target."""
+
+    kind: Literal["simulated"]
+    target: AnyTargetConfig
+    camera: CameraConfig = CameraConfig()
+    render: RenderConfig = RenderConfig()
+
+
+class CaptureSource(Config):
+    """Frames come from a real capture; see `detectors.recordings.open_capture`. Paths count from the YAML's folder."""
+
+    kind: Literal["capture"]
+    paths: Annotated[tuple[FileName, ...], Field(min_length=1, max_length=100_000)] = Field(
+        description="files or one folder of depth frames"
+    )
+    unit: str | None = Field(None, description="of stored depth, where the files do not say")
+    intrinsics: FileName | None = Field(None, description="a file with the lens, or a camera's name")
+
+
+class CaptureConfig(Config):
+    """How many frames are averaged, and how."""
+
+    frames: Frames
+    average: AverageConfig = AverageConfig()
+
+
+class DetectorConfig(Config):
+    """A detector by name; its settings are its own declaration, checked with the rest."""
+
+    name: str = "thesis"
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+
+class CalibrateConfig(Config):
+    """The threshold is the lowest k that gives no false cluster in so many hole-free repeats of the same set-up."""
+
+    repeats: Repeats
+
+
+class ThresholdConfig(Config):
+    """A threshold k that is given, or calibrated: one of the two."""
+
+    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's scale")
+    calibrate: CalibrateConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_of_the_two(self) -> Self:
+        if (self.k is None) == (self.calibrate is None):
+            raise ValueError("give either `k` or `calibrate`, and not both")
+        return self
+
+
+class MatchingConfig(Config):
+    """Which detection counts for which damage: the nearest centre within this radius on the face, one to one."""
+
+    radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
+
+
+class ValuesVariation(Config):
+    """One key tried at other values, one at a time."""
+
+    path: DottedPath
+    values: AxisValues
+    reason: Reason
+
+
+class LabelledVariation(Config):
+    """Several keys changed together, under one label."""
+
+    label: Label
+    set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
+    reason: Reason
+
+
+class SensitivityConfig(Config):
+    """One-at-a-time variations of the experiment, each run at a few numbers of frames with fewer repeats."""
+
+    repeats: Repeats
+    calibration_repeats: Repeats | None = Field(
+        None, description="hole-free repeats of a variation; null: as threshold"
+    )
+    frames: Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100)]
+    vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
+
+
+class ExperimentConfig(Config):
+    """One complete experiment, and the axes over which it is swept."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = Field(
+        description="letters, digits, - and _; it names a folder of results"
+    )
+    title: Annotated[str, Field(max_length=300)] = ""
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
+    source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
+    capture: CaptureConfig
+    detector: DetectorConfig = DetectorConfig()
+    threshold: ThresholdConfig
+    matching: MatchingConfig = MatchingConfig()
+    repeats: Repeats = 1
+    sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
+    sensitivity: SensitivityConfig | None = None

@@ -1,0 +1,222 @@
+"""Pictures of averaged clouds: points with the damage in magenta, residuals in mm, depth profiles through holes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.evaluation.profile import HoleInView, hole_shape, relative_radius, true_residual_mm
+from harness.report.canvas import BLUE, DAMAGE, GREY, INK, ORANGE, svg
+from harness.report.example import ExampleCloud
+from harness.report.measures import inches
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PROFILES = 6
+"""Holes shown in profile, the largest ones."""
+SMALLEST_RING_PX = 2.5
+"""Rings are drawn no smaller than this, or those of the smallest holes could not be seen."""
+WIDTH_IN = 10.0
+LOOKS = {"bowl": "like a bowl", "cylinder": "like a cylinder", "neither": "neither clearly"}
+
+Paint = Callable[["Axes", ExampleCloud, "_Frame"], None]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The searched part of a cloud and the map from pixels to mm in the camera's frame: zero + step * pixel."""
+
+    rows: slice
+    cols: slice
+    x_zero: float
+    x_step: float
+    y_zero: float
+    y_step: float
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """left, right, bottom, top of the picture in mm; y points down, as in the camera's frame."""
+        u0, u1 = self.cols.start - 0.5, self.cols.stop - 0.5
+        v0, v1 = self.rows.start - 0.5, self.rows.stop - 0.5
+        x, y = (lambda u: self.x_zero + self.x_step * u), (lambda v: self.y_zero + self.y_step * v)
+        return x(u0), x(u1), y(v1), y(v0)
+
+    @property
+    def aspect(self) -> float:
+        """Height over width."""
+        left, right, bottom, top = self.extent
+        return abs((bottom - top) / (right - left))
+
+
+def cloud_figure(clouds: Sequence[ExampleCloud]) -> str:
+    """The points of each cloud in their colours, damage in magenta, rings at the true holes (dashed: not found)."""
+
+    def paint(axes: Axes, cloud: ExampleCloud, frame: _Frame) -> None:
+        axes.imshow(_coloured(cloud)[frame.rows, frame.cols], extent=frame.extent, aspect="equal")
+        for hole in cloud.truth:
+            _ring(axes, frame, hole, found=_touched(cloud, hole))
+        axes.set_title(
+            f"{_frames(cloud)}: {sum(_touched(cloud, h) for h in cloud.truth)} of {len(cloud.truth)} holes marked"
+        )
+
+    alt = (
+        "Front view of the averaged cloud in its colours with detected damage in magenta and a ring at each true hole."
+    )
+    return _stacked("cloud", clouds, alt, paint)
+
+
+def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
+    """Distance behind (+) or before (-) the fitted surface, mm; linear within 1 mm, logarithmic beyond, grey: none."""
+    from matplotlib.colors import SymLogNorm
+
+    finite = [np.abs(c.residual_mm[c.inside & np.isfinite(c.residual_mm)]) for c in clouds]
+    pooled = np.concatenate(finite) if finite else np.zeros(0)
+    limit = max(10.0, float(np.quantile(pooled, 0.9995)) if pooled.size else 0.0)
+
+    def paint(axes: Axes, cloud: ExampleCloud, frame: _Frame) -> None:
+        shown = np.where(cloud.inside, cloud.residual_mm, np.nan)[frame.rows, frame.cols]
+        norm = SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
+        picture = axes.imshow(shown, extent=frame.extent, aspect="equal", norm=norm, cmap="RdBu_r")
+        axes.set_facecolor("#b9bec4")
+        axes.set_title(f"{_frames(cloud)}: distance behind the fitted surface")
+        bar = axes.figure.colorbar(picture, cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)), extend="both")
+        bar.set_label("mm")
+        ticks = [t for t in (-100, -10, -1, 0, 1, 10, 100) if abs(t) <= limit]
+        bar.set_ticks(ticks, labels=[f"{t:+d}".replace("-", "−") if t else "0" for t in ticks])
+        bar.minorticks_off()
+
+    alt = "Range residual of each pixel in millimetres: noise and pattern of the face near zero, holes far behind it."
+    return _stacked("residual", clouds, alt, paint)
+
+
+def profile_figure(clouds: Sequence[ExampleCloud]) -> str:
+    """Depth along a row of pixels through the largest holes, with the true geometry and the best-fitting bowl."""
+    last = clouds[-1]
+    holes = sorted(last.truth, key=lambda hole: hole.diameter_mm)[-PROFILES:]
+    columns = min(3, len(holes))
+    rows = -(-len(holes) // columns)
+
+    def draw(figure: Figure) -> None:
+        grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
+        for axes, hole in zip(grid, holes, strict=False):
+            _profile(axes, list(clouds), hole)
+        for axes in grid[len(holes) :]:
+            axes.set_visible(False)
+        for axes in grid[max(0, len(holes) - columns) : len(holes)]:
+            axes.set_xlabel("across the hole (mm)")
+        for axes in grid[::columns]:
+            axes.set_ylabel("depth (mm)")
+        handles, labels = grid[-1 if len(holes) == len(grid) else 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+
+    alt = "Depth profiles through the largest holes: measured points, the true cylinder, and a scaled hemisphere."
+    return svg("profile", (WIDTH_IN, 2.7 * rows + 0.4), alt, draw)
+
+
+def _profile(axes: Axes, clouds: list[ExampleCloud], hole: HoleInView) -> None:
+    radius_mm, last = hole.diameter_mm / 2, clouds[-1]
+    across = (np.arange(last.residual_mm.shape[1]) - hole.u_px) / hole.radius_px * radius_mm
+    row = int(np.clip(round(hole.v_px), 0, last.residual_mm.shape[0] - 1))
+    near = np.abs(across) < max(2 * radius_mm, radius_mm + 6)
+    true = true_residual_mm(last, hole)[row]
+    axes.plot(across[near], true[near], color=INK, lw=1.3, drawstyle="steps-mid", label="true geometry on these pixels")
+    deepest = 1.0
+    for cloud in clouds[:1] + clouds[-1:] if len(clouds) > 1 else clouds:
+        z = cloud.residual_mm[row]
+        colour, marker, line = (BLUE, "o", "-") if cloud is last else (GREY, "^", "")
+        axes.plot(across[near], z[near], line, color=colour, marker=marker, ms=4, lw=1, label=_measured(cloud))
+        finite = z[near & np.isfinite(z)]
+        deepest = max(deepest, float(finite.max()) if finite.size else 0.0)
+    shape = hole_shape(last, hole)
+    if shape is not None:
+        x = np.linspace(-radius_mm, radius_mm, 101)
+        y = shape.bowl_depth_mm * np.sqrt(1 - (x / radius_mm) ** 2)
+        axes.plot(x, y, "--", color=ORANGE, label="hemisphere, depth fitted")
+        deepest = max(deepest, shape.bowl_depth_mm)
+    floor = float(np.nanmax(true[near])) if np.isfinite(true[near]).any() else deepest
+    shown = floor if floor <= 3 * deepest else 1.6 * deepest
+    if shown < floor:
+        axes.annotate(f"true floor at {floor:.0f} mm", (0, 1.5 * deepest), ha="center", fontsize=8.5, color=INK)
+    axes.set_ylim(1.12 * max(shown, deepest), -0.15 * max(shown, deepest))
+    axes.set_title(
+        f"Hole {hole.hole}, {inches(hole.diameter_mm) or f'{hole.diameter_mm:.1f} mm'}"
+        + (f": {LOOKS[shape.looks]}" if shape else "")
+    )
+
+
+def _stacked(name: str, clouds: Sequence[ExampleCloud], alt: str, paint: Paint) -> str:
+    """One picture under the other, each with its axes in mm."""
+    frames = [_framed(cloud) for cloud in clouds]
+    height = sum(min(max(0.92 * WIDTH_IN * frame.aspect, 1.1), 7.0) + 0.75 for frame in frames)
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(len(clouds), 1, squeeze=False)[:, 0]
+        for axes, cloud, frame in zip(panels, clouds, frames, strict=True):
+            paint(axes, cloud, frame)
+            axes.grid(visible=False)
+            axes.set_ylabel("y down (mm)")
+        panels[-1].set_xlabel("x in the camera's frame (mm)")
+
+    return svg(name, (WIDTH_IN, height), alt, draw)
+
+
+def _framed(cloud: ExampleCloud) -> _Frame:
+    """The searched rectangle and its scale by least squares on the valid points (a board seen nearly frontally)."""
+    searched = cloud.inside if cloud.inside.any() else np.ones_like(cloud.inside)
+    v_all, u_all = np.nonzero(searched)
+    valid = searched & np.isfinite(cloud.points_m[..., 2])
+    if valid.sum() < 3:
+        valid = np.zeros_like(searched)
+    v, u = np.nonzero(valid)
+    x, y = cloud.points_m[valid][:, 0] * 1e3, cloud.points_m[valid][:, 1] * 1e3
+    x_step, x_zero = np.polyfit(u, x, 1) if len(set(u)) > 1 else (1.0, 0.0)
+    y_step, y_zero = np.polyfit(v, y, 1) if len(set(v)) > 1 else (1.0, 0.0)
+    rows, cols = slice(int(v_all.min()), int(v_all.max()) + 1), slice(int(u_all.min()), int(u_all.max()) + 1)
+    return _Frame(rows, cols, float(x_zero), float(x_step), float(y_zero), float(y_step))
+
+
+def _coloured(cloud: ExampleCloud) -> np.ndarray:
+    """(h, w, 3) uint8: the cloud's colours, grey where no point is, paler outside the crop, magenta for damage."""
+    picture = cloud.rgb.astype(float)
+    picture[~np.isfinite(cloud.points_m[..., 2])] = 185
+    picture[~cloud.inside] = 0.4 * picture[~cloud.inside] + 0.6 * 255
+    picture[cloud.detected] = tuple(int(DAMAGE[i : i + 2], 16) for i in (1, 3, 5))
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def _touched(cloud: ExampleCloud, hole: HoleInView) -> bool:
+    """Whether a pixel of the hole (at least the central one) belongs to a detected cluster in this very cloud."""
+    radius = relative_radius(cloud, hole)
+    return bool(cloud.detected[radius <= max(1.0, 0.75 / hole.radius_px)].any())
+
+
+def _ring(axes: Axes, frame: _Frame, hole: HoleInView, *, found: bool) -> None:
+    from matplotlib.patches import Circle
+
+    centre = (frame.x_zero + frame.x_step * hole.u_px, frame.y_zero + frame.y_step * hole.v_px)
+    radius = max(hole.radius_px, SMALLEST_RING_PX) * abs(frame.x_step)
+    style = {"ls": "-", "ec": INK, "lw": 1.0} if found else {"ls": (0, (2.5, 1.8)), "ec": "#000000", "lw": 1.4}
+    axes.add_patch(Circle(centre, radius, fill=False, **style))
+    axes.annotate(
+        hole.hole,
+        (centre[0], centre[1] - radius),
+        (0, 2.5),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=9,
+        color="#000000",
+    )
+
+
+def _measured(cloud: ExampleCloud) -> str:
+    return f"measured, {_frames(cloud)}"
+
+
+def _frames(cloud: ExampleCloud) -> str:
+    return "1 frame" if cloud.frames == 1 else f"{cloud.frames} frames averaged"

@@ -1,0 +1,191 @@
+"""What `harness.detect` found, as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
+
+All files of one run are written beside their final names first and renamed together at the end.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from detectors.interface import Detection, Evidence, Measurement
+from harness.report.findings_picture import save_picture
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.files import atomic_path
+from harness.vocabulary.units import MM
+
+DAMAGE_RGB = (255, 0, 255)
+"""Magenta, as in the thesis' figure 3."""
+COLUMNS = (
+    "id", "u_px", "v_px", "x_mm", "y_mm", "z_mm", "diameter_mm", "depth_mm", "volume_mm3", "points", "score",
+)  # fmt: skip
+FILES = ("findings.csv", "findings.json", "annotated.png", "cloud.ply")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row: the best of both measures, camera frame. NaN where nothing could be measured.
+
+    ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth) or ``extent`` (the thesis'
+    extreme points). ``depth_from``: likewise, or ``extreme residual`` of the cluster's points.
+    """
+
+    id: int
+    u_px: float
+    v_px: float
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    diameter_mm: float
+    depth_mm: float
+    volume_mm3: float
+    points: int
+    score: float
+    size_from: str
+    depth_from: str
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A cloud with all that a detector said about it; ``measurements`` and ``detections`` side by side."""
+
+    cloud: Cloud
+    evidence: Evidence
+    detections: tuple[Detection, ...]
+    measurements: tuple[Measurement, ...]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Numbered from 1, strongest first."""
+        pairs = zip(self.detections, self.measurements, strict=True)
+        return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
+
+
+def finding_of(number: int, evidence: Evidence, detection: Detection, measured: Measurement) -> Finding:
+    """The row of one detection: the model's numbers where they exist, else those of the extents."""
+    modelled = math.isfinite(measured.model_diameter_m)
+    placed = bool(np.isfinite(measured.model_centre_m).all())
+    centre_mm = (measured.model_centre_m if placed else measured.extent_centre_m) / MM
+    diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
+    size_from = "extent" if not modelled else "contour" if math.isnan(measured.model_diameter_se_m) else "model"
+    depth_m, depth_from = measured.model_depth_m, size_from
+    if math.isnan(depth_m):
+        residuals = evidence.residual_m.reshape(-1)[detection.pixels]
+        depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
+    return Finding(
+        id=number,
+        u_px=measured.u_px,
+        v_px=measured.v_px,
+        x_mm=float(centre_mm[0]),
+        y_mm=float(centre_mm[1]),
+        z_mm=float(centre_mm[2]),
+        diameter_mm=diameter_m / MM,
+        depth_mm=depth_m / MM,
+        volume_mm3=measured.volume_m3 / MM**3,
+        points=measured.points,
+        score=measured.score,
+        size_from=size_from,
+        depth_from=depth_from,
+    )
+
+
+def write_findings(folder: Path, judged: Judged, about: Mapping[str, Any], title: str) -> tuple[Path, ...]:
+    """Write all files of a run into ``folder`` (made where it is missing); all of them or none.
+
+    ``about``: what the JSON says beside the findings (capture, threshold, settings, provenance): plain data.
+    Raises UserError where the folder cannot be written or the disk is full.
+    """
+    is_new = not folder.exists()
+    try:
+        with ExitStack() as stack:
+            part = {name: stack.enter_context(atomic_path(folder / name)) for name in FILES}
+            part["findings.csv"].write_text(csv_text(judged.findings), encoding="utf-8")
+            part["findings.json"].write_text(json_text(judged, about), encoding="utf-8")
+            save_picture(part["annotated.png"], judged.cloud, judged.evidence, judged.detections, title)
+            part["cloud.ply"].write_bytes(ply_bytes(judged.cloud, judged.detections))
+    except BaseException:
+        if is_new and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+    return tuple(folder / name for name in FILES)
+
+
+def csv_text(findings: Sequence[Finding]) -> str:
+    """The table with the columns `COLUMNS`; an empty cell where there is no number."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for finding in findings:
+        row = asdict(finding)
+        writer.writerow([_cell(row[column]) for column in COLUMNS])
+    return text.getvalue()
+
+
+def _cell(value: float | int) -> str:
+    if isinstance(value, int):
+        return str(value)
+    return f"{value:.4f}" if math.isfinite(value) else ""
+
+
+def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
+    """The findings with both measures and their standard errors, then ``about``; null where there is no number."""
+    rows = []
+    for finding, measured in zip(judged.findings, judged.measurements, strict=True):
+        rows.append({**asdict(finding), "extent": _extent(measured), "model": _model(measured)})
+    return json.dumps(_without_nan({"findings": rows, **about}), indent=2, allow_nan=False) + "\n"
+
+
+def _extent(measured: Measurement) -> dict[str, Any]:
+    return {
+        "diameter_mm": measured.extent_diameter_m / MM,
+        "centre_mm": [float(value) / MM for value in measured.extent_centre_m],
+    }
+
+
+def _model(measured: Measurement) -> dict[str, Any]:
+    return {
+        "diameter_mm": measured.model_diameter_m / MM,
+        "diameter_se_mm": measured.model_diameter_se_m / MM,
+        "depth_mm": measured.model_depth_m / MM,
+        "depth_se_mm": measured.model_depth_se_m / MM,
+        "centre_mm": [float(value) / MM for value in measured.model_centre_m],
+        "centre_se_mm": measured.model_centre_se_m / MM,
+        "note": measured.model_note,
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    """Plain data with null for NaN and infinity, and Python's numbers for NumPy's."""
+    if isinstance(value, Mapping):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, np.generic):
+        return _without_nan(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
+    """The valid points (camera frame, metres, float32) as a binary PLY: damage magenta, else its colour or grey."""
+    import trimesh
+
+    colours = np.full((cloud.valid.size, 3), 160, np.uint8) if cloud.rgb is None else _flat_bytes(cloud.rgb)
+    for detection in detections:
+        colours[detection.pixels] = DAMAGE_RGB
+    valid = cloud.valid.reshape(-1)
+    points = trimesh.PointCloud(cloud.points_m.reshape(-1, 3)[valid], colors=colours[valid])
+    exported: bytes = points.export(file_type="ply")
+    return exported
+
+
+def _flat_bytes(rgb: np.ndarray) -> np.ndarray:
+    return np.clip(np.nan_to_num(rgb), 0, 255).reshape(-1, 3).astype(np.uint8)

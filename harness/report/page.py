@@ -1,0 +1,285 @@
+"""The report: result tables in, one self-contained HTML page out. It opens without a network and runs no script."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.evaluation.claims import RULES, Verdict, hole_list, score_claims, verdicts_by_variant
+from harness.evaluation.noise import noise_against_frames
+from harness.evaluation.profile import RINGS, hole_shapes
+from harness.evaluation.summary import (
+    FOUND_RULE,
+    MAIN,
+    STATES,
+    ResultTables,
+    bounded,
+    false_calls,
+    found_holes,
+    summarise_holes,
+)
+from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_figure
+from harness.report.example import ExampleCloud
+from harness.report.measures import inches, positions_figure, sizes_figure
+from harness.report.noise import noise_figure
+from harness.vocabulary.files import write_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MARKS = {"borne out": "✓", "not borne out": "✗", "undecided": "?"}
+CLASSES = {"borne out": "yes", "not borne out": "no", "undecided": "open"}
+SHOWN_APART = ("command", "seconds", "failures")
+"""Keys of the provenance with a section of their own."""
+
+
+def write_report(
+    folder: Path,
+    tables: ResultTables,
+    examples: Sequence[ExampleCloud],
+    provenance: Mapping[str, Any],
+    experiment_yaml_text: str,
+    title: str,
+) -> Path:
+    """Write ``folder/report.html`` and return its path.
+
+    ``provenance`` may hold: ``command``, ``commit``, ``dirty``, ``versions``, ``mitsuba_variant``, ``seed``,
+    ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``cache_hits``, ``failures`` (texts, or
+    mappings with their parts); whatever else it holds is shown as it is, and a missing one as not recorded. The same
+    input gives the same bytes. Raises UserError where the folder cannot be written.
+    """
+    page = report_html(tables, examples, provenance, experiment_yaml_text, title)
+    path = Path(folder) / "report.html"
+    write_text(path, page)
+    return path
+
+
+def report_html(
+    tables: ResultTables,
+    examples: Sequence[ExampleCloud],
+    provenance: Mapping[str, Any],
+    experiment_yaml_text: str,
+    title: str,
+) -> str:
+    """The page as text; see `write_report`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    summary = summarise_holes(tables.holes)
+    main = summary[summary["variant"] == MAIN]
+    noise = noise_against_frames(tables.probes[tables.probes["variant"] == MAIN])
+    clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
+    verdicts = score_claims(tables, MAIN, examples, summary)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        title=title,
+        answer=answer_sentence(main, verdicts),
+        found_rule=FOUND_RULE,
+        frames=sorted(int(n) for n in main["frames"].unique()),
+        repeats=int(main["n"].max()) if len(main) else 0,
+        holes=_hole_rows(main),
+        figures=_figures(main, noise, clouds),
+        shapes=_shape_rows(clouds),
+        rings=[f"{ring:g} R" for ring in RINGS],
+        verdicts=verdicts,
+        marks=MARKS,
+        classes=CLASSES,
+        claims=list(RULES),
+        variants=_variant_rows(verdicts_by_variant(tables, examples, summary)),
+        noise=noise.to_dict("records"),
+        calls=_call_rows(false_calls(tables.runs)),
+        failures=[_plain(failure) for failure in provenance.get("failures", ())],
+        left_out=_left_out(tables.runs),
+        seconds=_seconds(provenance),
+        provenance=_provenance_rows(provenance),
+        command=provenance.get("command", "not recorded"),
+        experiment=experiment_yaml_text,
+    )
+
+
+def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict]) -> str:
+    """What the experiment says, in a sentence or two: the holes found with the most and the fewest frames, the claims.
+
+    ``main``: summary rows of the main variant.
+    """
+    if main.empty:
+        return "No trial of the main experiment finished, so there is no answer."
+    frames = sorted(int(n) for n in main["frames"].unique())
+    parts = [f"With {_counted(frames[-1])} the camera finds {_found_phrase(main, frames[-1])}"]
+    if len(frames) > 1:
+        parts.append(f"with {_counted(frames[0])} {_found_phrase(main, frames[0])}")
+    answers = [
+        f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
+        for answer in MARKS
+        if (names := [verdict.claim for verdict in verdicts if verdict.verdict == answer])
+    ]
+    listed = answers[0] if len(answers) == 1 else ", ".join(answers[:-1]) + " and " + answers[-1]
+    return f"{'; '.join(parts)}. Of the {len(verdicts)} claims scored, {listed}."
+
+
+def _found_phrase(main: pd.DataFrame, frames: int) -> str:
+    status = found_holes(main, MAIN, frames)
+    found = [hole for hole, state in status.items() if state == "found"]
+    open_ = [hole for hole, state in status.items() if state == "undecided"]
+    text = f"{len(found)} of {len(status)} holes"
+    if found:
+        least = float(main["true_diameter_mm"][main["hole"].isin(found)].min())
+        text += f" ({hole_list(found)}; the smallest is {least:.2f} mm{', ' + inches(least) if inches(least) else ''})"
+    return text + (f" and {hole_list(open_)} undecided" if open_ else "")
+
+
+def _counted(frames: int) -> str:
+    return "one frame" if frames == 1 else f"{frames} averaged frames"
+
+
+def _figures(main: pd.DataFrame, noise: pd.DataFrame, clouds: Sequence[ExampleCloud]) -> dict[str, str]:
+    """The figures that the data allow, as SVG text by name."""
+    figures: dict[str, str] = {}
+    if len(main):
+        frames = sorted(int(n) for n in main["frames"].unique())
+        figures |= {"sizes": sizes_figure(main, frames[0], frames[-1])}
+        figures |= {"positions": positions_figure(main, frames[-1])}
+    if clouds:
+        figures |= {
+            "cloud": cloud_figure(clouds),
+            "residual": residual_figure(clouds),
+            "profile": profile_figure(clouds),
+        }
+    if len(noise) and (noise["temporal_rms_mm"] > 0).all():
+        figures |= {"noise": noise_figure(noise)}
+    return figures
+
+
+def _hole_rows(main: pd.DataFrame) -> list[dict[str, Any]]:
+    """One row per hole with a cell per number of frames: counts, interval, shade of blue by rate."""
+    out = []
+    for hole, part in main.groupby("hole", sort=False):
+        first = part.iloc[0]
+        out.append(
+            {
+                "hole": hole,
+                "drill": inches(float(first["true_diameter_mm"])),
+                "diameter": f"{first['true_diameter_mm']:.2f}",
+                "kind": first["kind"],
+                "cells": {int(row["frames"]): _cell(row) for _, row in part.iterrows()},
+            }
+        )
+    return out
+
+
+def _cell(row: pd.Series) -> dict[str, str]:
+    rate = float(row["rate"])
+    interval = bounded(rate, row["rate_low"], row["rate_high"])
+    states = {state: float(row[f"share_{state.replace(' ', '_')}"]) for state in STATES}
+    seen = ", ".join(f"{state} {100 * share:.0f} %" for state, share in states.items() if share > 0)
+    weight = 0.06 + 0.94 * rate
+    shade = [round(255 + (channel - 255) * weight) for channel in (0, 94, 156)]
+    return {
+        "count": f"{row['detected']}/{row['n']}",
+        "interval": f"{row['rate_low']:.2f}–{row['rate_high']:.2f}",
+        "status": str(row["status"]),
+        "style": f"background:rgb({shade[0]},{shade[1]},{shade[2]});color:{'#fff' if rate > 0.5 else '#1d2530'}",
+        "title": f"{row['status']}: rate {interval}, 95 % Wilson interval. The hole's pixels: {seen or 'unknown'}",
+    }
+
+
+def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
+    if not clouds:
+        return []
+    return [
+        {
+            "hole": shape.hole,
+            "pixels": str(shape.pixels),
+            "depth": _mm(shape.true_depth_mm, 1),
+            "bowl": _mm(shape.bowl_rms_mm),
+            "cylinder": _mm(shape.cylinder_rms_mm),
+            "true_bowl": _mm(shape.true_bowl_rms_mm),
+            "true_cylinder": _mm(shape.true_cylinder_rms_mm),
+            "reached": [f"{100 * share:.0f} %" if np.isfinite(share) else "–" for share in shape.reached],
+            "looks": LOOKS[shape.looks],
+        }
+        for shape in hole_shapes(clouds[-1])
+    ]
+
+
+def _variant_rows(variants: pd.DataFrame) -> list[dict[str, Any]]:
+    """The sensitivity table's rows; a cell knows whether it differs from the main variant's."""
+    rows = [{str(key): value for key, value in row.items()} for row in variants.to_dict("records")]
+    main = next((row for row in rows if row["variant"] == MAIN), None)
+    for row in rows:
+        compared = [*RULES, "found_1", "found_50"]
+        row["changed"] = {key for key in compared if main is not None and row[key] != main[key]}
+    return rows
+
+
+def _call_rows(calls: pd.DataFrame) -> list[dict[str, str]]:
+    return [
+        {
+            "frames": str(row["frames"]),
+            "role": "damaged board" if row["role"] == "damaged" else "hole-free board (sets the threshold)",
+            "count": f"{row['false_calls']} in {row['runs']}",
+            "rate": bounded(row["per_run"], row["per_run_low"], row["per_run_high"], 3),
+            "threshold": f"{row['threshold']:.2f}",
+            "threshold_mm": _mm(row["threshold_mm"]),
+            "noise": _mm(row["surface_noise_mm"], 3),
+        }
+        for _, row in calls[calls["variant"] == MAIN].iterrows()
+    ]
+
+
+def _left_out(runs: pd.DataFrame) -> str:
+    """How many frames averaging left out as disturbed, over all runs."""
+    out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
+    return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
+
+
+def _seconds(provenance: Mapping[str, Any]) -> list[tuple[str, str, float]]:
+    """(stage, seconds as text, share of the longest in per cent)."""
+    seconds = {stage: float(value) for stage, value in dict(provenance.get("seconds", {})).items()}
+    longest = max(seconds.values(), default=0.0) or 1.0
+    return [(stage, f"{value:.1f}", round(100 * value / longest, 1)) for stage, value in seconds.items()]
+
+
+def _provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    expected = (
+        "commit",
+        "dirty",
+        "seed",
+        "started",
+        "machine",
+        "mitsuba_variant",
+        "indirect_noise_mm",
+        "cache_hits",
+        "versions",
+    )
+    others = [key for key in provenance if key not in expected and key not in SHOWN_APART]
+    return [
+        (key.replace("_mm", " (mm)").replace("_", " "), _plain(provenance.get(key, "not recorded")))
+        for key in (*expected, *others)
+    ]
+
+
+def _plain(value: Any) -> str:
+    """A recorded value as text: yes and no, ``name: value`` pairs, lists; never Python's own notation."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_plain(part)}" for key, part in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_plain(part) for part in value) or "none"
+    if value is None:
+        return "not recorded"
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _mm(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"

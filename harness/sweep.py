@@ -1,0 +1,67 @@
+"""``python -m harness.sweep experiments/averaging.yaml``: run an experiment and write its report."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from harness.vocabulary.errors import exit_code_of
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, given))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.sweep",
+        description="Run an experiment: render its targets, simulate the camera, detect, measure, report.",
+        epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
+    )
+    parser.add_argument("experiment", type=Path, help="a YAML file, such as experiments/averaging.yaml")
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        metavar="PATH=VALUE",
+        action="append",
+        default=[],
+        help="change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated",
+    )
+    parser.add_argument("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
+    return parser
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 4096:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
+    return int(text)
+
+
+def _run(options: argparse.Namespace, given: list[str]) -> int:
+    from harness.experiment.load import load_experiment
+    from harness.experiment.schema import SimulatedSource
+
+    experiment = load_experiment(options.experiment, options.overrides)
+    command = "python -m harness.sweep " + shlex.join(given)
+    if not isinstance(experiment.config.source, SimulatedSource):
+        from harness.engine.captures import judge_captures
+
+        return judge_captures(experiment, options.out, command, dry_run=options.dry_run)
+    from harness.engine.study import dry_run, run_study
+
+    if options.dry_run:
+        return dry_run(experiment, options.out, options.jobs)
+    return run_study(experiment, options.out, options.jobs, command)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,211 @@
+"""What a user may say about a target: board, damage, tape, material, backing, room and pose.
+
+Frames. ``board``: x along the row, y up the face, z out of the face towards the camera, origin on the face's centre.
+``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
++x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
+fields are checked here; what concerns several together (a hole that leaves the board) by `scenes.target.checks`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from harness.vocabulary.config import Config
+
+Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
+Rgb = tuple[Albedo, Albedo, Albedo]
+Coordinate = Annotated[float, Field(ge=-5e3, le=5e3)]
+Length = Annotated[float, Field(ge=1.0, le=1e4)]
+PlaceMm = tuple[Coordinate, Coordinate]
+SizeMm = tuple[Length, Length]
+DamageId = Annotated[int, Field(ge=1, le=9999)]
+
+
+class FlatConfig(Config):
+    """A flat face."""
+
+    kind: Literal["flat"] = "flat"
+
+
+class CylinderConfig(Config):
+    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), s the co-ordinate across the straight direction."""
+
+    kind: Literal["cylinder"]
+    radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
+    straight_along: Literal["x", "y"] = "y"
+    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
+
+
+class SphereConfig(Config):
+    """A face that is part of a sphere: z = +-(sqrt(R^2 - x^2 - y^2) - R)."""
+
+    kind: Literal["sphere"]
+    radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
+    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
+
+
+class TermConfig(Config):
+    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y / height)^power_y.
+
+    Co-ordinates count in half boards, so a coefficient is the term's height in millimetres at the edge. No constant
+    term: the face's centre is the frame's origin.
+    """
+
+    power_x: Annotated[int, Field(ge=0, le=8)]
+    power_y: Annotated[int, Field(ge=0, le=8)]
+    coefficient_mm: Annotated[float, Field(ge=-1e3, le=1e3)]
+
+    @model_validator(mode="after")
+    def _not_constant(self) -> Self:
+        if self.power_x + self.power_y == 0:
+            raise ValueError("a constant term is not legal: the face's centre has z = 0")
+        return self
+
+
+class PolynomialConfig(Config):
+    """A face whose height towards the camera is any polynomial: the sum of its terms."""
+
+    kind: Literal["polynomial"]
+    terms: Annotated[tuple[TermConfig, ...], Field(min_length=1, max_length=45)]
+
+
+ShapeConfig = Annotated[
+    FlatConfig | CylinderConfig | SphereConfig | PolynomialConfig,
+    Field(discriminator="kind", default_factory=FlatConfig),
+]
+
+
+class BoardConfig(Config):
+    """A board, rectangular in plan (along z, in which its size counts), equally thick along the normal."""
+
+    width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
+    height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
+    thickness_mm: Annotated[float, Field(ge=0.5, le=500.0)]
+    shape: ShapeConfig
+
+
+class HoleConfig(Config):
+    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
+
+    id: DamageId
+    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
+    centre_mm: PlaceMm
+    kind: Literal["through", "blind"] = "through"
+    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
+
+    @model_validator(mode="after")
+    def _depth_where_blind(self) -> Self:
+        if self.kind == "blind" and self.depth_mm is None:
+            raise ValueError("a blind hole needs depth_mm")
+        if self.kind == "through" and self.depth_mm is not None:
+            raise ValueError("a through-hole takes no depth_mm; its depth is the board's thickness")
+        return self
+
+
+class DentConfig(Config):
+    """A spherical cap: rim diameter and depth as a ball would leave them on a flat face."""
+
+    id: DamageId
+    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
+    depth_mm: Annotated[float, Field(ge=0.04, le=500.0)]
+    centre_mm: PlaceMm
+
+
+class TapeConfig(Config):
+    """A strip stuck on the face; size and place in plan, the angle from board +x towards +y."""
+
+    centre_mm: PlaceMm
+    size_mm: SizeMm
+    angle_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
+    rgb: Rgb = (0.85, 0.08, 0.08)
+    albedo_850: Albedo = 0.6
+    thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = 0.15
+
+
+class MaterialConfig(Config):
+    """The board's reflectance: diffuse, with a grain along x that scales 850 nm and all colours alike."""
+
+    albedo_850: Albedo = 0.6
+    rgb: Rgb = (0.55, 0.42, 0.28)
+    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = Field(
+        default=0.05, description="standard deviation of the albedo over its mean, before clipping to 0..1"
+    )
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
+    grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
+
+
+class BackingConfig(Config):
+    """A plane behind the board, parallel to the board frame's x and y."""
+
+    distance_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(
+        description="behind the deepest point of the back face"
+    )
+    albedo_850: Albedo = 0.6
+    rgb: Rgb = (0.55, 0.55, 0.55)
+    size_mm: SizeMm | None = Field(
+        default=None,
+        description="none: the board's shadow as seen from the lens at zero tilt, so that it fills every hole",
+    )
+
+
+class RoomConfig(Config):
+    """Surfaces for multipath, in the camera's frame: a floor parallel to the optical axis, a wall across it."""
+
+    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = None
+    floor_albedo_850: Albedo = 0.3
+    floor_rgb: Rgb = (0.3, 0.3, 0.3)
+    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = None
+    back_wall_albedo_850: Albedo = 0.6
+    back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
+    width_m: Annotated[float, Field(ge=0.5, le=40.0)] = Field(default=4.0, description="of floor and wall, centred")
+    height_m: Annotated[float, Field(ge=0.5, le=20.0)] = Field(
+        default=2.5, description="of the wall, up from the floor"
+    )
+
+
+class PoseConfig(Config):
+    """Where the face's centre is (camera axes), and how the board is turned: about its x, then y, then z."""
+
+    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(default=0.7, description="along the optical axis")
+    offset_x_mm: Coordinate = 0.0
+    offset_y_mm: Coordinate = 0.0
+    tilt_x_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
+    tilt_y_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
+    roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
+
+
+class TargetConfig(Config):
+    """A whole target. ``backing`` or ``room`` left out: nothing stands there."""
+
+    name: Literal["custom"] = "custom"
+    board: BoardConfig
+    holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
+    dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
+    tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
+    material: MaterialConfig = MaterialConfig()
+    backing: BackingConfig | None = None
+    room: RoomConfig | None = None
+    pose: PoseConfig = PoseConfig()
+
+    @model_validator(mode="after")
+    def _ids_once(self) -> Self:
+        ids = [damage.id for damage in self.damages]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ValueError(f"ids of holes and dents must differ; given more than once: {', '.join(map(str, twice))}")
+        return self
+
+    @property
+    def damages(self) -> tuple[HoleConfig | DentConfig, ...]:
+        """Holes, then dents."""
+        return self.holes + self.dents
+
+    def declare(self) -> TargetConfig:
+        """Itself: every kind of target answers ``declare()`` with the full declaration."""
+        return self
+
+    def hole_free(self) -> TargetConfig:
+        """The same set-up with neither holes nor dents: what a threshold is calibrated on."""
+        return self.model_copy(update={"holes": (), "dents": ()})
