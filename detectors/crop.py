@@ -159,8 +159,8 @@ def _largest_surface(cloud: Cloud, config: AutoCrop) -> np.ndarray:
     right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), bend)
     down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), bend)
     largest = _largest_component(valid & ~bend, right, down)
-    # smoothing and comparing flag smooth_px - 1 pixels on each side of a crease or rim: given back where no step parts
-    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=config.smooth_px - 1)
+    # smoothing and comparing flag smooth_px pixels on each side of a crease or rim: given back where no step parts
+    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=config.smooth_px)
     rim = _largest_component(valid & (grown > 0), *_steps_only(cloud))
     return _holes_filled(largest | (rim & (grown > 0))) & valid
 

@@ -9,7 +9,7 @@ robust fit by about a third of a sigma.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,8 +71,8 @@ class Surface:
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """z in metres at x, y of any equal shape; NaN where they are NaN. Extrapolates as polynomials do: badly."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
-        basis = _basis(x.ravel(), y.ravel(), self)
-        return (self.coefficients @ basis).reshape(x.shape)
+        u, v = _scaled(x.ravel(), y.ravel(), self)
+        return kernels.chebyshev_sum(u, v, self.powers, self.coefficients).reshape(x.shape)
 
 
 def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig) -> Surface:
@@ -82,22 +82,26 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     by more than 0.2 sigma sqrt(p / n); bisquare is within 0.05 of that unit of the fixed point of all points.
     Deterministic.
 
-    Raises UserError where there are fewer points than coefficients, or where the points do not determine them (all on a
-    line).
+    Raises UserError where there are fewer points than coefficients, or where all points lie on a line.
     """
     powers = _powers(config)
     _check_points(len(z_m), len(powers), config)
     x, y, z = (np.ascontiguousarray(a, dtype=np.float64) for a in (x_m, y_m, z_m))
     blank = _blank_surface(x, y, powers, config)
-    basis = _basis(x, y, blank)
+    basis = kernels.chebyshev_basis(*_scaled(x, y, blank), powers)
     middle = float(np.median(z[:: max(1, len(z) // SAMPLE_POINTS)]))
     problem = _Problem.of(basis, z - middle, config)
-    solution = {"least_squares": _least_squares, "lar": _lar, "bisquare": _bisquare, "lts": _lts_bisquare}[
-        config.method
-    ](problem)
+    solve = {"least_squares": _least_squares, "lar": _lar, "bisquare": _bisquare, "lts": _lts_bisquare}[config.method]
+    solution = solve(problem)
     coefficients = solution.coefficients.copy()
     coefficients[0] += middle
-    return _finished(blank, coefficients, solution)
+    return replace(
+        blank,
+        coefficients=coefficients,
+        iterations=solution.iterations,
+        converged=solution.converged,
+        note=solution.note,
+    )
 
 
 def _powers(config: SurfaceConfig) -> np.ndarray:
@@ -128,10 +132,8 @@ def _blank_surface(x: np.ndarray, y: np.ndarray, powers: np.ndarray, config: Sur
     )
 
 
-def _basis(x: np.ndarray, y: np.ndarray, surface: Surface) -> np.ndarray:
-    u = (x - surface.x_middle_m) / surface.x_half_m
-    v = (y - surface.y_middle_m) / surface.y_half_m
-    return kernels.chebyshev_basis(u, v, surface.powers)
+def _scaled(x: np.ndarray, y: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    return (x - surface.x_middle_m) / surface.x_half_m, (y - surface.y_middle_m) / surface.y_half_m
 
 
 @dataclass(frozen=True)
@@ -140,21 +142,6 @@ class _Solution:
     iterations: int
     converged: bool
     note: str
-
-
-def _finished(blank: Surface, coefficients: np.ndarray, solution: _Solution) -> Surface:
-    return Surface(
-        coefficients,
-        blank.powers,
-        blank.x_middle_m,
-        blank.x_half_m,
-        blank.y_middle_m,
-        blank.y_half_m,
-        blank.method,
-        solution.iterations,
-        solution.converged,
-        solution.note,
-    )
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,22 @@ def chebyshev_basis(u: np.ndarray, v: np.ndarray, powers: np.ndarray) -> np.ndar
 
 
 @numba.njit(**FAST)
+def chebyshev_sum(u: np.ndarray, v: np.ndarray, powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """(n,) coefficients times `chebyshev_basis`, without storing the basis."""
+    n = len(u)
+    values = np.empty(n)
+    for start in range(0, n, BLOCK):
+        stop = min(start + BLOCK, n)
+        block = chebyshev_basis(u[start:stop], v[start:stop], powers)
+        values[start:stop] = 0.0
+        for t in range(len(coefficients)):
+            c = coefficients[t]
+            for i in range(start, stop):
+                values[i] += c * block[t, i - start]
+    return values
+
+
+@numba.njit(**FAST)
 def weighted_gram(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(B W B', B W z) of a basis (p, n), values (n,) and weights (n,)."""
     terms, n = basis.shape

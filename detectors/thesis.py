@@ -151,7 +151,7 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
     for 1 mm; likewise where the averaged z still lies on the steps, as a median does. Without a step, z is taken to
     have been stored as float32.
     """
-    z = cloud.points_m[mask][:, 2]
+    z = cloud.points_m[..., 2][mask]
     step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
     whole = step**2 / 12.0
     if cloud.n_frames > 2 and _on_half_steps(z, step):

@@ -7,8 +7,6 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import numpy as np
 import pytest
 from pydantic import Field
 
@@ -373,52 +371,3 @@ def test_problems_of_file_axes_study_and_overrides_come_together_in_order(folder
     assert heads[2].startswith('--set: `repeats` is "none"')
     places = [head.split(": ")[0] for head in heads[3:]]
     assert places == ["x.yaml:2:1", "x.yaml:13:20", "x.yaml:17:12", "x.yaml:20:21"]
-
-
-def depth_folder(folder: Path, value_mm: int = 700) -> Path:
-    frames = folder / "frames"
-    frames.mkdir(exist_ok=True)
-    for index in range(2):
-        cv2.imwrite(str(frames / f"{index}.png"), np.full((576, 640), value_mm + index, np.uint16))
-    return frames
-
-
-CAPTURE = """\
-name: real
-source: {kind: capture, paths: [frames], intrinsics: azure_kinect_nfov}
-capture: {frames: 2}
-detector: {name: trial}
-threshold: {k: 3.5}
-"""
-
-
-def test_a_capture_is_known_by_its_content(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    depth_folder(folder)
-    (here,) = loaded(folder, CAPTURE).points
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    depth_folder(elsewhere)
-    (moved,) = loaded(elsewhere, CAPTURE).points
-    assert (moved.digest, moved.frames_key) == (here.digest, here.frames_key)
-    other = tmp_path_factory.mktemp("other")
-    depth_folder(other, 701)
-    (changed,) = loaded(other, CAPTURE).points
-    assert changed.digest != here.digest
-    (unit,) = loaded(folder, CAPTURE, "source.unit=4000/m").points
-    assert unit.frames_key != here.frames_key
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("[frames]", "[frmes]", ["2:33:", "frmes: there is no such file or folder", "did you mean: frames"]),
-        ("frames], ", "frames], unit: feet, ", ["2:32:", "feet: no such unit"]),
-        ("intrinsics: azure_kinect_nfov", "intrinsics: nothing.json", ["2:54:", "neither a file nor a camera"]),
-        (", intrinsics: azure_kinect_nfov", "", ["2:32:", "nothing says which lens"]),
-        ("{k: 3.5}", "{calibrate: {repeats: 5}}", ["5:24: a threshold can be calibrated only on hole-free repeats"]),
-    ],
-)
-def test_mistakes_of_a_capture(folder: Path, old: str, new: str, expected: list[str]) -> None:
-    depth_folder(folder)
-    message = refused(folder, CAPTURE.replace(old, new))
-    for words in expected:
-        assert words in message

@@ -45,7 +45,7 @@ def examples_of(group: Group, thresholds: Mapping[str, float], variant: str) -> 
                 detected=detected.reshape(cloud.valid.shape),
                 inside=np.isfinite(evidence.score),
                 truth=_marks(set_up),
-                z_truth_mm=set_up.true_z_m / MM,
+                z_truth_mm=set_up.seen_z_m / MM,
             )
         )
     return found

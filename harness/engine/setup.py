@@ -66,8 +66,12 @@ class SetUp:
     @cached_property
     def true_z_m(self) -> np.ndarray:
         """(h, w): z of the undamaged face along each pixel's central ray."""
-        view, cut = self.hole_free.view, self.hole_free.cut
-        return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
+        return _z_m(self.hole_free)
+
+    @cached_property
+    def seen_z_m(self) -> np.ndarray:
+        """(h, w): z of what each pixel's central ray meets on the damaged target, floors and backing of holes too."""
+        return _z_m(self.damaged)
 
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
@@ -93,6 +97,12 @@ class SetUp:
         """(p,) flat indices of evenly spread undamaged pixels."""
         intact = np.flatnonzero(self.intact)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
+
+
+def _z_m(unit: SimulatedUnit) -> np.ndarray:
+    """(h, w): true z along the central rays of a unit's pixels."""
+    view, cut = unit.view, unit.cut
+    return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
 
 @lru_cache(maxsize=4)

@@ -111,7 +111,7 @@ def claim_c3(case: Case) -> Verdict:
     parts = [_within_one(spread) for spread in extent.values()]
     evidence = (
         f"(mean - true)/std by the thesis' measure: {_per_hole(extent)}. "
-        f"By the model of the blurred hole: {_per_hole(model)}. "
+        f"By the model of the blurred hole: {_per_hole(model, spans=False)}. "
         f"Within one std: {_share(rows, 'extent')} (thesis' measure), {_share(rows, 'model')} (model)."
     )
     return Verdict("C3", text, decide(parts), evidence, rule)
@@ -287,14 +287,14 @@ def _exact_set(case: Case, frames: int, expected: frozenset[str]) -> tuple[Answe
     alike: dict[str, list[str]] = {}
     for _, row in rows.sort_values("detected", kind="stable").iterrows():
         alike.setdefault(f"{row['detected']} of {row['n']}", []).append(row["hole"])
-    counts = "; ".join(f"{count}: {hole_list(names)}" for count, names in alike.items())
+    counts = ", ".join(f"{count} ({hole_list(names)})" for count, names in alike.items())
     found = [hole for hole, state in status.items() if state == "found"]
     parts = [f"With {frames} frame{'s' if frames > 1 else ''} found: {hole_list(found)}."]
     parts += [f"More than the thesis: {hole_list(more)}."] if more else []
     parts += [f"Fewer than the thesis: {hole_list(fewer)}."] if fewer else []
     parts += [f"Undecided: {hole_list(open_)}."] if open_ else []
     answer = decide([not (more or fewer), None if open_ else True])
-    return answer, " ".join([*parts, f"Detections of trials, and whose: {counts}."])
+    return answer, " ".join([*parts, f"Detections of trials (holes): {counts}."])
 
 
 def _threshold_change(runs: pd.DataFrame) -> tuple[bool | None, str]:
@@ -326,9 +326,9 @@ def _within_one(spread: tuple[float, Interval]) -> bool | None:
     return False if interval.above(1) or interval.below(-1) else None
 
 
-def _per_hole(spreads: dict[str, tuple[float, Interval]]) -> str:
+def _per_hole(spreads: dict[str, tuple[float, Interval]], *, spans: bool = True) -> str:
     return ", ".join(
-        f"{hole}: {ratio:+.1f} ({_span(interval, 1)})" if interval.known else f"{hole}: –"
+        f"hole {hole} {ratio:+.1f}{f' ({_span(interval, 1)})' if spans else ''}" if interval.known else f"hole {hole} –"
         for hole, (ratio, interval) in spreads.items()
     )
 

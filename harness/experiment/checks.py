@@ -8,9 +8,8 @@ from itertools import combinations
 from math import dist
 from pathlib import Path
 
-from detectors import detector_names
 from harness.experiment import shape
-from harness.experiment.declared import DETECTOR_NAME
+from harness.experiment.declared import DETECTOR_NAME, detector_names
 from harness.experiment.diagnose import nearest, wrong_choice
 from harness.experiment.problems import Problem
 from harness.experiment.recorded import recording_of

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks, shape
-from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, splices_of
+from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, forget_detectors, splices_of
 from harness.experiment.diagnose import validated
 from harness.experiment.dotted import OPTION, overridden, set_path
 from harness.experiment.points import Experiment
 from harness.experiment.problems import ExperimentError
+from harness.experiment.recorded import recording_of
 from harness.experiment.schema import ExperimentConfig, ValuesVariation
 from harness.experiment.unfold import unfolded
 from harness.experiment.yaml_source import KeyPath, Source, read_yaml, to_yaml
@@ -19,6 +20,8 @@ from harness.experiment.yaml_source import KeyPath, Source, read_yaml, to_yaml
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     """Read, override (``path=value`` each), validate and unfold. Raises ExperimentError with all problems at once."""
+    forget_detectors()
+    recording_of.cache_clear()
     source, problems = overridden(read_yaml(Path(path)), overrides, declared_of)
     source = _with_absolute_paths(source, Path(path).resolve().parent)
     config, invalid = validated(ExperimentConfig, source, splices_of(source.data))

@@ -16,6 +16,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
@@ -167,7 +168,10 @@ def _places_in(text: str, origin: str, start: int, is_argument: bool) -> Callabl
 def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Node | None:
     """ruamel.yaml's node tree; its errors become a problem with a place."""
     try:
-        return YAML(typ="safe", pure=True).compose(text)
+        too_deep = _first_too_deep(text)
+        if too_deep is None:
+            return YAML(typ="safe", pure=True).compose(text)
+        problem = Problem("nested too deep", place(too_deep, too_deep + 1), legal=f"at most {MAX_DEPTH} levels")
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -179,9 +183,17 @@ def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Nod
         problem = Problem(f"character U+{ord(text[index]):04X} is not allowed in YAML", place(index, index + 1))
     except YAMLError as error:
         problem = Problem(f"no valid YAML: {error}", place(0, 1))
-    except RecursionError:
-        problem = Problem("nested too deep", place(0, 1), legal=f"at most {MAX_DEPTH} levels")
     raise ExperimentError(origin, [problem]) from None
+
+
+def _first_too_deep(text: str) -> int | None:
+    """The index of the first mapping or list beyond `MAX_DEPTH`: composing recurses, and scanning slows with depth."""
+    depth = 0
+    for event in YAML(typ="safe", pure=True).parse(text):
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            return int(event.start_mark.index)
+    return None
 
 
 @dataclass

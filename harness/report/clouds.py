@@ -128,8 +128,8 @@ def _profile(axes: Axes, clouds: list[ExampleCloud], hole: HoleInView) -> None:
     deepest = 1.0
     for cloud in clouds[:1] + clouds[-1:] if len(clouds) > 1 else clouds:
         z = cloud.residual_mm[row]
-        colour, marker, line = (BLUE, "o", "-") if cloud is last else (GREY, "^", "")
-        axes.plot(across[near], z[near], line, color=colour, marker=marker, ms=4, lw=1, label=_measured(cloud))
+        colour, marker, line = (BLUE, "o", "-") if cloud is last else (GREY, "^", "none")
+        axes.plot(across[near], z[near], ls=line, color=colour, marker=marker, ms=4, lw=1, label=_measured(cloud))
         finite = z[near & np.isfinite(z)]
         deepest = max(deepest, float(finite.max()) if finite.size else 0.0)
     shape = hole_shape(last, hole)

@@ -41,9 +41,10 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
     from matplotlib.figure import Figure
 
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
-    across, down = _extent(cloud)
+    left, right, bottom, top = _shown(cloud, evidence)
+    across, down = max(right - left, 1e-9), max(bottom - top, 1e-9)
     height_in = min(panels * (WIDTH_IN * 0.82 * down / across + 0.5) + 0.4, 30.0)
-    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="compressed")
     canvas = FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=10)
     axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
@@ -58,6 +59,7 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
         axis.set_xlabel("u, px" if cloud.organised else "x, mm", fontsize=8)
         axis.set_ylabel("v, px" if cloud.organised else "y, mm", fontsize=8)
         axis.tick_params(labelsize=7)
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
     canvas.draw()  # the layout is known only now, and with it what a letter measures in the axes' units
     for axis in axes:
         _draw_marks(axis, marks)
@@ -65,10 +67,21 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
     canvas.print_png(str(path))
 
 
-def _extent(cloud: Cloud) -> tuple[float, float]:
-    """Width and height of what is drawn, in the axes' units."""
+def _shown(cloud: Cloud, evidence: Evidence) -> tuple[float, float, float, float]:
+    """(left, right, bottom, top) of the axes: what was judged and a twelfth of it around, within the picture."""
     left, right, bottom, top = _edges(cloud)
-    return max(right - left, 1e-9), max(bottom - top, 1e-9)
+    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
+    if not cloud.organised or not len(rows):
+        return left, right, bottom, top
+    region = cloud.region
+    u0, u1, v0, v1 = (float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    margin = max(u1 - u0, v1 - v0) / 12.0
+    return (
+        max(left, region.col0 + u0 - 0.5 - margin),
+        min(right, region.col0 + u1 - 0.5 + margin),
+        min(bottom, region.row0 + v1 - 0.5 + margin),
+        max(top, region.row0 + v0 - 0.5 - margin),
+    )
 
 
 def _edges(cloud: Cloud) -> tuple[float, float, float, float]:
@@ -94,8 +107,6 @@ def _draw_residual(axis: Axes, cloud: Cloud, evidence: Evidence) -> Any:
         return axis.imshow(residual_mm, extent=_edges(cloud), interpolation="nearest", **style)
     judged = np.isfinite(residual_mm)
     x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
-    left, right, bottom, top = _edges(cloud)
-    axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     return axis.scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
 
 

@@ -83,7 +83,7 @@ def positions_figure(summary: pd.DataFrame, frames: int) -> str:
         left.legend(loc="upper left")
         right.set(xlabel="true distance from hole 11 (mm)", ylabel="measured − true (mm)")
         right.set_title("Difference from the truth, ±1 std")
-        right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, columnspacing=1, handletextpad=0.5)
+        figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=3)
 
     alt = f"Measured against true distance of each hole from the largest with {frames} frames, and the differences."
     return svg("positions", (10, 4.6), alt, draw)

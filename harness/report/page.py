@@ -134,7 +134,7 @@ def _found_phrase(main: pd.DataFrame, frames: int) -> str:
     if found:
         least = float(main["true_diameter_mm"][main["hole"].isin(found)].min())
         text += f" ({hole_list(found)}; the smallest is {least:.2f} mm{', ' + inches(least) if inches(least) else ''})"
-    return text + (f" and {hole_list(open_)} undecided" if open_ else "")
+    return text + (f", with {hole_list(open_)} undecided" if open_ else "")
 
 
 def _counted(frames: int) -> str:
@@ -187,7 +187,7 @@ def _cell(row: pd.Series) -> dict[str, str]:
         "count": f"{row['detected']}/{row['n']}",
         "interval": f"{row['rate_low']:.2f}–{row['rate_high']:.2f}",
         "status": str(row["status"]),
-        "style": f"background:rgb({shade[0]},{shade[1]},{shade[2]});color:{'#fff' if rate > 0.5 else '#1d2530'}",
+        "style": f"background:rgb({shade[0]},{shade[1]},{shade[2]});color:{'#fff' if rate > 0.72 else '#1d2530'}",
         "title": f"{row['status']}: rate {interval}, 95 % Wilson interval. The hole's pixels: {seen or 'unknown'}",
     }
 

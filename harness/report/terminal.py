@@ -27,7 +27,8 @@ def terminal_table(summary: pd.DataFrame, variant: str = MAIN) -> Table:
 
     frames, rows = _cells(summary, variant)
     # No box and no wrapping: eleven columns then fit a terminal of 80.
-    table = Table(title="holes detected of trials, by number of averaged frames", box=None, pad_edge=False)
+    title = "holes detected of trials, by number of averaged frames (N)"
+    table = Table(title=title, box=None, pad_edge=False, collapse_padding=True)
     for head in _heads(frames):
         table.add_column(head, justify="right", no_wrap=True)
     for row in rows:
@@ -44,7 +45,7 @@ def terminal_text(summary: pd.DataFrame, variant: str = MAIN) -> str:
 
 
 def _heads(frames: list[int]) -> list[str]:
-    return ["hole", "drill", "mm", *(f"N={n}" for n in frames), "thesis' mm", "model mm"]
+    return ["hole", "drill", "mm", *(f"N={n}" for n in frames), "thesis mm", "model mm"]
 
 
 def _cells(summary: pd.DataFrame, variant: str) -> tuple[list[int], list[list[tuple[str, str]]]]:

@@ -203,18 +203,13 @@ def _walk(lit: LitScene, ray: Any, uniform: Any, wave: list[float], bounces: int
     return totals
 
 
-def face_interpolator(nodes_x: np.ndarray, nodes_y: np.ndarray, values: np.ndarray) -> Any:
-    """Cubic interpolation over a grid of nodes on the face: values (m, len(nodes_y), len(nodes_x)), complex."""
-    kx, ky = min(3, len(nodes_x) - 1), min(3, len(nodes_y) - 1)
-    splines = [
-        (
-            interpolate.RectBivariateSpline(nodes_y, nodes_x, value.real, kx=ky, ky=kx),
-            interpolate.RectBivariateSpline(nodes_y, nodes_x, value.imag, kx=ky, ky=kx),
-        )
-        for value in values
-    ]
+def between_nodes(
+    nodes_x: np.ndarray, nodes_y: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> np.ndarray:
+    """Bilinear interpolation of values (m, len(nodes_y), len(nodes_x)), complex, at n places: (m, n).
 
-    def at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.stack([re.ev(y, x) + 1j * im.ev(y, x) for re, im in splines])
-
-    return at
+    Light that left its last surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 4e-4 at 40 mm and
+    0.7 m, of a part that is itself some per cent of the whole.
+    """
+    grid = interpolate.RegularGridInterpolator((nodes_y, nodes_x), np.moveaxis(values, 0, -1), method="linear")
+    return np.asarray(grid(np.column_stack([y, x])).T)

@@ -12,7 +12,7 @@ from harness.vocabulary.geometry import Region, invert, rotate_vectors, transfor
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
 from scenes.render.direct import DirectLight, direct_light, surface_rgb
-from scenes.render.indirect import face_interpolator, gather_at_points, gather_in_pixels
+from scenes.render.indirect import between_nodes, gather_at_points, gather_in_pixels
 from scenes.render.scene import LitScene, lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
@@ -151,13 +151,11 @@ def _face_light(
         here = direct.surface[face] == index
         albedo[here] = part.albedo_850_at(direct.uv[face][here]) if here.any() else 0.0
 
-    def at_pixels(sums: np.ndarray) -> np.ndarray:
-        nodes = sums.reshape(-1, len(ys), len(xs))
-        return np.asarray(albedo * to_lens * face_interpolator(xs, ys, nodes)(board[:, 0], board[:, 1]))
-
-    mean = at_pixels(light.mean)
-    batches = np.stack([at_pixels(sums)[:-1] for sums in light.sums])
-    return mean, range_noise_m(batches, direct.phasor[:, face] + mean[:-1], frequencies)
+    sums = np.concatenate([light.mean[None], light.sums])
+    nodes = sums.reshape(-1, len(ys), len(xs))
+    at_pixels = albedo * between_nodes(xs, ys, nodes, board[:, 0], board[:, 1])
+    mean, *batches = at_pixels.reshape(len(sums), len(frequencies) + 1, -1) * to_lens
+    return mean, range_noise_m(np.stack(batches)[:, :-1], direct.phasor[:, face] + mean[:-1], frequencies)
 
 
 def _node_places(values: np.ndarray, spacing: float) -> np.ndarray:

@@ -114,7 +114,7 @@ class AmcwImager:
     def frame(self, exposure: Exposure, rng: np.random.Generator) -> Decoded:
         """One frame: noise from ``rng`` on the samples, then the depth engine."""
         n_frequencies, n_phases, n = exposure.means.shape
-        normals = rng.standard_normal((n_frequencies, n_phases, n), dtype=f4)
+        normals = _standard_normals(rng, (n_frequencies, n_phases, n))
         unit = np.empty((2, n_frequencies, n), f4)
         amplitude = np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
@@ -178,24 +178,30 @@ class AmcwImager:
         return np.stack([along, np.full_like(along, emitter @ emitter), 1 / length]).reshape(3, -1).astype(f4)
 
     @cached_property
-    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        t = self.unwrap
-        return t.combination, t.table, t.offset, t.metres_per_turn, t.lattice
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, int, int, np.ndarray, np.ndarray, np.ndarray]:
+        return self.unwrap.for_kernel()
 
     @cached_property
-    def _gates(self) -> np.ndarray:
+    def _gates(self) -> tuple[np.float32, ...]:
         engine = self.camera.engine
-        return np.array(
-            [
-                engine.edge_threshold.value if self.config.edge_gate else np.inf,
-                engine.lattice_residual_turns.value**2,
-                engine.amplitude_ratio.value,
-                engine.min_amplitude_units.value,
-                engine.min_amplitude_sum_units.value,
-                engine.min_reflectivity_units_mm2.value * MM**2,
-                engine.min_range_mm.value * MM,
-                engine.max_range_mm.value * MM,
-                engine.output_step_mm.value * MM,
-            ],
-            f4,
+        values = (
+            engine.edge_threshold.value if self.config.edge_gate else np.inf,
+            engine.lattice_residual_turns.value**2,
+            engine.amplitude_ratio.value,
+            engine.min_amplitude_units.value,
+            engine.min_amplitude_sum_units.value,
+            engine.min_reflectivity_units_mm2.value * MM**2,
+            engine.min_range_mm.value * MM,
+            engine.max_range_mm.value * MM,
+            engine.output_step_mm.value * MM,
         )
+        return tuple(f4(value) for value in values)
+
+
+def _standard_normals(rng: np.random.Generator, shape: tuple[int, int, int]) -> np.ndarray:
+    """Standard normals from the generator's raw words; one more word where the count is odd."""
+    count = int(np.prod(shape))
+    even = count + count % 2
+    out = np.empty(even, f4)
+    kernels.normals_from_bits(rng.bit_generator.random_raw(even // 2).view(np.uint32), out)
+    return out[:count].reshape(shape)

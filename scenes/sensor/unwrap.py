@@ -28,6 +28,12 @@ class UnwrapTable:
     metres_per_turn: np.ndarray
     unambiguous_m: float
 
+    def for_kernel(self) -> tuple[np.ndarray, np.ndarray, int, int, np.ndarray, np.ndarray, np.ndarray]:
+        """What `scenes.sensor.kernels` takes: combination, wrap counts (3, a b), a, b, offset, metres, lattice."""
+        rows, columns, _ = self.table.shape
+        wraps = np.ascontiguousarray(self.table.reshape(rows * columns, 3).T)
+        return self.combination, wraps, rows, columns, self.offset, self.metres_per_turn, self.lattice
+
 
 def unwrap_table(frequencies_hz: tuple[float, ...]) -> UnwrapTable:
     """The table for three frequencies. Raises UserError where they are not small integer multiples of a common one."""

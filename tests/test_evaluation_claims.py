@@ -1,0 +1,171 @@
+"""Every claim reaches every verdict, on tables whose answer is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+from synthetic_tables import World, example, joined, tables
+
+from harness.evaluation.claim_rules import decide, falling_rank, hole_list
+from harness.evaluation.claims import RULES, Verdict, score_claims, verdicts_by_variant
+from harness.evaluation.profile import HoleInView, bowl, hole_shape, hole_shapes
+from harness.report.example import ExampleCloud
+
+
+def verdict(claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)) -> Verdict:
+    return next(v for v in score_claims(tables(world, frames=frames)) if v.claim == claim)
+
+
+def rate(many: float, few: float, of: int) -> World:
+    """The thesis' answer but for one hole, detected at these rates."""
+    usual = World().rate
+    return World(rate=lambda hole, n: (many if n == 50 else few) if hole == of else usual(hole, n))
+
+
+CASES = {
+    "C1": (
+        (World(), "borne out"),
+        (rate(1.0, 0.0, of=3), "not borne out"),
+        (rate(0.0, 0.0, of=4), "not borne out"),
+        (rate(0.5, 0.0, of=4), "undecided"),
+    ),
+    "C2": (
+        (World(), "borne out"),
+        (rate(1.0, 1.0, of=4), "not borne out"),
+        (rate(1.0, 0.5, of=5), "undecided"),
+        (World(threshold={1: 1.0, 10: 3.0, 50: 5.0}), "not borne out"),
+    ),
+    "C3": (
+        (World(), "borne out"),
+        (World(size_bias_mm=lambda diameter: 2.4 if diameter < 7 else 0.0), "not borne out"),
+        (World(size_bias_mm=lambda diameter: 1.2), "undecided"),
+        (World(size_bias_mm=lambda diameter: -2.4), "not borne out"),
+    ),
+    "C4": (
+        (World(), "borne out"),
+        (World(size_bias_mm=lambda diameter: 0.1 * diameter), "not borne out"),
+        (World(size_bias_mm=lambda diameter: 1.0 + 0.3 * np.cos(2 * diameter) - 0.01 * diameter), "undecided"),
+    ),
+    "C5": (
+        (World(), "borne out"),
+        (World(place_bias_mm=3.0), "not borne out"),
+        (World(place_std_mm=0.6), "not borne out"),
+        (World(place_std_mm=1.2), "undecided"),
+    ),
+    "C9": (
+        (World(), "borne out"),
+        (World(temporal_mm=lambda n: 0.9 * n**-0.2), "not borne out"),
+        (World(pattern_mm=lambda n: 0.6 / n**0.5, offset_mm=0.0), "not borne out"),
+        (World(pattern_mm=lambda n: 0.27 if n == 50 else 0.3, offset_mm=0.0), "undecided"),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("claim", "world", "answer"), [(claim, world, answer) for claim, rows in CASES.items() for world, answer in rows]
+)
+def test_each_verdict_is_reachable(claim: str, world: World, answer: str) -> None:
+    assert verdict(claim, world).verdict == answer
+
+
+@pytest.mark.parametrize("shape", ["bowl", "cylinder"])
+def test_shapes_are_told_apart(shape: str) -> None:
+    scored = score_claims(tables(frames=(50,)), examples=[example(50, shape)])
+    c6 = next(v for v in scored if v.claim == "C6")
+    assert c6.verdict == ("borne out" if shape == "bowl" else "not borne out")
+
+
+def test_c6_is_undecided_without_a_cloud_or_with_mixed_holes() -> None:
+    assert verdict("C6").verdict == "undecided"
+    one_frame = score_claims(tables(), examples=[example(1)])
+    assert next(v for v in one_frame if v.claim == "C6").verdict == "undecided"
+    round_, flat = example(50, "bowl"), example(50, "cylinder")
+    mixed = round_.residual_mm.copy()
+    mixed[:, 250:] = flat.residual_mm[:, 250:]
+    scored = score_claims(tables(), examples=[dataclasses.replace(round_, residual_mm=mixed)])
+    assert next(v for v in scored if v.claim == "C6").verdict == "undecided"
+
+
+@pytest.mark.parametrize("claim", ["C1", "C3", "C4", "C5"])
+def test_missing_counts_are_undecided_and_say_why(claim: str) -> None:
+    answer = verdict(claim, frames=(1, 10))
+    assert answer.verdict == "undecided"
+    assert "50 frames" in answer.evidence
+
+
+def test_nothing_found_is_no_evidence() -> None:
+    scored = score_claims(tables(World(rate=lambda hole, frames: 0.0), frames=(1, 50)))
+    assert [v.verdict for v in scored] == ["not borne out"] * 2 + ["undecided"] * 4 + ["borne out"]
+
+
+def test_another_target_is_not_the_thesis() -> None:
+    other = tables(frames=(1, 50))
+    other = dataclasses.replace(other, holes=other.holes[other.holes["hole"] != "3"])
+    scored = {v.claim: v for v in score_claims(other)}
+    assert scored["C1"].verdict == "undecided"
+    assert "eleven" in scored["C1"].evidence
+
+
+def test_evidence_carries_the_numbers() -> None:
+    more = verdict("C1", rate(42 / 50, 0.0, of=3))
+    assert "More than the thesis: 3" in more.evidence
+    assert "42 of 50 (3)" in more.evidence
+    assert "hole 4 +2.0 (1.6 to 2.4)" in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
+    assert "ratio position to size 4.00" in verdict("C5").evidence
+
+
+def test_sensitivity_table() -> None:
+    near = tables(World(rate=lambda hole, frames: float(hole >= 3)), frames=(1, 50), variant="distance 700 mm")
+    table = verdicts_by_variant(joined(near, tables(frames=(1, 50))), examples=[example(50)])
+    assert list(table["variant"]) == ["main", "distance 700 mm"]
+    assert list(table["found_1"]) == ["5–11", "3–11"]
+    assert list(table["found_50"]) == ["4–11", "3–11"]
+    assert list(table["C1"]) == ["borne out", "not borne out"]
+    assert list(table["C6"]) == ["borne out", "undecided"]
+    assert list(table.columns[-len(RULES) :]) == list(RULES)
+
+
+def test_rank_test_is_the_exact_permutation_test() -> None:
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=6), rng.normal(size=6)
+    rho, p = falling_rank(x, y)
+    assert rho == pytest.approx(spearmanr(x, y).statistic)
+    every = [spearmanr(x, np.array(order)).statistic for order in permutations(y)]
+    assert p == pytest.approx(np.mean(np.array(every) <= rho + 1e-12))
+    assert falling_rank(np.arange(4.0), -np.arange(4.0)) == (pytest.approx(-1), pytest.approx(1 / 24))
+    assert falling_rank(np.arange(4.0), np.ones(4)) == (0.0, 1.0)
+
+
+def test_hole_lists_and_decisions() -> None:
+    assert hole_list(["4", "5", "6", "9", "11", "10", "dent"]) == "4–6, 9–11, dent"
+    assert hole_list([]) == "none"
+    assert decide([True, True]) == "borne out"
+    assert decide([None, False]) == "not borne out"
+    assert decide([None, True]) == "undecided"
+    assert decide([]) == "undecided"
+
+
+def test_bowl_fit_by_its_own_shape() -> None:
+    cloud = example(50, "bowl", noise_mm=0.0)
+    shape = hole_shape(cloud, cloud.truth[-1])
+    assert shape is not None
+    assert shape.bowl_depth_mm == pytest.approx(12.7)
+    assert shape.bowl_rms_mm == pytest.approx(0, abs=1e-9)
+    assert shape.true_depth_mm == pytest.approx(12.7)
+    assert shape.true_cylinder_rms_mm == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(shape.reached, bowl(np.array([0.25, 0.5, 0.75])), atol=0.04)
+
+
+def test_holes_too_small_or_too_invalid_are_not_judged() -> None:
+    cloud = example(50)
+    assert {shape.hole for shape in hole_shapes(cloud)}.isdisjoint({"1", "2", "3"})
+    blind: ExampleCloud = dataclasses.replace(
+        cloud, residual_mm=np.where(cloud.residual_mm > 6, np.nan, cloud.residual_mm)
+    )
+    assert hole_shape(blind, cloud.truth[-1]) is None
+    lonely = HoleInView("1", 0.0, 0.0, 0.4, 1.0, 5.0)
+    assert hole_shape(cloud, lonely) is None

@@ -1,0 +1,65 @@
+"""Summaries of holes and false calls, by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_tables import World, joined, tables
+
+from harness.evaluation.summary import STATES, false_calls, found_holes, summarise_holes
+
+
+def test_a_hole_by_hand() -> None:
+    holes = tables(World(repeats=4), frames=(50,)).holes
+    holes = holes[holes["hole"] == "8"].copy()
+    holes["detected"] = [True, True, True, False]
+    holes["extent_diameter_mm"] = [12.0, 13.0, 14.0, np.nan]
+    holes["extent_offset_mm"] = [150.0, 152.0, 154.0, np.nan]
+    holes["state"] = ["found", "found", "wrong depth", "invalid"]
+    row = summarise_holes(holes).iloc[0]
+    assert (row["n"], row["detected"], row["rate"], row["extent_measured"]) == (4, 3, 0.75, 3)
+    assert row["extent_diameter_mean_mm"] == 13.0
+    assert row["extent_diameter_std_mm"] == 1.0
+    assert row["extent_bias_mm"] == pytest.approx(0.3)
+    # t(0.975, 2) = 4.302653 over sqrt(3)
+    assert row["extent_bias_high_mm"] - row["extent_bias_mm"] == pytest.approx(4.302653 / np.sqrt(3), abs=1e-6)
+    assert row["extent_offset_std_mm"] == 2.0
+    assert row["extent_offset_bias_mm"] == pytest.approx(152.0 - 152.4)
+    assert [row[f"share_{state.replace(' ', '_')}"] for state in STATES] == [0.5, 0.25, 0.25, 0.0]
+    assert row["status"] == "undecided"
+
+
+def test_rows_are_in_order_and_shares_sum_to_one() -> None:
+    both = joined(tables(frames=(1, 50), variant="far"), tables(frames=(1, 50)))
+    summary = summarise_holes(both.holes)
+    assert list(summary["variant"].unique()) == ["main", "far"]
+    main = summary[(summary["variant"] == "main") & (summary["frames"] == 1)]
+    assert list(main["hole"]) == [str(n) for n in range(1, 12)]
+    np.testing.assert_allclose(summary[[c for c in summary if c.startswith("share_")]].sum(axis=1), 1)
+
+
+@pytest.mark.parametrize(("detected", "status"), [(17, "missed"), (18, "missed"), (25, "undecided"), (33, "found")])
+def test_found_missed_or_undecided(detected: int, status: str) -> None:
+    world = World(rate=lambda hole, frames: detected / 50)
+    summary = summarise_holes(tables(world, frames=(50,)).holes)
+    assert set(found_holes(summary, "main", 50).values()) == {status}
+    assert found_holes(summary, "main", 7) == {}
+
+
+def test_false_calls_with_poisson_interval() -> None:
+    calls = false_calls(tables(frames=(1,)).runs).set_index("role")
+    damaged = calls.loc["damaged"]
+    assert (damaged["runs"], damaged["false_calls"], damaged["per_run"]) == (50, 1, 0.02)
+    assert damaged["per_run_low"] == pytest.approx(0.0253 / 50, abs=1e-6)
+    assert damaged["per_run_high"] == pytest.approx(5.5716 / 50, abs=1e-6)
+    assert damaged["threshold_mm"] == pytest.approx(5 * 0.9, abs=0.01)
+    assert calls.loc["hole_free", "false_calls"] == 0
+
+
+def test_a_repeat_of_rows_changes_counts_not_means() -> None:
+    holes = tables(frames=(50,)).holes
+    once, twice = summarise_holes(holes), summarise_holes(pd.concat([holes, holes], ignore_index=True))
+    pd.testing.assert_series_equal(once["extent_diameter_mean_mm"], twice["extent_diameter_mean_mm"])
+    assert (twice["n"] == 2 * once["n"]).all()
+    assert (twice["rate_high"] - twice["rate_low"] < once["rate_high"] - once["rate_low"]).all()

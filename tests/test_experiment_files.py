@@ -1,0 +1,86 @@
+"""The experiments that come with tofpod: valid, complete, crop and radius fit for the board in every variation."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detectors.crop import BoxCrop
+from detectors.thesis import ThesisConfig
+from harness.experiment.load import load_experiment, resolved_yaml
+from harness.experiment.points import MAIN, Point
+from harness.experiment.schema import SimulatedSource
+from harness.vocabulary.geometry import transform_points
+from harness.vocabulary.units import MM
+from scenes.target.pose import T_camera_board_of
+
+FOLDER = Path(__file__).resolve().parents[1] / "experiments"
+RIM_MM = 9.9
+"""The crop leaves a rim of 10 mm of the untilted board; the tilt of 3 degrees shortens it by 0.1 mm."""
+
+
+def points_of(name: str) -> tuple[Point, ...]:
+    return load_experiment(FOLDER / f"{name}.yaml").points
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_experiment_is_valid_and_named_like_its_file(path: Path, tmp_path: Path) -> None:
+    experiment = load_experiment(path)
+    assert experiment.config.name == path.stem
+    resolved = tmp_path / path.name
+    resolved.write_text(resolved_yaml(experiment))
+    again = load_experiment(resolved)
+    assert (again.points, again.digest) == (experiment.points, experiment.digest)
+
+
+def test_averaging_is_the_experiment_of_the_thesis() -> None:
+    main = [point for point in points_of("averaging") if point.variant == MAIN]
+    assert [point.config.capture.frames for point in main] == [1, 2, 5, 10, 20, 50]
+    assert {point.config.repeats for point in main} == {50}
+    assert len({point.frames_key for point in main}) == 1  # shorter averages are prefixes of the longer
+    assert len({point.digest for point in main}) == len(main)
+
+
+def test_every_variation_of_averaging_changes_something() -> None:
+    points = points_of("averaging")
+    main = {point.digest for point in points if point.variant == MAIN}
+    varied = [point.digest for point in points if point.variant != MAIN]
+    assert main.isdisjoint(varied)
+    assert len(set(varied)) == len(varied)
+
+
+@pytest.mark.parametrize("name", ["averaging", "smoke"])
+def test_the_crop_keeps_all_holes_and_leaves_a_rim(name: str) -> None:
+    for point in points_of(name):
+        source, crop = point.config.source, ThesisConfig.from_data(point.config.detector.settings).crop
+        assert isinstance(source, SimulatedSource)
+        assert isinstance(crop, BoxCrop)
+        target = source.target.declare()
+        to_camera = T_camera_board_of(target.pose)
+        half = np.array([target.board.width_mm, target.board.height_mm]) / 2
+        corners = [[x * half[0], y * half[1], 0.0] for x, y in product((-1, 1), repeat=2)]
+        board_mm = transform_points(to_camera, np.array(corners) * MM) / MM
+        for axis, (low, high) in enumerate((crop.x_mm, crop.y_mm)):
+            # the board's edges are within a degree of the camera's axes, so the inner corner on each side is its limit
+            assert low - np.sort(board_mm[:, axis])[1] >= RIM_MM, point.label
+            assert np.sort(board_mm[:, axis])[2] - high >= RIM_MM, point.label
+        assert crop.z_mm[0] < board_mm[:, 2].min(), point.label
+        assert board_mm[:, 2].max() + target.board.thickness_mm < crop.z_mm[1], point.label
+        assert crop.range_max_m is None
+        for hole in target.holes:
+            angle = np.linspace(0, 2 * np.pi, 64)
+            rim = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) * hole.diameter_mm / 2
+            rim_mm = transform_points(to_camera, (rim + np.array([*hole.centre_mm, 0.0])) * MM) / MM
+            for axis, (low, high) in enumerate((crop.x_mm, crop.y_mm)):
+                assert low < rim_mm[:, axis].min() and rim_mm[:, axis].max() < high, point.label
+
+
+def test_the_matching_radius_tells_neighbours_apart_and_covers_the_largest_hole() -> None:
+    for point in points_of("averaging"):
+        assert isinstance(point.config.source, SimulatedSource)
+        holes = point.config.source.target.declare().holes
+        pitch_mm = min(abs(a.centre_mm[0] - b.centre_mm[0]) for a, b in pairwise(holes))
+        assert max(hole.diameter_mm for hole in holes) / 2 < point.config.matching.radius_mm < pitch_mm / 2

@@ -1,0 +1,276 @@
+"""Every format gives the same points, colours and reasons; lenses from every kind of file."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import recorded_plane as plane
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from detectors.recordings import Recording, open_capture
+from detectors.recordings.distances import frame_from_points, metres_per_unit, rounding_step_m
+from detectors.recordings.intrinsics import read_lens
+from harness.vocabulary.capture import Frame, Reason
+from harness.vocabulary.lens import Lens
+
+STORED = plane.depth_mm()
+TRUE_M = plane.points_m(STORED)
+
+
+def points_of(recording: Recording, frame: Frame) -> np.ndarray:
+    """(h, w, 3), as averaging makes them."""
+    if frame.xy_m is not None:
+        return np.concatenate([frame.xy_m, frame.z_m[..., None]], axis=-1)
+    assert recording.slopes is not None
+    z = frame.z_m.astype(float)[..., None]
+    return np.concatenate([recording.slopes * z, z], axis=-1)
+
+
+def open3d(tmp: Path) -> Recording:
+    return open_capture([plane.write_open3d_folder(tmp / "o3d", 1)])
+
+
+def tum(tmp: Path) -> Recording:
+    for name in ("depth", "rgb"):
+        (tmp / name).mkdir()
+    cv2.imwrite(str(tmp / "depth" / "1305031102.160407.png"), STORED * 5)
+    cv2.imwrite(str(tmp / "rgb" / "1305031102.175304.png"), plane.rgb()[..., ::-1])
+    cv2.imwrite(str(tmp / "rgb" / "1305031102.211214.png"), plane.rgb(9)[..., ::-1])
+    (tmp / "depth.txt").write_text("# timestamp filename\n")
+    return open_capture([tmp], intrinsics=plane.write_lens(tmp / "freiburg.json"))
+
+
+def sdk_names(tmp: Path) -> Recording:
+    cv2.imwrite(str(tmp / "depth_0001.png"), STORED)
+    cv2.imwrite(str(tmp / "color_0001.png"), plane.rgb()[..., ::-1])
+    cv2.imwrite(str(tmp / "ir_0001.png"), STORED)
+    plane.write_lens(tmp / "camera.json")
+    return open_capture([tmp])
+
+
+def file_list(tmp: Path) -> Recording:
+    cv2.imwrite(str(tmp / "a.png"), STORED)
+    return open_capture([tmp / "a.png"], lens=plane.LENS)
+
+
+def npy_depth(tmp: Path) -> Recording:
+    np.save(tmp / "d.npy", STORED[None])
+    return open_capture([tmp / "d.npy"], lens=plane.LENS)
+
+
+def npz_metres(tmp: Path) -> Recording:
+    np.savez(tmp / "d.npz", depth=(STORED / 1e3).astype(np.float32), rgb=plane.rgb())
+    return open_capture([tmp / "d.npz"], lens=plane.LENS)
+
+
+def npy_points(tmp: Path) -> Recording:
+    np.save(tmp / "p.npy", TRUE_M)
+    return open_capture([tmp / "p.npy"])
+
+
+def mat_grid(tmp: Path) -> Recording:
+    scipy.io.savemat(tmp / "c.mat", {"Location": TRUE_M, "Color": plane.rgb(), "note": "plate"})
+    return open_capture([tmp / "c.mat"])
+
+
+def mat_frames_last(tmp: Path) -> Recording:
+    scipy.io.savemat(tmp / "c.mat", {"Location": np.stack([TRUE_M] * 5, axis=-1)})
+    return open_capture([tmp / "c.mat"])
+
+
+def mat_lists_on_a_lens(tmp: Path) -> Recording:
+    scipy.io.savemat(tmp / "c.mat", {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
+    return open_capture([tmp / "c.mat"], lens=plane.LENS)
+
+
+def pcd(tmp: Path) -> Recording:
+    return open_capture([plane.write_pcd(tmp / "c.pcd", TRUE_M)])
+
+
+def ply(tmp: Path) -> Recording:
+    return open_capture([plane.write_ply(tmp / "c.ply", TRUE_M)])
+
+
+FORMATS = (
+    open3d, tum, sdk_names, file_list, npy_depth, npz_metres, npy_points, mat_grid, mat_frames_last,
+    mat_lists_on_a_lens, pcd, ply,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("opened", FORMATS, ids=lambda f: f.__name__)
+def test_every_format_gives_the_points_that_were_written(opened: Callable[[Path], Recording], tmp_path: Path) -> None:
+    recording = opened(tmp_path)
+    frame = next(recording.frames())
+    assert recording.organised
+    assert recording.region.shape == (72, 96)
+    np.testing.assert_allclose(points_of(recording, frame), TRUE_M, atol=1e-6)
+    expected = np.zeros((72, 96), np.uint8)
+    stores_zero = frame.reason[plane.NO_RETURN] == Reason.NO_RETURN
+    expected[plane.NO_RETURN] = Reason.NO_RETURN if stores_zero else Reason.NOT_FINITE
+    np.testing.assert_array_equal(frame.reason, expected)
+    assert recording.z_step_m == pytest.approx(0.2e-3 if opened is tum else 1e-3, rel=1e-12)
+    assert all(path.is_file() for path in recording.files)
+
+
+@pytest.mark.parametrize("opened", (open3d, tum, sdk_names, npz_metres, mat_grid), ids=lambda f: f.__name__)
+def test_colour_lies_on_the_depth_pixels(opened: Callable[[Path], Recording], tmp_path: Path) -> None:
+    np.testing.assert_array_equal(next(opened(tmp_path).frames()).rgb, plane.rgb())
+
+
+@pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
+def test_a_cloud_keeps_colour_and_may_lack_a_grid(write: Callable[..., Path], suffix: str, tmp_path: Path) -> None:
+    recording = open_capture([write(tmp_path / f"c.{suffix}", TRUE_M, False)])
+    frame = next(recording.frames())
+    assert not recording.organised and recording.region.shape == (1, 72 * 96)
+    np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
+    assert frame.rgb is not None and (frame.rgb == (16, 32, 48)).all()
+
+
+def test_lists_of_points_without_a_lens_have_no_grid(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "c.mat", {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
+    recording = open_capture([tmp_path / "c.mat"])
+    assert not recording.organised and len(list(recording.frames())) == 2
+
+
+def test_frames_stream_in_the_order_of_their_numbers_and_start_again(tmp_path: Path) -> None:
+    for i in (2, 10, 9):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), plane.depth_mm() + i)
+    cv2.imwrite(str(tmp_path / "wall_mask.png"), np.full((72, 96), 255, np.uint8))
+    recording = open_capture([tmp_path], lens=plane.LENS)
+    names = [frame.name.split("/")[1] for frame in recording.frames()]
+    assert names == ["2.png", "9.png", "10.png"]
+    assert [frame.name.split("/")[1] for frame in recording.frames()] == names
+    assert len(list(open_capture([tmp_path], lens=plane.LENS, frames=slice(2)).frames())) == 2
+    (tmp_path / "10.png").unlink()  # an iterator that has not come to it has not read it
+    streaming = recording.frames()
+    assert [next(streaming).name, next(streaming).name] == [f"{tmp_path.name}/2.png", f"{tmp_path.name}/9.png"]
+
+
+def test_a_recording_can_be_sent_to_another_process(tmp_path: Path) -> None:
+    recording = pickle.loads(pickle.dumps(open3d(tmp_path)))
+    np.testing.assert_allclose(points_of(recording, next(recording.frames())), TRUE_M, atol=1e-6)
+
+
+def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "o", 1)
+    cv2.imwrite(str(folder / "color" / "00000.png"), np.zeros((10, 10, 3), np.uint8))
+    recording = open_capture([folder])
+    assert next(recording.frames()).rgb is None
+    assert any("10 x 10" in note for note in recording.notes)
+
+
+def test_a_cloud_behind_or_beside_the_lens_keeps_a_reason() -> None:
+    stored = np.array([[[0.0, 0, 1], [0, 0, 0], [np.inf, 0, 1], [0, 0, np.nan], [0, 0, -1], [0, 0, 2]]])
+    frame = frame_from_points("a", stored, 1.0)
+    valid, none, odd, out = Reason.VALID, Reason.NO_RETURN, Reason.NOT_FINITE, Reason.OUT_OF_RANGE
+    assert frame.reason.tolist() == [[valid, none, odd, odd, out, valid]]
+    np.testing.assert_array_equal(np.isfinite(frame.z_m), frame.reason == Reason.VALID)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(("mm", "m", "cm", "um", "tum", "4000/m")), st.floats(0.06, 19.0))
+def test_a_unit_turns_stored_numbers_into_metres_and_back(unit: str, distance_m: float) -> None:
+    stored = np.full((2, 2, 3), distance_m / metres_per_unit(unit))
+    assert frame_from_points("a", stored, metres_per_unit(unit)).z_m[0, 0] == pytest.approx(distance_m, rel=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from((1e-3, 2.5e-4, 2e-4, 1e-4)), st.integers(0, 1000))
+def test_the_rounding_step_is_found_in_floating_point_metres(step_m: float, seed: int) -> None:
+    turns = np.random.default_rng(seed).integers(800, 19_000, 500)
+    assert rounding_step_m((turns * step_m).astype(np.float32)) >= step_m * (1 - 1e-12)
+    free = np.random.default_rng(seed).uniform(0.5, 2.0, 500).astype(np.float32)
+    assert rounding_step_m(free) == 0.0
+
+
+# ---- lenses ----------------------------------------------------------------------------------------------------------
+
+DISTORTION = (0.1, -0.2, 0.001, -0.002, 0.03, 0.4, 0.05, 0.006)
+
+
+def plain_json(lens: Lens) -> str:
+    k = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    return json.dumps({**k, "distortion": list(lens.distortion)})
+
+
+def named_json(lens: Lens) -> str:
+    k = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return json.dumps({**k, "distortion": dict(zip(names, lens.distortion, strict=True))})
+
+
+def opencv_yaml(lens: Lens) -> str:
+    def matrix(rows: int, columns: int, values: list[float]) -> str:
+        head = f" !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n"
+        return head + f"   data: [ {', '.join(map(repr, values))} ]\n"
+
+    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
+    return f"%YAML:1.0\n---\n{size}camera_matrix:{matrix(3, 3, k)}distortion_coefficients:{matrix(1, 8, d)}"
+
+
+def ros_yaml(lens: Lens) -> str:
+    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
+    matrices = f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\ndistortion_coefficients:\n  data: {d}\n"
+    return f"{size}camera_name: depth\ndistortion_model: rational_polynomial\n{matrices}"
+
+
+def ros_message(lens: Lens) -> str:
+    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    return f"height: {lens.height}\nwidth: {lens.width}\ndistortion_model: rational_polynomial\nD: {d}\nK: {k}\n"
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.sampled_from((plain_json, named_json, opencv_yaml, ros_yaml, ros_message)),
+    st.floats(300, 900),
+    st.floats(300, 900),
+    st.floats(200, 400),
+    st.floats(200, 400),
+)
+def test_every_kind_of_lens_file_gives_the_same_lens(
+    tmp_path_factory: pytest.TempPathFactory,
+    written: Callable[[Lens], str],
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> None:
+    lens = Lens(640, 576, fx, fy, cx, cy, DISTORTION)
+    path = tmp_path_factory.mktemp("lens") / "camera.txt"
+    path.write_text(written(lens))
+    assert read_lens(path, 640, 576) == lens
+
+
+def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "o", 1)
+    assert read_lens(folder / "intrinsic.json", 96, 72) == plane.LENS
+
+
+# ---- real captures ---------------------------------------------------------------------------------------------------
+
+
+def test_the_drilled_plate_opens_as_it_stands(shared_data: Path) -> None:
+    recording = open_capture([shared_data / "azure_drilled_board"])
+    frames = [(float(np.nanmedian(frame.z_m)), frame.rgb is not None) for frame in recording.frames()]
+    medians = np.array([median for median, _ in frames])
+    assert len(frames) == 18 and recording.region.shape == (720, 1280)
+    # Frame 3 of this capture stands 18 mm behind all others.
+    np.testing.assert_allclose(np.delete(medians, 3), 0.254, atol=1e-6)
+    assert medians[3] == pytest.approx(0.272)
+    assert frames[0][1] and not any(coloured for _, coloured in frames[1:])
+
+
+def test_the_walls_need_a_lens_and_leave_their_mask_out(shared_data: Path) -> None:
+    recording = open_capture([shared_data / "azure_nfov_walls"], lens=Lens(640, 576, 504.0, 504.0, 332.0, 326.0))
+    assert len(list(recording.frames())) == 22
+    assert not any("mask" in path.name for path in recording.files)

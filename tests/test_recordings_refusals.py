@@ -1,0 +1,254 @@
+"""What is wrong with a capture is told once: which file, what would be legal, what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import recorded_plane as plane
+import scipy.io
+
+from detectors.recordings import open_capture
+from detectors.recordings.intrinsics import read_lens
+from harness.vocabulary.errors import UserError
+
+STORED = plane.depth_mm()
+
+
+def refusal(*paths: Path, **options: object) -> str:
+    """The message of opening and reading a capture to its end."""
+    with pytest.raises(UserError) as caught:
+        list(open_capture(list(paths), **options).frames())  # type: ignore[arg-type]
+    return str(caught.value)
+
+
+def png(path: Path, stored: np.ndarray = STORED) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), stored)
+    return path
+
+
+def cut(path: Path, part: float) -> Path:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(part * len(content))])
+    return path
+
+
+def test_a_missing_path_is_named(tmp_path: Path) -> None:
+    message = refusal(tmp_path / "nowhere")
+    assert str(tmp_path / "nowhere") in message and ".mkv" in message
+
+
+def test_an_unknown_kind_of_file_lists_the_known_ones(tmp_path: Path) -> None:
+    (tmp_path / "scan.las").write_bytes(b"LASF")
+    message = refusal(tmp_path / "scan.las")
+    assert "'.las'" in message and all(kind in message for kind in (".png", ".ply", ".npz", ".mat", ".mkv"))
+
+
+def test_a_mixed_list_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STORED)
+    message = refusal(png(tmp_path / "a.png"), tmp_path / "a.npy", lens=plane.LENS)
+    assert ".npy, .png" in message
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    assert "no depth picture" in refusal(tmp_path, lens=plane.LENS)
+
+
+@pytest.mark.parametrize("part", (0.0, 0.02, 0.5, 0.98))
+def test_a_truncated_picture_is_named(tmp_path: Path, part: float) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "c", 3)
+    cut(folder / "depth" / "00001.png", part)
+    message = refusal(folder)
+    assert "00001.png" in message and "truncated" in message
+
+
+def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
+    path = png(tmp_path / "1.png")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    assert "1.png: is damaged" in refusal(tmp_path, lens=plane.LENS)
+
+
+@pytest.mark.parametrize(
+    ("stored", "told"), ((np.zeros((72, 96), np.uint8), "8 bits"), (np.ones((72, 96, 3), np.uint16), "RGB"))
+)
+def test_a_picture_that_is_no_depth_image_is_named(tmp_path: Path, stored: np.ndarray, told: str) -> None:
+    png(tmp_path / "1.png")
+    png(tmp_path / "2.png", stored)
+    message = refusal(tmp_path, lens=plane.LENS)
+    assert "2.png" in message and told in message and "16-bit" in message
+    assert "2.png" in refusal(tmp_path / "2.png", lens=plane.LENS)
+
+
+def test_sizes_that_differ_name_both_pictures(tmp_path: Path) -> None:
+    png(tmp_path / "1.png")
+    png(tmp_path / "2.png", STORED[:-2])
+    message = refusal(tmp_path, lens=plane.LENS)
+    assert "2.png: 96 x 70" in message and "1.png has 96 x 72" in message
+
+
+def test_clouds_of_different_sizes_are_named(tmp_path: Path) -> None:
+    points = plane.points_m(STORED)
+    plane.write_pcd(tmp_path / "1.pcd", points)
+    plane.write_pcd(tmp_path / "2.pcd", points[:-2])
+    assert "2.pcd: 96 x 70 pixels, but the first frame has 96 x 72" in refusal(tmp_path)
+
+
+def test_frames_without_one_valid_pixel_are_refused(tmp_path: Path) -> None:
+    png(tmp_path / "1.png", STORED * 0)
+    png(tmp_path / "2.png", STORED * 0)
+    assert "not one valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
+    np.save(tmp_path / "nan.npy", np.full((72, 96), np.nan))
+    assert "not one valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
+
+
+def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
+    png(tmp_path / "1.png", STORED * 0)
+    png(tmp_path / "2.png")
+    frames = list(open_capture([tmp_path], lens=plane.LENS).frames())
+    assert [np.isfinite(frame.z_m).any() for frame in frames] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("stored", "unit", "advice"),
+    (
+        (STORED.astype(np.float32), None, "--unit mm (then 0.5"),
+        (STORED.astype(np.float32) / 1000, "mm", "--unit m (then 0.5"),
+        (STORED, "m", "--unit mm (then 0.5"),
+    ),
+)
+def test_a_wrong_unit_is_noticed_and_the_right_one_offered(
+    tmp_path: Path, stored: np.ndarray, unit: str | None, advice: str
+) -> None:
+    np.save(tmp_path / "d.npy", stored)
+    message = refusal(tmp_path / "d.npy", lens=plane.LENS, unit=unit)
+    assert "wrong unit" in message and advice in message
+
+
+def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+    assert "--unit furlong" in refusal(png(tmp_path / "1.png"), lens=plane.LENS, unit="furlong")
+
+
+def test_depth_without_a_lens_says_what_to_give(tmp_path: Path) -> None:
+    message = refusal(png(tmp_path / "1.png"))
+    assert "which lens" in message and "--intrinsics" in message and "camera_info" in message
+
+
+def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "c", 1)
+    (folder / "depth" / "00000.png").unlink()
+    png(folder / "depth" / "00000.png", STORED[:-2])
+    assert "96 x 72 pixels, but the depth images have 96 x 70" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    ("array", "told"),
+    (
+        (np.zeros((4, 5), np.uint8), "8-bit"),
+        (np.zeros((4, 5), bool), "bool"),
+        (np.zeros(7), "axes"),
+        (np.zeros((2, 2, 3, 4, 5)), "axes"),
+        (np.zeros((0, 4, 5)), "empty"),
+    ),
+)
+def test_an_array_that_is_no_capture_is_refused(tmp_path: Path, array: np.ndarray, told: str) -> None:
+    np.save(tmp_path / "a.npy", array)
+    assert told in refusal(tmp_path / "a.npy", lens=plane.LENS)
+
+
+def test_arrays_of_objects_are_never_unpickled(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([{}], dtype=object), allow_pickle=True)
+    assert "no objects" in refusal(tmp_path / "a.npy")
+    np.savez(tmp_path / "a.npz", depth=np.array([{}], dtype=object))
+    assert "no objects" in refusal(tmp_path / "a.npz")
+
+
+def test_an_archive_with_several_arrays_must_name_one(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", first=STORED, second=STORED)
+    assert "first (72, 96), second (72, 96)" in refusal(tmp_path / "a.npz", lens=plane.LENS)
+    np.savez(tmp_path / "b.npz", depth=STORED, xyz=plane.points_m(STORED))
+    assert "several arrays" in refusal(tmp_path / "b.npz", lens=plane.LENS)
+
+
+@pytest.mark.parametrize("suffix", (".npy", ".npz", ".mat"))
+def test_a_truncated_file_of_arrays_is_named(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".npy":
+        np.save(path, STORED)
+    elif suffix == ".npz":
+        np.savez(path, depth=STORED)
+    else:
+        scipy.io.savemat(path, {"Location": plane.points_m(STORED)})
+    assert f"a{suffix}" in refusal(cut(path, 0.6), lens=plane.LENS)
+
+
+EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
+
+
+def test_a_saved_point_cloud_object_gets_the_line_that_exports_it(tmp_path: Path) -> None:
+    message = refusal(plane.write_opaque_mat(tmp_path / "pc.mat"))
+    assert "the variable pc is a MATLAB object (pointCloud)" in message and EXPORT in message
+
+
+def test_a_v73_file_is_told_how_to_be_saved(tmp_path: Path) -> None:
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(100)
+    (tmp_path / "a.mat").write_bytes(head)
+    message = refusal(tmp_path / "a.mat")
+    assert "-v7.3" in message and "'-v7'" in message
+
+
+@pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
+@pytest.mark.parametrize("missing", (10, 60_000, 10**6))
+def test_a_truncated_cloud_is_named(
+    tmp_path: Path, write: Callable[..., Path], suffix: str, missing: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    whole = write(tmp_path / f"c.{suffix}", plane.points_m(STORED)).stat().st_size
+    message = refusal(write(tmp_path / f"c.{suffix}", plane.points_m(STORED), cut=min(missing, whole)))
+    assert f"c.{suffix}" in message
+    assert capfd.readouterr().out == ""
+
+
+def test_a_cloud_behind_the_camera_is_refused(tmp_path: Path) -> None:
+    message = refusal(plane.write_pcd(tmp_path / "c.pcd", plane.points_m(STORED) * [1, -1, -1]))
+    assert "behind the camera" in message and "negate" in message
+
+
+# ---- lenses ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    (
+        ('{"fx": 500, "fy": 500, "cx": 300}', "its keys: fx, fy, cx"),
+        ('{"fx": 500, "fx": 500, "fy": 500, "cx": 300, "cy": 200}', "fx stands twice"),
+        ('{"fx": 500,\n "fy": }', ":2:8:"),
+        ('{"fx": "500", "fy": 500, "cx": 300, "cy": 200}', "fx is '500'"),
+        ('{"fx": true, "fy": 500, "cx": 300, "cy": 200}', "fx is True"),
+        ('{"fx": NaN, "fy": 500, "cx": 300, "cy": 200}', "fx is nan"),
+        ('{"fx": 0.79, "fy": 0.88, "cx": 0.5, "cy": 0.5}', "normalised"),
+        ('{"fx": -500, "fy": 500, "cx": 300, "cy": 200}', "focal length"),
+        ('{"fx": 500, "fy": 500, "cx": 9000, "cy": 200}', "principal point"),
+        ('{"fx": 500, "fy": 500, "cx": 300, "cy": 200, "distortion": [1, 2, 3]}', "3 numbers"),
+        ('{"fx": 500, "fy": 500, "cx": 300, "cy": 200, "distortion": {"k7": 1}}', "has k7"),
+        ('{"intrinsic_matrix": [1, 2, 3]}', "list of 9"),
+        ("K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\ndistortion_model: equidistant", "equidistant"),
+        ("fx: 500\nfx: 500\n", ":2:1:"),
+        ("just text", "no names"),
+    ),
+)
+def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "lens.txt"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_lens(path, 640, 576)
+    assert told in str(caught.value) and "lens.txt" in str(caught.value)
+
+
+def test_a_missing_lens_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"none\.json: no such file"):
+        read_lens(tmp_path / "none.json", 640, 576)
