@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import cv2
+import math
+
 import numpy as np
 from pydantic import Field, field_validator
 
@@ -226,7 +228,9 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, around.patch.metric_m2, 1)[0]
     if float(disc[around.invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, "part of the hole has no range"
-    error = float(np.sqrt(fit.covariance[2, 2])) / fit.radius_m
+    variance = float(fit.covariance[2, 2])
+    # a singular fit can leave a negative variance by rounding
+    error = math.sqrt(variance) / fit.radius_m if variance > 0 else math.inf
     if not error < config.largest_relative_error:
         return None, "diameter and depth cannot be told apart through the blur (the diameter is an upper limit)"
     return fit, ""

@@ -96,7 +96,7 @@ def _run(arguments: argparse.Namespace) -> int:
     threshold, origin = _threshold(arguments, detector, cloud)
     detections = detector.find(cloud, evidence, threshold)
     judged = Judged(cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections))
-    _print_capture(recording, cloud, evidence)
+    _print_capture(recording, cloud, evidence, arguments.crop)
     print(f"threshold: {threshold:.4g} x {_mm(evidence.scale_m)} = {_mm(threshold * evidence.scale_m)} ({origin})")
     _print_table(judged.findings)
     if arguments.out is not None:
@@ -219,7 +219,7 @@ def _print_frames(recording: Recording) -> None:
         print(f"frame {frame.name}: {100 * valid.mean():.1f} % valid, median distance {median}")
 
 
-def _print_capture(recording: Recording, cloud: Cloud, evidence: Evidence) -> None:
+def _print_capture(recording: Recording, cloud: Cloud, evidence: Evidence, crop: str) -> None:
     """Frames, what was left out, crop and surface, a line each."""
     import numpy as np
 
@@ -235,14 +235,20 @@ def _print_capture(recording: Recording, cloud: Cloud, evidence: Evidence) -> No
     where = (
         f", columns {columns.min()} to {columns.max()}, rows {rows.min()} to {rows.max()}" if cloud.organised else ""
     )
-    print(f"crop: {kept.sum()} of {cloud.valid.sum()} valid points{where}")
+    print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points{where}")
+    if not cloud.organised and crop == "auto" and kept.sum() < cloud.valid.sum():
+        off = cloud.valid.sum() - kept.sum()
+        print(f"note: {off} points lie off the largest cluster and are not judged; --crop none judges all of them")
     within = cloud.variance_m2[kept & np.isfinite(cloud.variance_m2)]
     temporal = f"; one frame's noise {_mm(float(np.sqrt(np.median(within))))}" if within.size else ""
     print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {_mm(evidence.scale_m)}{temporal}")
 
 
 def _print_table(findings: tuple[Finding, ...]) -> None:
-    """A table on a terminal, plain columns elsewhere."""
+    """A table on a terminal that is wide enough for it, plain columns elsewhere."""
+    if not findings:
+        print("no findings")
+        return
     titles = (
         "id",
         "u px",
@@ -250,28 +256,31 @@ def _print_table(findings: tuple[Finding, ...]) -> None:
         "x mm",
         "y mm",
         "z mm",
-        "diameter mm",
+        "diam. mm",
         "from",
         "depth mm",
-        "volume mm3",
+        "vol. mm3",
         "points",
         "score",
     )
     rows = [_cells(finding) for finding in findings]
-    if not rows:
-        print("no findings")
-    elif sys.stdout.isatty():
+    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
+    if sys.stdout.isatty():
+        from rich.box import SIMPLE_HEAD
         from rich.console import Console
         from rich.table import Table
 
-        table = Table(*titles)
-        for row in rows:
-            table.add_row(*row)
-        Console().print(table)
-    else:
-        widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-        for row in (titles, *rows):
-            print("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))
+        console = Console()
+        if sum(widths) + 2 * len(widths) <= console.width:
+            table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+            for title, width in zip(titles, widths, strict=True):
+                table.add_column(title, justify="right", no_wrap=True, min_width=width)
+            for row in rows:
+                table.add_row(*row)
+            console.print(table)
+            return
+    for row in (titles, *rows):
+        print("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))
 
 
 def _cells(f: Finding) -> tuple[str, ...]:

@@ -9,8 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from harness.evaluation.summary import ResultTables
 from harness.report.example import ExampleCloud, HoleInView
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Satisfies `harness.evaluation.summary.ResultTables`."""
+
+    holes: pd.DataFrame
+    runs: pd.DataFrame
+    probes: pd.DataFrame
+    variants: pd.DataFrame
+
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
 FRAMES = (1, 2, 5, 10, 20, 50)
@@ -42,12 +52,12 @@ class World:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
-def tables(world: World | None = None, frames: tuple[int, ...] = FRAMES, variant: str = "main") -> ResultTables:
+def tables(world: World | None = None, frames: tuple[int, ...] = FRAMES, variant: str = "main") -> Tables:
     """The four tables of one variant."""
     world = world or World()
     rng = np.random.default_rng(world.seed)
     variants = pd.DataFrame([{"variant": variant, "reason": "as declared", "settings": json.dumps({"seed": 1})}])
-    return ResultTables(
+    return Tables(
         holes=pd.concat([_holes(world, rng, variant, n) for n in frames], ignore_index=True),
         runs=pd.concat([_runs(world, rng, variant, n) for n in frames], ignore_index=True),
         probes=_probes(world, rng, variant, frames),
@@ -55,9 +65,9 @@ def tables(world: World | None = None, frames: tuple[int, ...] = FRAMES, variant
     )
 
 
-def joined(*parts: ResultTables) -> ResultTables:
+def joined(*parts: Tables) -> Tables:
     """Several variants in one set of tables."""
-    return ResultTables(
+    return Tables(
         *(
             pd.concat([getattr(part, name) for part in parts], ignore_index=True)
             for name in ("holes", "runs", "probes", "variants")
@@ -113,6 +123,8 @@ def provenance() -> dict[str, object]:
 def _exactly(rng: np.random.Generator, n: int, mean: float, std: float) -> np.ndarray:
     """``n`` values with exactly this mean and standard deviation (n - 1)."""
     values = rng.normal(size=n)
+    if n == 1:
+        return np.array([mean])
     return mean + std * (values - values.mean()) / values.std(ddof=1)
 
 
@@ -173,8 +185,8 @@ def _runs(world: World, rng: np.random.Generator, variant: str, frames: int) -> 
                     "role": role,
                     "false_calls": (np.arange(n) == 3).astype(int) if role == "damaged" else 0,
                     "detections": 8 if role == "damaged" else 0,
-                    "threshold": threshold,
-                    "quiet_threshold": np.nan if role == "damaged" else threshold - 0.3,
+                    "threshold": threshold if role == "damaged" else np.nan,
+                    "quiet_threshold": np.nan if role == "damaged" else threshold - 0.02 * np.arange(n),
                     "scale_mm": scale + rng.normal(0, 0.003, n),
                     "surface_noise_mm": 0.9 / np.sqrt(frames),
                     "frames_used": frames,
@@ -194,18 +206,18 @@ def _probes(world: World, rng: np.random.Generator, variant: str, frames: tuple[
     parts = []
     for n in frames:
         sigma = world.temporal_mm(n)
-        freedom = world.repeats - 1
+        freedom = max(world.repeats - 1, 1)
         parts.append(
             pd.DataFrame(
                 {
                     "variant": variant,
                     "frames": n,
                     "pixel": np.arange(pixels),
-                    "true_z_mm": 800.0,
                     "mean_error_mm": world.offset_mm
                     + world.pattern_mm(n) * pattern
                     + rng.normal(0, sigma / np.sqrt(world.repeats), pixels),
-                    "temporal_std_mm": sigma * np.sqrt(rng.chisquare(freedom, pixels) / freedom),
+                    "temporal_std_mm": (np.nan if world.repeats < 2 else sigma)
+                    * np.sqrt(rng.chisquare(freedom, pixels) / freedom),
                     "repeats": world.repeats,
                 }
             )

@@ -38,7 +38,6 @@ def test_three_pixels_by_hand() -> None:
             "variant": "main",
             "frames": 4,
             "pixel": [0, 1, 2, 3],
-            "true_z_mm": 800.0,
             "mean_error_mm": [1.0, 2.0, 3.0, np.nan],
             "temporal_std_mm": [0.5, 0.5, 0.5, 0.5],
             "repeats": 5,

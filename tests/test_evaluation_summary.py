@@ -48,13 +48,24 @@ def test_found_missed_or_undecided(detected: int, status: str) -> None:
 
 
 def test_false_calls_with_poisson_interval() -> None:
-    calls = false_calls(tables(frames=(1,)).runs).set_index("role")
+    runs = tables(frames=(1,)).runs
+    calls = false_calls(runs).set_index("role")
+    # The hole-free runs set the threshold: they are no test of it.
+    assert list(calls.index) == ["damaged"]
     damaged = calls.loc["damaged"]
     assert (damaged["runs"], damaged["false_calls"], damaged["per_run"]) == (50, 1, 0.02)
     assert damaged["per_run_low"] == pytest.approx(0.0253 / 50, abs=1e-6)
     assert damaged["per_run_high"] == pytest.approx(5.5716 / 50, abs=1e-6)
     assert damaged["threshold_mm"] == pytest.approx(5 * 0.9, abs=0.01)
-    assert calls.loc["hole_free", "false_calls"] == 0
+    assert (damaged["quiet_runs"], damaged["quiet_highest"]) == (50, 5.0)
+
+
+def test_hole_free_runs_at_a_given_threshold_are_counted() -> None:
+    runs = tables(frames=(1,)).runs
+    runs.loc[runs["role"] == "hole_free", ["threshold", "false_calls"]] = [3.0, 2]
+    calls = false_calls(runs).set_index("role")
+    assert calls.loc["hole_free", "false_calls"] == 100
+    assert calls.loc["hole_free", "per_run"] == 2.0
 
 
 def test_a_repeat_of_rows_changes_counts_not_means() -> None:

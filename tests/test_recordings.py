@@ -274,3 +274,23 @@ def test_the_walls_need_a_lens_and_leave_their_mask_out(shared_data: Path) -> No
     recording = open_capture([shared_data / "azure_nfov_walls"], lens=Lens(640, 576, 504.0, 504.0, 332.0, 326.0))
     assert len(list(recording.frames())) == 22
     assert not any("mask" in path.name for path in recording.files)
+
+
+def test_pixels_without_a_ray_are_outside_the_mask(tmp_path: Path) -> None:
+    """With k1 = -0.5 the distorted radius r - r^3 / 2 never exceeds 0.544: pixels beyond see nothing."""
+    np.save(tmp_path / "d.npy", np.full((101, 101), 1000, np.uint16))
+    lens = Lens(101, 101, 60.0, 60.0, 50.0, 50.0, (-0.5, *[0.0] * 7))
+    recording = open_capture([tmp_path / "d.npy"], lens=lens)
+    frame = next(recording.frames())
+    v, u = np.mgrid[:101, :101]
+    radius = np.hypot(u - 50, v - 50) / 60.0
+    assert (frame.reason[radius > 0.56] == Reason.OUTSIDE_MASK).all()
+    assert (frame.reason[radius < 0.50] == Reason.VALID).all()
+    np.testing.assert_array_equal(np.isnan(frame.z_m), frame.reason == Reason.OUTSIDE_MASK)
+
+
+def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_path: Path) -> None:
+    (tmp_path / "calibration.json").write_bytes(plane.calibration().rstrip(b"\0"))
+    cv2.imwrite(str(tmp_path / "depth0.png"), np.full((576, 640), 900, np.uint16))
+    lens = open_capture([tmp_path]).lens
+    assert lens is not None and (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,43 +11,61 @@ from detectors.average import prefix_averages
 from harness.engine.plan import Group
 from harness.engine.setup import SetUp, load_set_up
 from harness.evaluation.profile import HoleInView
+from harness.experiment.points import Point
 from harness.report.example import ExampleCloud
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM
 
 
-def examples_of(group: Group, thresholds: Mapping[str, float], variant: str) -> list[ExampleCloud]:
-    """The clouds of repeat 0 at the least and the greatest number of frames of a variant, with what was detected."""
-    points = sorted((p for p in group.points if p.variant == variant), key=lambda p: p.config.capture.frames)
-    points = [p for p in points if p.digest in thresholds]
-    if not points:
+def examples_of(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
+    """The clouds of repeat 0 at the least and the greatest number of frames of each variant of a group."""
+    chosen = _ends([point for point in group.points if point.digest in thresholds])
+    if not chosen:
         return []
-    chosen = [points[0], points[-1]] if len(points) > 1 else points
     set_up = load_set_up(group.set_up)
-    counts = [p.config.capture.frames for p in chosen]
-    capture = set_up.damaged.capture(max(counts), group.seed, "damaged", 0)
-    clouds = prefix_averages(capture, counts, chosen[0].config.capture.average)
-    found = []
-    for point in chosen:
-        cloud = clouds[point.config.capture.frames]
-        detector = load_detector(point.config.detector.name, json.loads(json.dumps(point.config.detector.settings)))
-        evidence = detector.analyse(cloud)
-        detected = np.zeros(cloud.valid.size, bool)
-        for detection in detector.find(cloud, evidence, thresholds[point.digest]):
-            detected[detection.pixels] = True
-        found.append(
-            ExampleCloud(
-                frames=point.config.capture.frames,
-                variant=variant,
-                points_m=cloud.points_m,
-                rgb=cloud.rgb if cloud.rgb is not None else np.full((*cloud.valid.shape, 3), 160, np.uint8),
-                residual_mm=evidence.residual_m / MM,
-                detected=detected.reshape(cloud.valid.shape),
-                inside=np.isfinite(evidence.score),
-                truth=_marks(set_up),
-                z_truth_mm=set_up.seen_z_m / MM,
-            )
+    counts = sorted({point.config.capture.frames for point in chosen})
+    capture = set_up.damaged.capture(counts[-1], group.seed, "damaged", 0)
+    averages = {canonical_json(point.config.capture.average.to_data()): point for point in chosen}
+    clouds = {text: prefix_averages(capture, counts, point.config.capture.average) for text, point in averages.items()}
+    return [
+        _example(
+            set_up,
+            clouds[canonical_json(point.config.capture.average.to_data())][point.config.capture.frames],
+            point,
+            thresholds[point.digest],
         )
-    return found
+        for point in chosen
+    ]
+
+
+def _ends(points: Sequence[Point]) -> list[Point]:
+    """Of each variant the points with the least and the greatest number of frames."""
+    by_variant: dict[str, list[Point]] = {}
+    for point in sorted(points, key=lambda p: p.config.capture.frames):
+        by_variant.setdefault(point.variant, []).append(point)
+    return [
+        point for found in by_variant.values() for point in (found[:1] if len(found) == 1 else [found[0], found[-1]])
+    ]
+
+
+def _example(set_up: SetUp, cloud: Cloud, point: Point, threshold: float) -> ExampleCloud:
+    detector = load_detector(point.config.detector.name, dict(point.config.detector.settings))
+    evidence = detector.analyse(cloud)
+    detected = np.zeros(cloud.valid.size, bool)
+    for detection in detector.find(cloud, evidence, threshold):
+        detected[detection.pixels] = True
+    return ExampleCloud(
+        frames=point.config.capture.frames,
+        variant=point.variant,
+        points_m=cloud.points_m,
+        rgb=cloud.rgb if cloud.rgb is not None else np.full((*cloud.valid.shape, 3), 160, np.uint8),
+        residual_mm=evidence.residual_m / MM,
+        detected=detected.reshape(cloud.valid.shape),
+        inside=np.isfinite(evidence.score),
+        truth=_marks(set_up),
+        z_truth_mm=set_up.seen_z_m / MM,
+    )
 
 
 def _marks(set_up: SetUp) -> tuple[HoleInView, ...]:

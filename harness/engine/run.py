@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from harness.engine import workers
+from harness.engine.examples import examples_of
 from harness.engine.journal import Journal, without_nan
 from harness.engine.plan import Group, Plan, RenderJob
 from harness.engine.trial import Record, Role, TrialTask, run_trial
+from harness.report.example import ExampleCloud
 from harness.vocabulary.errors import UserError
 
 
@@ -34,6 +36,7 @@ class Outcome:
     records: dict[str, Record] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
     thresholds: dict[str, float] = field(default_factory=dict)
+    examples: list[ExampleCloud] = field(default_factory=list)
     renders_done: int = 0
     renders_cached: int = 0
     render_seconds: float = 0.0
@@ -55,6 +58,11 @@ class Progress:
 @dataclass(frozen=True)
 class _Render:
     job: RenderJob
+
+
+@dataclass(frozen=True)
+class _Examples:
+    group: int
 
 
 @dataclass(frozen=True)
@@ -96,7 +104,7 @@ class _Run:
         self.trial_pool = trial_pool
         self.report = report
         self.outcome = Outcome()
-        self.pending: dict[Future[Any], _Render | _Trial] = {}
+        self.pending: dict[Future[Any], _Render | _Trial | _Examples] = {}
         self._views_missing = [{g.damaged.path, g.hole_free.path} for g in plan.groups]
         self._trials_missing: list[set[str]] = [set() for _ in plan.groups]
         self._quiet: dict[str, list[float]] = {}
@@ -120,13 +128,15 @@ class _Run:
                 fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short",
             ) from error
         except UserError as error:
-            if isinstance(work, _Render):
+            if not isinstance(work, _Trial):
                 raise
             self.outcome.failures.append(Failure(work.key, error.message))
             self._trial_over(work)
             return
         if isinstance(work, _Render):
             self._rendered(work.job, *result)
+        elif isinstance(work, _Examples):
+            self.outcome.examples += result
         else:
             record = without_nan(result)
             self.journal.write(work.key, record)
@@ -178,9 +188,11 @@ class _Run:
 
     def _role_over(self, number: int, role: Role) -> None:
         """After the hole-free trials each point has its threshold; then the damaged ones begin."""
-        if role == "damaged":
-            return
         group = self.plan.groups[number]
+        if role == "damaged":
+            future = self.trial_pool.submit(examples_of, group, self.outcome.thresholds)
+            self.pending[future] = _Examples(number)
+            return
         for point in group.points:
             given = point.config.threshold.k
             quiet = [value for value in self._quiet.get(point.digest, []) if value is not None]

@@ -13,7 +13,6 @@ from typing import Any
 import pandas as pd
 
 from harness.engine.console import progress_display
-from harness.engine.examples import examples_of
 from harness.engine.journal import Journal
 from harness.engine.plan import Plan, plan_of
 from harness.engine.run import Outcome, pending_counts, run_plan
@@ -61,7 +60,7 @@ def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int
     tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
     provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
     _write_tables(folder, tables, provenance)
-    _write_report(folder, experiment, plan, outcome, tables, provenance)
+    _write_report(folder, experiment, outcome, tables, provenance)
     _conclude(folder, tables, outcome)
     return 1 if outcome.failures else 0
 
@@ -134,14 +133,12 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> N
 
 
 def _write_report(
-    folder: Path, experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
+    folder: Path, experiment: Experiment, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
 ) -> None:
     from harness.report.page import write_report
 
-    variants = {point.variant: group for group in reversed(plan.groups) for point in group.points}
-    examples = [e for variant, group in variants.items() for e in examples_of(group, outcome.thresholds, variant)]
     title = experiment.config.title or experiment.config.name
-    write_report(folder, tables, examples, provenance, resolved_yaml(experiment), title)
+    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title)
 
 
 def _conclude(folder: Path, tables: Tables, outcome: Outcome) -> None:

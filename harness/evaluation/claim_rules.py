@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
+from harness.evaluation.comparisons import falling_rank, scatter_ratio
+from harness.evaluation.intervals import Interval, mean_difference, standardised_bias
 from harness.evaluation.noise import noise_law
 from harness.evaluation.profile import AveragedCloud, HoleShape, hole_shapes
 from harness.evaluation.summary import Measure, found_holes
@@ -160,7 +161,8 @@ def claim_c5(case: Case) -> Verdict:
         return Verdict("C5", text, "undecided", "No hole but the reference is found with 50 frames.", rule)
     off = rows["extent_offset_bias_mm"].abs()
     agrees = off <= np.maximum(rows["extent_offset_std_mm"].fillna(0.0), RULER_MM)
-    ratio, interval = _scatter_ratio(case.holes, list(rows["hole"]))
+    many = case.holes[(case.holes["frames"] == MANY) & case.holes["hole"].isin(rows["hole"])]
+    ratio, interval = scatter_ratio(many, "extent_offset_mm", "extent_diameter_mm")
     larger = True if interval.above(1) else (False if interval.below(1) else None)
     worst = rows.iloc[int(off.to_numpy().argmax())]
     evidence = (
@@ -245,35 +247,6 @@ def hole_list(names: Iterable[str]) -> str:
     return ", ".join(parts + others) or "none"
 
 
-def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows".
-
-    Exact permutation test up to 8 pairs, 20000 fixed random permutations beyond. A constant input has rho 0, p 1.
-    """
-    from scipy.stats import permutation_test, rankdata
-
-    ranks, other = rankdata(x), rankdata(y)
-    if np.ptp(ranks) == 0 or np.ptp(other) == 0:
-        return 0.0, 1.0
-    a, b = ranks - ranks.mean(), other - other.mean()
-    norm = np.sqrt((a @ a) * (b @ b))
-
-    def rho(permuted: np.ndarray, axis: int = -1) -> np.ndarray:
-        return np.sum(permuted * b, axis=axis) / norm
-
-    test = permutation_test(
-        (a,),
-        rho,
-        permutation_type="pairings",
-        alternative="less",
-        vectorized=True,
-        n_resamples=50_000 if len(a) <= 8 else 20_000,
-        rng=np.random.default_rng(0),
-        batch=10_000,
-    )
-    return float(a @ b / norm), float(test.pvalue)
-
-
 def _exact_set(case: Case, frames: int, expected: frozenset[str]) -> tuple[Answer, str]:
     """Whether exactly the expected ones of the thesis' holes are found; with the counts."""
     status = found_holes(case.summary, case.variant, frames)
@@ -344,43 +317,21 @@ def _nothing_found(case: Case) -> str:
     return "No hole is found with 50 frames."
 
 
-def _scatter_ratio(holes: pd.DataFrame, names: list[str]) -> tuple[float, Interval]:
-    """Median over holes of var(position)/var(size) with 50 frames, interval by bootstrap over repeats."""
-    rows = holes[(holes["frames"] == MANY) & holes["hole"].isin(names)]
-    place = rows.pivot(index="repeat", columns="hole", values="extent_offset_mm").to_numpy(float)
-    size = rows.pivot(index="repeat", columns="hole", values="extent_diameter_mm").to_numpy(float)
-    both = np.isfinite(place) & np.isfinite(size)
-    place, size = np.where(both, place, np.nan), np.where(both, size, np.nan)
-
-    def ratio(chosen: np.ndarray) -> np.ndarray:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratios = _nan_variance(place[chosen]) / _nan_variance(size[chosen])
-        return np.nanmedian(np.where(np.isnan(ratios).all(axis=1, keepdims=True), np.inf, ratios), axis=1)
-
-    everything = np.arange(len(place))[None]
-    return float(ratio(everything)[0]), bootstrap(ratio, len(place))
-
-
-def _nan_variance(values: np.ndarray) -> np.ndarray:
-    """Variance (n - 1) over axis 1 of (resamples, n, holes), NaN left out; NaN below two values."""
-    there = np.isfinite(values)
-    count = there.sum(axis=1)
-    mean = np.where(there, values, 0).sum(axis=1) / count
-    squares = np.where(there, (values - mean[:, None]) ** 2, 0).sum(axis=1)
-    return np.where(count >= 2, squares / (count - 1), np.nan)
-
-
 def _shapes_text(shapes: list[HoleShape]) -> str:
     looks = {look: [s.hole for s in shapes if s.looks == look] for look in ("bowl", "cylinder", "neither")}
     reached = np.array([shape.reached for shape in shapes])
     known = reached[np.isfinite(reached).all(axis=1)]
-    ratio = np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes])
+    ratio, seen = (
+        float(np.median([getattr(shape, f"{name}_rms_mm") / shape.cylinder_rms_mm for shape in shapes]))
+        for name in ("bowl", "seen")
+    )
     depths = ", ".join(f"{100 * share:.0f} %" for share in np.median(known, axis=0)) if len(known) else "unknown"
     control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
     return (
         f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
         f"{hole_list(looks['cylinder'])}; neither clearly: {hole_list(looks['neither'])}. Median misfit of the bowl "
-        f"{ratio:.2f} of the cylinder's. Median share of the true depth reached at 1/4, 1/2 and 3/4 of the radius: "
+        f"{ratio:.2f} of the cylinder's, of the true hole as seen from the camera {seen:.2f}. "
+        f"Median share of the true depth reached at 1/4, 1/2 and 3/4 of the radius: "
         f"{depths} (a hemisphere as deep: 97, 87 and 66 %). Control: the true geometry at the same pixels is nearer "
         f"to a bowl in {control} of {len(shapes)} holes."
     )

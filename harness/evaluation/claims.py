@@ -21,7 +21,7 @@ from harness.evaluation.claim_rules import (
     claim_c9,
     hole_list,
 )
-from harness.evaluation.summary import MAIN, ResultTables, summarise_holes
+from harness.evaluation.summary import MAIN, ResultTables, summarise_holes, with_columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,10 +69,11 @@ def verdicts_by_variant(
 
 
 def _case(tables: ResultTables, variant: str, examples: Sequence[Example], summary: pd.DataFrame) -> Case:
+    holes = with_columns(tables.holes)
     return Case(
         variant=variant,
         summary=summary[summary["variant"] == variant],
-        holes=tables.holes[tables.holes["variant"] == variant],
+        holes=holes[holes["variant"] == variant],
         runs=tables.runs[tables.runs["variant"] == variant],
         probes=tables.probes[tables.probes["variant"] == variant],
         examples=[example for example in examples if example.variant == variant],

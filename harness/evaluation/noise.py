@@ -54,13 +54,16 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     pixels of the mean error. ``pattern_mm``: standard deviation over pixels of the mean error, less the temporal
     variance that the finite number of repeats leaves in it (temporal^2 / repeats; 0 where that is the greater).
     ``systematic_mm``: offset and pattern together. ``total_rms_mm``: temporal and systematic together.
-    ``guide_mm``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value are left out.
+    ``guide_mm``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value
+    are left out, and with them rows that have no pixel (a single repeat has no scatter).
     """
     import pandas as pd
 
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)
+        if not len(moments):
+            continue
         mean = moments.mean(axis=0)
         offset, pattern2 = mean[1], _pattern_variance(mean, len(moments))
         systematic2 = _systematic_variance(mean, len(moments))

@@ -52,8 +52,10 @@ class HoleShape:
     """One-parameter fits to the depth inside a hole's outline, mm.
 
     ``cylinder_rms_mm``: misfit of a flat floor at ``cylinder_depth_mm``. ``bowl_rms_mm``: misfit of the hemisphere on
-    the same rim, its depth scaled to ``bowl_depth_mm``. ``true_*``: the same two misfits for the true geometry at the
-    same pixels, a control that no camera has touched. ``reached``: median depth in the `RINGS` over the true floor's.
+    the same rim, its depth scaled to ``bowl_depth_mm``. ``seen_rms_mm``: misfit of the true hole as it is seen from the
+    camera's place (walls that an oblique view shows included), its depth scaled; NaN where the truth has gaps.
+    ``true_*``: the first two misfits for the true geometry at the same pixels, a control that no camera has touched.
+    ``reached``: median depth in the `RINGS` over the true floor's.
     """
 
     hole: str
@@ -63,6 +65,7 @@ class HoleShape:
     cylinder_rms_mm: float
     bowl_depth_mm: float
     bowl_rms_mm: float
+    seen_rms_mm: float
     true_depth_mm: float
     true_cylinder_rms_mm: float
     true_bowl_rms_mm: float
@@ -127,6 +130,7 @@ def hole_shape(cloud: AveragedCloud, hole: HoleInView) -> HoleShape | None:
         cylinder_rms_mm=cylinder_rms,
         bowl_depth_mm=bowl_depth,
         bowl_rms_mm=bowl_rms,
+        seen_rms_mm=_fit(measured, true_depth[valid])[1],
         true_depth_mm=true_floor,
         true_cylinder_rms_mm=_fit(true_depth[known], np.ones(known.sum()))[1],
         true_bowl_rms_mm=_fit(true_depth[known], bowl(radius[known]))[1],
@@ -147,7 +151,7 @@ def bowl(rho: np.ndarray) -> np.ndarray:
 
 def _fit(depth: np.ndarray, shape: np.ndarray) -> tuple[float, float]:
     """Least-squares factor of ``shape`` and the rms misfit; NaN without data."""
-    if depth.size == 0:
+    if depth.size == 0 or not np.isfinite(shape).all() or not shape.any():
         return float("nan"), float("nan")
     factor = float(depth @ shape / (shape @ shape))
     return factor, float(np.sqrt(np.mean((depth - factor * shape) ** 2)))

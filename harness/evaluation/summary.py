@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
@@ -24,23 +23,38 @@ FOUND_RULE = (
     "as missed when it lies below, else as undecided."
 )
 GROUP = ["variant", "frames", "hole"]
+TRUTH = ["kind", "true_diameter_mm", "true_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
+MEASURED = ["diameter_mm", "offset_mm", "error_mm"]
+COLUMNS = [
+    *GROUP,
+    *TRUTH,
+    "repeat",
+    "detected",
+    "state",
+    "median_residual_mm",
+    "invalid_fraction",
+    *(f"{measure}_{name}" for measure in ("extent", "model") for name in MEASURED),
+]
 
 
-@dataclass(frozen=True)
-class ResultTables:
+class ResultTables(Protocol):
     """What an experiment leaves: one row per trial and hole, per run, per probe pixel, per variant.
 
     ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
     ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
-    quiet_threshold, scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
-    ``probes``: variant, frames, pixel, true_z_mm, mean_error_mm, temporal_std_mm, repeats; pixels in sensor order.
+    quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
+    ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, repeats; pixels in sensor order.
     ``variants``: variant, reason, settings (JSON text).
     """
 
-    holes: pd.DataFrame
-    runs: pd.DataFrame
-    probes: pd.DataFrame
-    variants: pd.DataFrame
+    @property
+    def holes(self) -> pd.DataFrame: ...
+    @property
+    def runs(self) -> pd.DataFrame: ...
+    @property
+    def probes(self) -> pd.DataFrame: ...
+    @property
+    def variants(self) -> pd.DataFrame: ...
 
 
 def by_hole(names: pd.Series) -> pd.Series:
@@ -60,9 +74,9 @@ def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
+    holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
-    truth = ["kind", "true_diameter_mm", "true_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
-    out = groups[truth].first()
+    out = groups[TRUTH].first()
     out["n"] = groups.size()
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
@@ -75,6 +89,11 @@ def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
     for state in STATES:
         out[f"share_{state.replace(' ', '_')}"] = (holes["state"] == state).groupby([holes[c] for c in GROUP]).mean()
     return out.reset_index().sort_values(GROUP, key=_order, kind="stable").reset_index(drop=True)
+
+
+def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
+    """The table of holes, with its columns where it came without any because no trial on the damaged board ended."""
+    return holes if "hole" in holes else holes.reindex(columns=COLUMNS)
 
 
 def status_of(rate_low: float, rate_high: float) -> HoleState:
@@ -93,24 +112,24 @@ def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, H
 def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     """One row per (variant, frames, role): runs, false calls, their rate per run with Garwood's Poisson interval.
 
-    The hole-free runs set the threshold, so they are quiet by construction; only the damaged runs test it.
+    Counts only runs that were judged at a threshold: hole-free runs that set it (their threshold is NaN) are told by
+    ``quiet_runs`` and ``quiet_highest``, the highest of their quiet thresholds, instead.
     """
-    groups = runs.groupby(["variant", "frames", "role"], sort=False)
-    out = groups.agg(
+    keys = ["variant", "frames"]
+    judged = runs[runs["threshold"].notna()].assign(threshold_mm=lambda r: r["threshold"] * r["scale_mm"])
+    out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(
         runs=("repeat", "size"),
         false_calls=("false_calls", "sum"),
         threshold=("threshold", "mean"),
+        threshold_mm=("threshold_mm", "mean"),
         surface_noise_mm=("surface_noise_mm", "mean"),
-        frames_used=("frames_used", "mean"),
-        left_out=("left_out", "sum"),
     )
-    in_mm = (runs["threshold"] * runs["scale_mm"]).groupby([runs[c] for c in ("variant", "frames", "role")], sort=False)
-    out["threshold_mm"] = in_mm.mean()
+    quiet = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
+    out = out.merge(quiet.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max")), "left", keys)
+    out["false_calls"] = out["false_calls"].astype(int)
     out["per_run"] = out["false_calls"] / out["runs"]
     out["per_run_low"], out["per_run_high"] = intervals.poisson_rate(out["false_calls"], out["runs"])
-    return (
-        out.reset_index().sort_values(["variant", "frames", "role"], key=_order, kind="stable").reset_index(drop=True)
-    )
+    return out.sort_values([*keys, "role"], key=_order, kind="stable", ignore_index=True)
 
 
 def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:

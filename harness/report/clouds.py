@@ -183,8 +183,8 @@ def _framed(cloud: ExampleCloud) -> _Frame:
 def _coloured(cloud: ExampleCloud) -> np.ndarray:
     """(h, w, 3) uint8: the cloud's colours, grey where no point is, paler outside the crop, magenta for damage."""
     picture = cloud.rgb.astype(float)
-    picture[~np.isfinite(cloud.points_m[..., 2])] = 185
     picture[~cloud.inside] = 0.4 * picture[~cloud.inside] + 0.6 * 255
+    picture[~np.isfinite(cloud.points_m[..., 2])] = 185
     picture[cloud.detected] = tuple(int(DAMAGE[i : i + 2], 16) for i in (1, 3, 5))
     return np.clip(picture, 0, 255).astype(np.uint8)
 

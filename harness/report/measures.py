@@ -78,10 +78,10 @@ def positions_figure(summary: pd.DataFrame, frames: int) -> str:
             mean, bias = shown[f"{measure}_offset_mean_mm"], shown[f"{measure}_offset_bias_mm"]
             left.errorbar(x, mean, std, ms=size, mfc="none" if side < 0 else colour, label=name, **look)
             right.errorbar(x + side * top / 150, bias, std, ms=5, label=name, **look)
-        left.set(xlabel="true distance from hole 11 (mm)", ylabel="measured distance (mm)", aspect="equal")
+        left.set(xlabel="true distance from the largest hole (mm)", ylabel="measured distance (mm)", aspect="equal")
         left.set_title(f"Positions, {_frames(frames)}")
         left.legend(loc="upper left")
-        right.set(xlabel="true distance from hole 11 (mm)", ylabel="measured − true (mm)")
+        right.set(xlabel="true distance from the largest hole (mm)", ylabel="measured − true (mm)")
         right.set_title("Difference from the truth, ±1 std")
         figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=3)
 

@@ -79,6 +79,7 @@ def report_html(
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
     return environment.get_template("report.html").render(
         title=title,
@@ -97,7 +98,7 @@ def report_html(
         variants=_variant_rows(verdicts_by_variant(tables, examples, summary)),
         noise=noise.to_dict("records"),
         calls=_call_rows(false_calls(tables.runs)),
-        failures=[_plain(failure) for failure in provenance.get("failures", ())],
+        failures=[_failure(failure) for failure in provenance.get("failures", ())],
         left_out=_left_out(tables.runs),
         seconds=_seconds(provenance),
         provenance=_provenance_rows(provenance),
@@ -200,6 +201,7 @@ def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
             "hole": shape.hole,
             "pixels": str(shape.pixels),
             "depth": _mm(shape.true_depth_mm, 1),
+            "seen": _mm(shape.seen_rms_mm),
             "bowl": _mm(shape.bowl_rms_mm),
             "cylinder": _mm(shape.cylinder_rms_mm),
             "true_bowl": _mm(shape.true_bowl_rms_mm),
@@ -225,15 +227,23 @@ def _call_rows(calls: pd.DataFrame) -> list[dict[str, str]]:
     return [
         {
             "frames": str(row["frames"]),
-            "role": "damaged board" if row["role"] == "damaged" else "hole-free board (sets the threshold)",
+            "role": "damaged board" if row["role"] == "damaged" else "hole-free board",
             "count": f"{row['false_calls']} in {row['runs']}",
             "rate": bounded(row["per_run"], row["per_run_low"], row["per_run_high"], 3),
             "threshold": f"{row['threshold']:.2f}",
             "threshold_mm": _mm(row["threshold_mm"]),
+            "quiet": f"{_mm(row['quiet_highest'])} ({row['quiet_runs']:.0f} runs)" if row["quiet_runs"] > 0 else "–",
             "noise": _mm(row["surface_noise_mm"], 3),
         }
         for _, row in calls[calls["variant"] == MAIN].iterrows()
     ]
+
+
+def _failure(failure: Any) -> str:
+    """A failure as text; a mapping with ``what`` and ``why`` as one sentence."""
+    if isinstance(failure, Mapping) and set(failure) == {"what", "why"}:
+        return f"{failure['what']}: {failure['why']}"
+    return _plain(failure)
 
 
 def _left_out(runs: pd.DataFrame) -> str:

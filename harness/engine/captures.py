@@ -1,0 +1,90 @@
+"""An experiment whose frames are a real capture: the same averages and detectors, without a truth to judge by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from detectors import load_detector
+from detectors.average import prefix_averages
+from harness.experiment.load import resolved_yaml
+from harness.experiment.points import Experiment, Point
+from harness.experiment.recorded import recording_of
+from harness.experiment.schema import CaptureSource
+from harness.report.findings import Judged, write_findings
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.files import write_text
+from harness.vocabulary.provenance import commit_and_dirty, machine, versions
+from harness.vocabulary.units import MM
+
+
+def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: bool) -> int:
+    """Judge every point's capture once and write its findings to ``<folder>/<number>/``, and a table of all points.
+
+    A capture has no repeats and no truth, so rates, sizes against the truth and claims are not given. Returns 0.
+    """
+    folder = experiment.folder(out)
+    if dry_run:
+        print(f"{experiment.config.name}: valid; {len(experiment.points)} points of a real capture; results: {folder}")
+        return 0
+    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+    rows = []
+    for number, point in enumerate(experiment.points):
+        judged, threshold = _judged(point)
+        name = f"point-{number:03d}"
+        write_findings(folder / name, judged, _about(point, judged.cloud, threshold, command), point.label or name)
+        mm = threshold * judged.evidence.scale_m / MM
+        rows.append(
+            {
+                "point": name,
+                "variant": point.variant,
+                "what": point.label,
+                "frames_used": judged.cloud.n_frames,
+                "frames_left_out": len(judged.cloud.left_out),
+                "threshold_k": threshold,
+                "threshold_mm": round(mm, 4),
+                "findings": len(judged.findings),
+            }
+        )
+        print(f"{name} {point.label}: {len(judged.findings)} findings beyond {mm:.2f} mm")
+        for left in judged.cloud.left_out:
+            print(f"  left out: {left.name}: {left.why}")
+    write_text(folder / "summary.csv", pd.DataFrame(rows).to_csv(index=False))
+    print(f"findings: {folder}")
+    return 0
+
+
+def _judged(point: Point) -> tuple[Judged, float]:
+    config = point.config
+    assert isinstance(config.source, CaptureSource)
+    frames = config.capture.frames
+    cloud = prefix_averages(recording_of(config.source), [frames], config.capture.average)[frames]
+    detector = load_detector(config.detector.name, dict(config.detector.settings))
+    evidence = detector.analyse(cloud)
+    threshold = config.threshold.k
+    assert threshold is not None  # a capture cannot be calibrated on; the experiment's checks say so
+    detections = detector.find(cloud, evidence, threshold)
+    return Judged(
+        cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections)
+    ), threshold
+
+
+def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[str, object]:
+    """What stands beside the findings in their JSON."""
+    commit, dirty = commit_and_dirty()
+    return {
+        "capture": {
+            "frames_used": cloud.n_frames,
+            "frames_left_out": [{"name": left.name, "why": left.why} for left in cloud.left_out],
+        },
+        "threshold": {"k": threshold, "from": "given"},
+        "settings": point.config.to_data(),
+        "provenance": {
+            "command": command,
+            "commit": commit,
+            "dirty": dirty,
+            "versions": versions(),
+            "machine": machine(),
+        },
+    }

@@ -1,0 +1,42 @@
+"""``python -m harness.prepare``: compile the inner loops once, so that the first sweep need not. Part of the set-up."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from harness.vocabulary.errors import exit_code_of
+
+
+def main() -> int:
+    """The program."""
+    return exit_code_of(_prepare)
+
+
+def _prepare() -> int:
+    """Drive every compiled loop through one small capture: exposure, engine, averages, fits, clusters, hole model."""
+    from detectors import load_detector
+    from detectors.average import AverageConfig, prefix_averages
+    from harness.vocabulary.geometry import Region
+    from scenes.render.closed_form import plane_view
+    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.source import SimulatedUnit
+
+    began = time.perf_counter()
+    camera = load_camera("azure_kinect_nfov")
+    view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
+    view.phasor[:, 18:24, 28:34] *= 1j
+    capture = SimulatedUnit(camera, CameraConfig(edge_gate=False), view).capture(6, 1)
+    for method in ("mean", "median", "clipped"):
+        cloud = prefix_averages(capture, [1, 6], AverageConfig.from_data({"method": method}))[6]
+    for method in ("lar", "bisquare", "least_squares", "lts"):
+        detector = load_detector("thesis", {"crop": {"kind": "none"}, "surface": {"method": method}})
+        evidence = detector.analyse(cloud)
+        for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
+            detector.measure(cloud, evidence, detection)
+    print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

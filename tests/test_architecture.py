@@ -1,0 +1,88 @@
+"""Who may import whom, read from the sources; and that detectors run without Mitsuba."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = ("harness", "scenes", "detectors")
+ALLOWED = {
+    # the first matching prefix of a module decides; "" means every room
+    "harness/vocabulary": ("harness.vocabulary",),
+    "scenes": ("harness.vocabulary", "scenes"),
+    "detectors": ("harness.vocabulary", "detectors"),
+    "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
+    "harness/evaluation": ("harness.vocabulary", "harness.evaluation"),
+    "harness/report": ("harness.vocabulary", "harness.evaluation", "harness.report", "detectors.interface"),
+    "harness": ("",),
+}
+"""Imports inside functions count as well, but for a version number that a leaf may ask for."""
+
+
+def sources() -> list[Path]:
+    return sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+
+
+def imported(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.add(node.module or "")
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in names if name.split(".")[0] in ROOMS and name not in ("harness", "harness.__version__")}
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    here = path.relative_to(ROOT).as_posix()
+    allowed = next(rule for prefix, rule in ALLOWED.items() if here.startswith(prefix + "/"))
+    for name in imported(path):
+        assert any(rule == "" or name == rule or name.startswith(rule + ".") for rule in allowed), f"{here}: {name}"
+
+
+def test_the_rule_sees_a_forbidden_import(tmp_path):
+    path = tmp_path / "wrong.py"
+    path.write_text("from scenes.view import NoiseFreeView\ndef f():\n    import detectors.average\n")
+    assert {"scenes.view", "detectors.average"} <= imported(path)
+
+
+def test_no_further_code_folder():
+    folders = {path.parts[0] for path in (p.relative_to(ROOT) for p in ROOT.glob("*/*.py"))}
+    assert folders <= {*ROOMS, "tests"}
+
+
+@pytest.mark.parametrize("program", ["sweep", "detect", "target"])
+def test_help_loads_nothing_heavy(program):
+    code = (
+        f"import sys; sys.argv = ['x', '--help']\n"
+        f"import harness.{program} as program\n"
+        "try: program.main()\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "usage: python -m harness." in done.stdout
+
+
+def test_detectors_and_their_program_never_import_mitsuba():
+    code = (
+        "import sys\n"
+        "class Wall:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('mitsuba', 'drjit'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Wall())\n"
+        "import detectors, detectors.average, detectors.measure, detectors.thesis, detectors.recordings, harness.detect\n"
+        "assert 'mitsuba' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,306 @@
+"""``python -m harness.detect`` from files to findings: numbers, files, messages, exit codes."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import recorded_plane as plane
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness import detect
+from harness.report.findings import COLUMNS, FILES
+from harness.report.findings_picture import Mark, label_places
+from harness.vocabulary.errors import UserError
+
+TRUE_CENTRE_MM = 1e3 * plane.points_m(plane.depth_mm(hole=False))[plane.HOLE_V, plane.HOLE_U]
+TRUE_DIAMETER_MM = 2 * plane.HOLE_RADIUS_PX * TRUE_CENTRE_MM[2] / plane.LENS.fx
+NO_BLUR = ("--set", "hole_model.blur_px=1")
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """Four good frames, and one (the third) that stands 18 mm behind them."""
+    folder = plane.write_open3d_folder(tmp_path / "capture", 5, noise_mm=0.6)
+    cv2.imwrite(str(folder / "depth" / "00002.png"), plane.depth_mm(2, noise_mm=0.6) + 18)
+    return folder
+
+
+def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """The message of a run that must end with exit code 2 and print nothing else."""
+    assert detect.main([str(argument) for argument in arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ") and "Traceback" not in said.err
+    return said.err
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+# ---- what it finds ---------------------------------------------------------------------------------------------------
+
+
+def test_it_finds_the_hole_and_writes_everything(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new" / "found"
+    assert detect.main([str(capture), "--out", str(out), *NO_BLUR]) == 0
+    said = capsys.readouterr().out
+    assert "4 frames averaged" in said
+    assert "left out: depth/00002.png: the whole range jumps by +18" in said
+    assert "not calibrated" in said
+    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+    with (out / "findings.csv").open() as stream:
+        header = stream.readline()
+    assert header == "id,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score\n"
+    (row,) = rows_of(out / "findings.csv")
+    number = {key: float(value) for key, value in row.items()}
+    assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
+    place = [number["x_mm"], number["y_mm"], number["z_mm"]]
+    np.testing.assert_allclose(place, TRUE_CENTRE_MM, atol=1.0)
+    assert number["diameter_mm"] == pytest.approx(TRUE_DIAMETER_MM, rel=0.05)
+    assert number["depth_mm"] == pytest.approx(plane.HOLE_DEPTH_MM, rel=0.05)
+    area = np.pi / 4 * TRUE_DIAMETER_MM**2
+    assert number["volume_mm3"] == pytest.approx(area * plane.HOLE_DEPTH_MM, rel=0.1)
+
+
+def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert detect.main([str(capture), "--out", str(out), "--threshold", "6", *NO_BLUR]) == 0
+    told = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
+    (finding,) = told["findings"]
+    row = rows_of(out / "findings.csv")[0]
+    for column in COLUMNS:
+        assert float(row[column]) == pytest.approx(finding[column], abs=1e-4)
+    assert finding["size_from"] == "model" and finding["model"]["diameter_se_mm"] > 0
+    assert finding["diameter_mm"] == finding["model"]["diameter_mm"] != finding["extent"]["diameter_mm"]
+    assert told["capture"]["frames_used"] == 4
+    assert told["capture"]["frames_left_out"][0]["name"] == "depth/00002.png"
+    assert told["threshold"]["k"] == 6 and told["threshold"]["from"] == "given"
+    assert told["settings"]["detector"]["settings"]["crop"]["kind"] == "auto"
+    assert told["settings"]["detector"]["settings"]["hole_model"]["blur_px"] == 1
+    digests = {Path(file["path"]).name: file["sha256"] for file in told["provenance"]["files"]}
+    assert set(digests) >= {"00000.png", "00004.png", "intrinsic.json"}
+    assert digests["intrinsic.json"] == hashlib.sha256((capture / "intrinsic.json").read_bytes()).hexdigest()
+
+
+def test_the_cloud_has_the_damage_in_magenta(capture: Path, tmp_path: Path) -> None:
+    import trimesh
+
+    out = tmp_path / "out"
+    assert detect.main([str(capture), "--out", str(out)]) == 0
+    content = (out / "cloud.ply").read_bytes()
+    assert content.startswith(b"ply\nformat binary_little_endian")
+    cloud = trimesh.load(out / "cloud.ply")
+    assert len(cloud.vertices) == 72 * 96 - 1
+    magenta = (cloud.colors[:, :3] == (255, 0, 255)).all(axis=1)
+    assert magenta.sum() == int(rows_of(out / "findings.csv")[0]["points"])
+    distance_mm = np.linalg.norm(1e3 * cloud.vertices[magenta] - TRUE_CENTRE_MM, axis=1)
+    assert distance_mm.max() < TRUE_DIAMETER_MM
+
+
+def test_the_picture_is_a_picture(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert detect.main([str(capture), "--out", str(out)]) == 0
+    picture = cv2.imread(str(out / "annotated.png"))
+    assert picture is not None and picture.shape[1] == 1650
+    magenta = (picture == (255, 0, 255)).all(axis=-1)
+    assert magenta.sum() > 200  # two circles
+
+
+def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
+    assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
+    (row,) = rows_of(tmp_path / "out" / "findings.csv")
+    assert row["u_px"] == "" and row["volume_mm3"] == ""
+    # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to a part of the hole.
+    offset = np.array([float(row[f"{a}_mm"]) for a in "xy"]) - TRUE_CENTRE_MM[:2]
+    assert np.hypot(*offset) < TRUE_DIAMETER_MM / 3
+    assert float(row["depth_mm"]) == pytest.approx(plane.HOLE_DEPTH_MM, abs=1.0)
+    finding = json.loads((tmp_path / "out" / "findings.json").read_text())["findings"][0]
+    assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
+    assert finding["u_px"] is None
+    assert "single points" in capsys.readouterr().out
+    assert detect.main([str(cloud)]) == 0
+    assert "109 points lie off the largest cluster" in capsys.readouterr().out
+
+
+def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = plane.write_open3d_folder(tmp_path / "quiet", 4, noise_mm=0.6, hole=False)
+    assert detect.main([str(capture), "--quiet-capture", str(quiet), "--out", str(tmp_path / "a")]) == 0
+    assert "silent on" in capsys.readouterr().out
+    k = json.loads((tmp_path / "a" / "findings.json").read_text())["threshold"]["k"]
+    assert detect.main([str(quiet), "--threshold", str(k)]) == 0
+    assert "no findings" in capsys.readouterr().out
+    assert detect.main([str(quiet), "--threshold", str(0.99 * k)]) == 0
+    assert "no findings" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("crop", "found"),
+    (
+        ("none", 1),
+        ("polygon:2,2,40,2,40,60,2,60", 0),
+        ("polygon:45,10,80,10,80,60,45,60", 1),
+        ("box:-500,500,-500,500,100,900", 1),
+        ("box:-500,-10,-500,500,100,900", 0),
+    ),
+)
+def test_the_crop_decides_what_is_searched(capture: Path, tmp_path: Path, crop: str, found: int) -> None:
+    arguments = [str(capture), "--crop", crop, "--threshold", "8", "--out", str(tmp_path / "out")]
+    assert detect.main(arguments) == 0
+    assert len(rows_of(tmp_path / "out" / "findings.csv")) == found
+
+
+def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert detect.main([str(capture), "--set", "variant=script", "--average", "median", "--frames-report"]) == 0
+    said = capsys.readouterr().out
+    assert "threshold: 1.2 x" in said and "the detector's own" in said
+    assert "frame depth/00002.png: 100.0 % valid, median distance 51" in said
+    assert detect.main([str(capture), "--max-frames", "2"]) == 0
+    assert "2 frames averaged" in capsys.readouterr().out
+
+
+def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from scenes.sensor.camera import load_camera
+
+    lens = load_camera("azure_kinect_nfov").nominal_lens
+    slopes = lens.region_slopes(lens.whole)
+    z_mm = np.rint(900 / (1 - 0.1 * slopes[..., 0])).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "1.png"), z_mm)
+    assert detect.main([str(tmp_path), "--intrinsics", "azure_kinect_nfov"]) == 0
+    assert "no findings" in capsys.readouterr().out
+
+
+# ---- what it refuses -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    (
+        (("--crop", "circle"), "--crop circle"),
+        (("--crop", "box:1,2,3"), "box:x0,x1,y0,y1,z0,z1"),
+        (("--crop", "box:a,2,3,4,5,6"), "not all of its values are numbers"),
+        (("--crop", "box:-500,500,-500,500,5000,9000"), "holds none of the cloud's"),
+        (("--crop", "polygon:200,1,300,1,200,90"), "none of the cloud's 6911 points"),
+        (("--set", "surface.degre=3"), "surface.degre"),
+        (("--set", "surface"), "KEY=VALUE"),
+        (("--set", "min_points=0"), "min_points"),
+        (("--detector", "thesys"), "did you mean 'thesis'"),
+        (("--threshold", "0"), "above 0"),
+        (("--threshold", "nan"), "above 0"),
+        (("--threshold", "3", "--quiet-capture", "x"), "give one of them"),
+        (("--intrinsics", "no_such_camera"), "azure_kinect_nfov"),
+        (("--unit", "m"), "--unit mm"),
+        (("--quiet-capture", "nowhere"), "nowhere: no such file"),
+    ),
+)
+def test_a_mistake_is_one_message_and_leaves_nothing(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], told: str
+) -> None:
+    assert told in failed(capsys, capture, "--out", tmp_path / "out", *arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_fewer_points_than_coefficients(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stored = np.zeros((72, 96), np.uint16)
+    stored[10:13, 10:13] = 500
+    np.save(tmp_path / "d.npy", stored)
+    message = failed(
+        capsys, tmp_path / "d.npy", "--intrinsics", plane.write_lens(tmp_path / "lens.json"), "--crop", "none"
+    )
+    assert "9 valid points" in message and "10 coefficients" in message
+
+
+def test_a_folder_that_cannot_be_written_is_refused(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in failed(capsys, capture, "--out", tmp_path / "file")
+    assert "cannot be written" in failed(capsys, capture, "--out", tmp_path / "file" / "below")
+
+
+@pytest.mark.parametrize("existing", (False, True))
+def test_a_full_disk_leaves_the_old_files_or_none(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, existing: bool
+) -> None:
+    out = tmp_path / "out"
+    if existing:
+        out.mkdir()
+        (out / "findings.csv").write_text("old")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("harness.report.findings.save_picture", full)
+    assert "the disk is full" in failed(capsys, capture, "--out", out)
+    assert out.exists() == existing
+    assert not existing or [path.read_text() for path in out.iterdir()] == ["old"]
+
+
+def test_help_is_there_without_the_heavy_libraries() -> None:
+    code = "import sys; sys.argv = ['detect', '--help']\nimport harness.detect as d\n"
+    code += "try: d.main()\nexcept SystemExit: pass\n"
+    code += "print([m for m in ('numpy', 'cv2', 'numba', 'matplotlib', 'open3d', 'mitsuba') if m in sys.modules])"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "--quiet-capture" in said and said.strip().endswith("[]")
+
+
+# ---- parts -----------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1000), st.floats(0, 600), st.floats(1, 20)), max_size=40))
+def test_numbers_in_the_picture_never_cover_each_other(circles: list[tuple[float, float, float]]) -> None:
+    marks = [Mark(str(i), *circle) for i, circle in enumerate(circles)]
+    places = label_places(marks, 6.0, 12.0, (0.0, 1000.0, 0.0, 600.0))
+    for i, (x, y) in enumerate(places):
+        width = 6.0 * (len(marks[i].text) + 0.6)
+        assert width / 2 <= x <= 1000 - width / 2 and 6 <= y <= 594
+        for j in range(i):
+            other = 6.0 * (len(marks[j].text) + 0.6)
+            clear_x = abs(x - places[j][0]) >= (width + other) / 2 - 1e-9
+            assert clear_x or abs(y - places[j][1]) >= 12 - 1e-9
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.text(max_size=30))
+def test_a_crop_is_read_or_refused(text: str) -> None:
+    try:
+        assert detect.crop_from_text(text)["kind"] in ("auto", "none", "box", "polygon")
+    except UserError as mistake:
+        assert "auto" in (mistake.legal or "")
+
+
+# ---- real captures ---------------------------------------------------------------------------------------------------
+
+
+def test_the_drilled_plate_as_it_stands(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert detect.main([str(shared_data / "azure_drilled_board"), "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "17 frames averaged" in said and "left out: depth/00003.png: the whole range jumps" in said
+    findings = rows_of(tmp_path / "findings.csv")
+    # The object on the plate is its largest departure: it stands before the surface and is no hole.
+    assert float(findings[0]["depth_mm"]) < -10 and float(findings[0]["points"]) > 30_000
+    # Drilled holes whose dark mouths are seen in the colour picture, in pixels; the camera aligns to some 9 px.
+    holes = np.array([(430, 393), (734, 607), (728, 492), (512, 605), (233, 393), (417, 492), (725, 391), (818, 300)])
+    found = np.array([(float(row["u_px"]), float(row["v_px"])) for row in findings[1:]])
+    nearest = np.linalg.norm(holes[:, None] - found[None], axis=2).min(axis=1)
+    assert (nearest < 13).all()
+
+
+def test_the_recording_as_it_stands(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert detect.main([str(shared_data / "azure_mkv" / "recording.mkv"), "--out", str(tmp_path)]) == 0
+    assert "1 frames averaged" in capsys.readouterr().out
+    assert rows_of(tmp_path / "findings.csv")

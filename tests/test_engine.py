@@ -1,0 +1,256 @@
+"""The engine end to end on a tiny experiment: same numbers however it is run; nothing finished is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from harness.engine.journal import Journal, without_nan
+from harness.engine.plan import plan_of
+from harness.engine.run import pending_counts
+from harness.experiment.load import load_experiment
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TINY = """\
+name: tiny
+seed: 3
+source:
+  kind: simulated
+  target: {name: thesis}
+  camera: {name: azure_kinect_nfov}
+  render: {bounces: 1, face_samples: 64, hole_samples: 16, rest_samples: 8}
+capture: {frames: 3}
+detector:
+  name: thesis
+  settings:
+    crop: {kind: box, x_mm: [-294, 294], y_mm: [-51, 51], z_mm: [0, 1100], range_max_m: null, inset_px: 3}
+threshold: {calibrate: {repeats: 2}}
+repeats: 2
+sweep:
+  capture.frames: [1, 3]
+"""
+
+
+def sweep(folder: Path, *arguments: str, experiment: Path | None = None) -> subprocess.CompletedProcess[str]:
+    path = experiment or folder.parent / "tiny.yaml"
+    command = [sys.executable, "-m", "harness.sweep", str(path), "--out", str(folder), *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def results(folder: Path) -> Path:
+    (found,) = (folder / "tiny").iterdir()
+    return found
+
+
+def trials(folder: Path) -> pd.DataFrame:
+    return pd.read_parquet(results(folder) / "trials.parquet")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("engine")
+    (home / "tiny.yaml").write_text(TINY)
+    done = sweep(home / "out", "--jobs", "2")
+    assert done.returncode == 0, done.stderr
+    return home / "out"
+
+
+def test_a_sweep_leaves_all_its_files(finished):
+    names = {path.name for path in results(finished).iterdir()}
+    assert names == {
+        "experiment.yaml",
+        "journal",
+        "probes.parquet",
+        "provenance.json",
+        "report.html",
+        "runs.parquet",
+        "summary.csv",
+        "trials.parquet",
+    }
+    table = trials(finished)
+    assert len(table) == 2 * 2 * 11  # numbers of frames, repeats, holes
+    assert table.groupby("hole")["true_diameter_mm"].nunique().eq(1).all()
+    # the 1 in hole, seven pixels wide in radius, cannot be missed; the 1/16 in hole is one pixel
+    assert table[table.hole == "11"].detected.all()
+    assert not table[table.hole == "1"].detected.any()
+    summary = pd.read_csv(results(finished) / "summary.csv")
+    assert {"rate", "rate_low", "rate_high", "n", "detected"} <= set(summary.columns)
+
+
+def test_provenance_is_stored(finished):
+    said = json.loads((results(finished) / "provenance.json").read_text())
+    assert said["seed"] == 3
+    assert said["command"].startswith("python -m harness.sweep ")
+    assert said["versions"]["mitsuba"]
+    assert set(said) >= {"commit", "dirty", "machine", "indirect_noise_mm", "failures", "seconds"}
+    import pyarrow.parquet as pq
+
+    inside = json.loads(pq.read_schema(results(finished) / "trials.parquet").metadata[b"tofpod"])
+    assert inside["digest"] == said["digest"]
+
+
+def test_report_is_one_file_without_outside_links(finished):
+    page = (results(finished) / "report.html").read_text()
+    assert "<svg" in page
+    for outside in ("http://", "https://", "<script src", "<link"):
+        assert outside not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")
+
+
+def test_one_process_gives_the_same_numbers(finished):
+    alone = finished.parent / "alone"
+    shutil.copytree(finished / ".cache", alone / ".cache")
+    done = sweep(alone, "--jobs", "1")
+    assert done.returncode == 0, done.stderr
+    pd.testing.assert_frame_equal(trials(finished), trials(alone), check_exact=True)
+
+
+def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
+    half = finished.parent / "half"
+    shutil.copytree(finished, half)
+    folder = results(half)
+    journal = sorted((folder / "journal").glob("*.json"))
+    assert len(journal) == 4
+    journal[0].unlink()
+    journal[1].write_text(journal[1].read_text()[:100])  # half written
+    journal[3].unlink()
+    (folder / "trials.parquet").unlink()
+    done = sweep(half)
+    assert done.returncode == 0, done.stderr
+    said = json.loads((folder / "provenance.json").read_text())
+    assert said["trials"] == {"done": 3, "resumed": 1}
+    assert said["renders"] == {"done": 0, "cached": 2}
+    pd.testing.assert_frame_equal(trials(finished), trials(half), check_exact=True)
+
+
+def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished):
+    """Ctrl-C after the first finished trial of many: exit 130 soon, the journal whole, the command to resume told."""
+    cut = finished.parent / "cut"
+    shutil.copytree(finished / ".cache", cut / ".cache")
+    command = [sys.executable, "-m", "harness.sweep", str(finished.parent / "tiny.yaml"), "--out", str(cut)]
+    command += ["--set", "repeats=400"]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while not list(cut.glob("tiny/*/journal/damaged-*.json")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    began = time.monotonic()
+    _, errors = process.communicate(timeout=30)
+    assert time.monotonic() - began < 10
+    assert process.returncode == 130, errors
+    assert "interrupted; finished trials are kept" in errors
+    assert "--set repeats=400" in errors
+    journal = Journal(next(cut.glob("tiny/*/journal")))
+    kept = list(journal.keys())
+    assert kept
+    assert all(journal.read(key) is not None for key in kept)
+
+
+def test_dry_run_counts_and_runs_nothing(finished):
+    done = sweep(finished, "--dry-run")
+    assert done.returncode == 0
+    assert "2 points in 1 set-ups" in done.stdout
+    assert "renders: 2, 2 already there" in done.stdout
+    fresh = finished.parent / "fresh"
+    assert sweep(fresh, "--dry-run").returncode == 0
+    assert not fresh.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--set", "repeats=0"], "repeats"),
+        (["--set", "capture.framse=3"], "did you mean"),
+        (["--set", "source.target.distance_m=0.3"], "covers columns"),
+    ],
+)
+def test_mistakes_end_with_one_message_and_exit_2(finished, arguments, expected):
+    fresh = finished.parent / f"wrong-{expected[:3]}"
+    done = sweep(fresh, *arguments)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert expected in done.stderr
+
+
+def test_missing_file_and_unwritable_folder(finished, tmp_path):
+    done = sweep(tmp_path / "out", experiment=tmp_path / "none.yaml")
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    (tmp_path / "file").write_text("")
+    done = sweep(tmp_path / "file", experiment=finished.parent / "tiny.yaml")
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    assert "cannot be written" in done.stderr
+
+
+def test_missing_llvm_is_one_message(finished, tmp_path):
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(tmp_path / "libLLVM.so")}
+    command = [
+        sys.executable,
+        "-m",
+        "harness.sweep",
+        str(finished.parent / "tiny.yaml"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "DRJIT_LIBLLVM_PATH" in done.stderr
+
+
+def test_seeds_change_the_frames_but_not_the_render(finished):
+    first = load_experiment(finished.parent / "tiny.yaml")
+    second = load_experiment(finished.parent / "tiny.yaml", ["seed=4"])
+    cache = finished / ".cache" / "renders"
+    a, b = plan_of(first, cache), plan_of(second, cache)
+    assert [job.path for job in a.renders] == [job.path for job in b.renders]
+    assert first.digest != second.digest
+    assert dict((what, there) for what, _, there in pending_counts(b, Journal(finished / "none"))) == {
+        "renders": 2,
+        "hole-free trials": 0,
+    }
+
+
+def test_journal_holds_nan_as_none(tmp_path):
+    journal = Journal(tmp_path)
+    journal.write("key", without_nan({"rows": [{"a": float("nan"), "b": 1.5}]}))
+    assert journal.read("key") == {"rows": [{"a": None, "b": 1.5}]}
+    assert journal.read("other") is None
+
+
+CAPTURE = """\
+name: capture
+source:
+  kind: capture
+  paths: [{path}]
+capture: {{frames: 12}}
+detector:
+  name: thesis
+  settings: {{crop: {{kind: auto, inset_px: 8}}}}
+threshold: {{k: 5.0}}
+sweep:
+  capture.frames: [1, 12]
+"""
+
+
+def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
+    (tmp_path / "capture.yaml").write_text(CAPTURE.format(path=shared_data / "azure_drilled_board"))
+    done = sweep(tmp_path / "out", experiment=tmp_path / "capture.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "left out: " in done.stdout
+    assert "00003.png" in done.stdout
+    table = pd.read_csv(next((tmp_path / "out").glob("capture/*/summary.csv")))
+    assert list(table.frames_used) == [1, 11]
+    assert len(list((tmp_path / "out").glob("capture/*/point-*/findings.csv"))) == 2
