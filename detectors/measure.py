@@ -6,11 +6,10 @@ along this axis than along its own by 1 / cos. Sizes are measured on the surface
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
-import math
-
 import numpy as np
 from pydantic import Field, field_validator
 

@@ -39,7 +39,8 @@ class LitScene:
         """Index into ``names`` of each hit; meaningless where the ray met nothing."""
         import drjit as dr
 
-        return dr.gather(self.mi.UInt32, self._identity, dr.reinterpret_array(self.mi.UInt32, interaction.shape))
+        number: Any = dr.reinterpret_array(self.mi.UInt32, interaction.shape)
+        return dr.gather(self.mi.UInt32, self._identity, number)
 
     def arriving(self, interaction: Any, active: Any) -> tuple[Any, Any]:
         """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
@@ -72,7 +73,7 @@ def lit_scene(mi: Any, parts: Sequence[Part], camera: AmcwCamera) -> LitScene:
         description[part.name] = _mesh(mi, part)
     scene = mi.load_dict(description)
     shapes = scene.shapes()
-    registered = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+    registered: np.ndarray = mi.UInt32(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).numpy()
     identity = np.zeros(int(registered.max()) + 1, np.uint32)
     for shape, number in zip(shapes, registered, strict=True):
         identity[number] = names.index(shape.id())

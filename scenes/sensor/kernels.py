@@ -7,6 +7,7 @@ compares it with Dr.Jit and NumPy.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -14,7 +15,7 @@ from numba.extending import intrinsic
 
 from harness.vocabulary.capture import Reason
 
-FAST = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
+FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
 """No assumption of finiteness: an unlit pixel may divide by zero and is gated out later."""
 
 TWO_PI = np.float32(2.0 * math.pi)
@@ -41,7 +42,7 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 @numba.njit(inline="always", **FAST)
 def _log(u):  # type: ignore[no-untyped-def]
     """Natural logarithm of a positive float32: exponent from the bits, mantissa by an atanh series."""
-    word = _float_bits(u)
+    word: Any = _float_bits(u)  # type: ignore[call-arg]
     exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
     mantissa = _bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
     big = mantissa > np.float32(1.41421356)
@@ -317,8 +318,8 @@ def range_and_gates(
     saturated: np.ndarray,
     geometry: np.ndarray,
     outside_mask: np.ndarray,
-    tables: tuple,  # type: ignore[type-arg]
-    gates: tuple,  # type: ignore[type-arg]
+    tables: tuple,
+    gates: tuple,
     z_m: np.ndarray,
     reason: np.ndarray,
     strength: np.ndarray,
