@@ -213,9 +213,19 @@ def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
     ]
 
 
+def _short(label: str) -> str:
+    """A variant's label for a narrow column: of ``source.target.distance_m=0.5`` the last key, the value apart."""
+    path, equals, value = label.partition("=")
+    if not equals or " " in path:
+        return label
+    return f"{path.rpartition('.')[2].replace('_', ' ')} = {value}"
+
+
 def _variant_rows(variants: pd.DataFrame) -> list[dict[str, Any]]:
     """The sensitivity table's rows; a cell knows whether it differs from the main variant's."""
     rows = [{str(key): value for key, value in row.items()} for row in variants.to_dict("records")]
+    for row in rows:
+        row["shown"] = _short(str(row["variant"]))
     main = next((row for row in rows if row["variant"] == MAIN), None)
     for row in rows:
         compared = [*RULES, "found_1", "found_50"]
