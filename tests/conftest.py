@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+
+from detectors.recordings.pointclouds import MissingLibrary
+from scenes.render.variant import load_mitsuba
+
+
+def pytest_configure() -> None:
+    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.variant`)."""
+    load_mitsuba()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call() -> Generator[None, object, object]:
+    """A test that needs Open3D skips, and says which package is missing, where the system lacks a library of it."""
+    try:
+        return (yield)
+    except MissingLibrary as missing:
+        pytest.skip(str(missing))
 
 
 @pytest.fixture(scope="session")

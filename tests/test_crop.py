@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from detectors import load_detector
 from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, crop
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
@@ -80,7 +82,10 @@ def test_the_largest_surface_is_the_wall_or_the_board() -> None:
     cloud, board = board_before_wall()
     np.testing.assert_array_equal(crop(cloud, AutoCrop()), np.ones(board.shape, dtype=bool))
     near = cloud_of(np.where(board, cloud.points_m[..., 2], np.nan))
-    np.testing.assert_array_equal(crop(near, AutoCrop()), board)
+    np.testing.assert_array_equal(crop(near, AutoCrop(inset_px=0)), board)
+    within = np.zeros_like(board)
+    within[33:117, 43:167] = True
+    np.testing.assert_array_equal(crop(near, AutoCrop()), within)
 
 
 def test_the_board_is_found_before_a_broken_background_with_its_damage_inside() -> None:
@@ -88,7 +93,7 @@ def test_the_board_is_found_before_a_broken_background_with_its_damage_inside() 
     z = cloud.points_m[..., 2].copy()
     behind = ~board
     z[behind] += np.random.default_rng(1).uniform(0, 0.5, behind.sum())
-    mask = crop(cloud_of(z), AutoCrop())
+    mask = crop(cloud_of(z), AutoCrop(inset_px=0))
     assert (mask & board).sum() == board.sum()
     assert (mask & ~board).sum() == 0
     assert mask[70, 90]
@@ -98,7 +103,7 @@ def test_a_crease_ends_the_surface() -> None:
     u = np.arange(200)
     floor_and_wall = np.broadcast_to(np.where(u < 120, 0.8, 0.8 + 0.006 * (u - 120)), (150, 200)).copy()
     noisy = floor_and_wall + 3e-4 * np.random.default_rng(2).standard_normal((150, 200))
-    mask = crop(cloud_of(noisy), AutoCrop())
+    mask = crop(cloud_of(noisy), AutoCrop(inset_px=0))
     assert mask[:, :115].all() and not mask[:, 126:].any()
 
 
@@ -113,18 +118,87 @@ def test_inset_takes_the_rim_but_leaves_holes_and_the_image_edge() -> None:
     np.testing.assert_array_equal(mask, expected)
 
 
-def test_without_a_grid_the_largest_cluster_is_taken() -> None:
-    random = np.random.default_rng(3)
-    plate = np.column_stack([random.uniform(-0.2, 0.2, (3000, 2)), 0.8 + 0 * random.random(3000)])
-    clutter = np.column_stack([random.uniform(-0.2, 0.2, (400, 2)), np.full(400, 1.3)])
-    points = np.concatenate([clutter, plate])[None]
-    n = points.shape[1]
+# ---------------------------------------------------------------- without a pixel grid
+
+
+def drilled_board_before_a_wall(noise_m: float = 5e-4, seed: int = 5) -> tuple[Cloud, np.ndarray]:
+    """A frontal board at 0.7 m, half an inch thick, right of the axis, with through-holes of 14 and 25 mm to a backing
+    33 mm behind its face, and a wall 0.2 m behind; and which of the pixels see the board or through its holes.
+
+    A ray that leaves a hole's cylinder within the thickness ends on its wall; the camera's own blur is left out. Only
+    30 mm of the wall are seen around the board: a wall that fills more of the picture would be the largest surface.
+    """
+    slopes = LENS.region_slopes(LENS.whole)
+    x, y = np.moveaxis(0.7 * slopes, -1, 0)
+    target = (x > 0.03) & (x < 0.27) & (np.abs(y) < 0.12)
+    z = np.where(target, 0.7, 0.9)
+    for centre_x, diameter in ((0.1, 0.014), (0.19, 0.025)):
+        apart = np.stack([x - centre_x, y - 0.02], axis=-1)
+        a, b = (slopes**2).sum(-1), (apart * slopes).sum(-1)
+        c = (apart**2).sum(-1) - diameter**2 / 4
+        inside = c < 0
+        wall = (np.sqrt(np.where(inside, b * b - a * c, 0.0)) - b) / a
+        z[inside] = 0.7 + np.where(wall < 0.0127, wall, 0.033)[inside]
+    z += noise_m * np.random.default_rng(seed).standard_normal(z.shape)
+    z[(x < 0) | (x > 0.3) | (np.abs(y) > 0.15)] = np.nan
+    return cloud_of(z), target
+
+
+def without_grid(points: np.ndarray) -> Cloud:
+    """The points of (n, 3) that are none NaN, as a cloud without a grid."""
+    points = points[np.isfinite(points[:, 2])]
+    n = len(points)
     none, zeros = np.full((1, n), np.nan), np.zeros((1, n), dtype=np.uint8)
-    cloud = Cloud(points, zeros, zeros.astype(int) + 1, none, Region(0, 1, 0, n), 0.0, 1, organised=False)
-    mask = crop(cloud, AutoCrop(link_distance_mm=30.0))[0]
-    assert mask[400:].all() and not mask[:400].any()
+    return Cloud(points[None], zeros, zeros.astype(int) + 1, none, Region(0, 1, 0, n), 0.0, 1, organised=False)
+
+
+@pytest.mark.parametrize("recorded_from_origin", [True, False])
+def test_without_a_grid_holes_with_a_backing_are_found_and_the_wall_past_the_rim_is_not(
+    recorded_from_origin: bool,
+) -> None:
+    cloud, target = drilled_board_before_a_wall()
+    order = np.random.default_rng(6).permutation(np.flatnonzero(cloud.valid))
+    points, target = cloud.points_m.reshape(-1, 3)[order], target.ravel()[order]
+    if not recorded_from_origin:
+        points = points - [0.15, 0.02, 0.7]
+    flat = without_grid(points)
+    detector = load_detector("thesis", {"crop": {"kind": "auto"}})
+    evidence = detector.analyse(flat)
+    kept = np.isfinite(evidence.score[0])
+    # of 85 x 86 pixels at most 6 on each side go: 3 of rim, 3 for the raster's cells
+    assert not kept[~target].any() and kept[target].mean() > 0.73
+    small, large = sorted(detector.find(flat, evidence, 5.0), key=lambda d: len(d.pixels))
+    for found, diameter_px in ((small, 5.0), (large, 8.9)):
+        assert len(found.pixels) == pytest.approx(np.pi / 4 * diameter_px**2, rel=0.2)
+
+
+def test_without_a_grid_the_crop_is_the_grids_but_for_the_rim() -> None:
+    cloud, target = drilled_board_before_a_wall()
+    flat = without_grid(cloud.points_m.reshape(-1, 3))
+    whole = crop(flat, AutoCrop(inset_px=0))[0]
+    assert whole[target[cloud.valid]].all()
+    # a cell on the rim may hold a point of the wall too
+    near = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not whole[~near[cloud.valid]].any()
+    for inset in (1, 2, 3, 5, 8):
+        mask = crop(flat, AutoCrop(inset_px=inset))[0]
+        assert not (mask & ~crop(cloud, AutoCrop(inset_px=inset))[cloud.valid]).any()
+        # the raster's cells are 1.5 px wide: up to 3 px more than asked
+        assert not (~mask & crop(cloud, AutoCrop(inset_px=inset + 3))[cloud.valid]).any()
+
+
+def test_points_in_no_order_at_all_still_make_a_surface() -> None:
+    random = np.random.default_rng(3)
+    plate = np.column_stack([random.uniform(-0.2, 0.2, (3000, 2)), 0.8 + 1e-3 * random.standard_normal(3000)])
+    clutter = np.column_stack([random.uniform(0.5, 0.9, (400, 2)), random.uniform(1.2, 1.4, 400)])
+    mask = crop(without_grid(np.concatenate([clutter, plate])), AutoCrop(inset_px=0))[0]
+    assert mask[400:].mean() > 0.99 and not mask[:400].any()
+
+
+def test_a_polygon_needs_a_grid() -> None:
+    cloud, _ = drilled_board_before_a_wall()
     with pytest.raises(UserError, match="without a pixel grid"):
-        crop(cloud, PolygonCrop(vertices_px=((0, 0), (1, 0), (1, 1))))
+        crop(without_grid(cloud.points_m.reshape(-1, 3)), PolygonCrop(vertices_px=((0, 0), (1, 0), (1, 1))))
 
 
 def test_an_empty_crop_names_the_box_and_the_cloud() -> None:
@@ -143,6 +217,7 @@ def test_an_empty_crop_names_the_box_and_the_cloud() -> None:
 def test_the_kind_chooses_the_declaration() -> None:
     adapter: TypeAdapter[NoCrop | BoxCrop | PolygonCrop | AutoCrop] = TypeAdapter(CropConfig)
     assert isinstance(adapter.validate_json('{"kind": "auto", "inset_px": 2}'), AutoCrop)
+    assert adapter.validate_json('{"kind": "auto"}').inset_px == 3 and NoCrop().inset_px == 0
     assert adapter.validate_json('{"kind": "box", "x_mm": [-10, 20]}') == BoxCrop(x_mm=(-10.0, 20.0))
     for wrong in ('{"kind": "bix"}', '{"kind": "box", "x_mm": [20, 10]}', '{"kind": "none", "x_mm": [0, 1]}'):
         with pytest.raises(ValidationError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 import recorded_plane as plane
 import scipy.io
 
-from detectors.recordings import open_capture
+from detectors.recordings import open_capture, pointclouds
 from detectors.recordings.intrinsics import read_lens
 from harness.vocabulary.errors import UserError
 
@@ -252,3 +253,16 @@ def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, told: str) -
 def test_a_missing_lens_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"none\.json: no such file"):
         read_lens(tmp_path / "none.json", 640, 576)
+
+
+def test_a_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+            if name == "open3d":
+                raise ImportError("libGL.so.1: cannot open shared object file: No such file or directory")
+
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
+    with pytest.raises(UserError, match="Open3D") as caught:
+        pointclouds._open3d()
+    assert "apt install libgl1" in str(caught.value)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -19,6 +23,7 @@ from scenes.sensor.camera import AmcwCamera, load_camera
 from scenes.target.declaration import TargetConfig, ThesisTargetConfig
 from scenes.target.mesh import Part, build_target
 
+ROOT = Path(__file__).resolve().parents[1]
 CAMERA = load_camera("azure_kinect_nfov")
 EMITTER = CAMERA.emitter_position_m
 WAVE = 2 * np.pi * np.array(CAMERA.frequencies_hz) / SPEED_OF_LIGHT_AIR
@@ -271,3 +276,11 @@ def test_cache_key_changes_with_what_matters_only():
     gate = CAMERA.engine.edge_threshold.model_copy(update={"value": 9.0})
     engine = CAMERA.engine.model_copy(update={"edge_threshold": gate})
     assert render_key(SMALL, CAMERA.model_copy(update={"engine": engine}), QUICK) == base
+
+
+def test_open3d_before_mitsuba_is_told_apart_from_a_missing_llvm():
+    code = "import open3d\nfrom scenes.render.variant import load_mitsuba\nload_mitsuba()\n"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    if "cannot open shared object file" in done.stderr:
+        pytest.skip("Open3D lacks a system library")
+    assert done.returncode == 0 or "Open3D was imported before it" in done.stderr

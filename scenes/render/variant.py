@@ -27,6 +27,12 @@ def load_mitsuba() -> Any:
     for name in VARIANTS:
         if _works(mi, name):
             return mi
+    if "open3d" in sys.modules:
+        # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
+        raise UserError(
+            "Mitsuba cannot run: Open3D was imported before it, and its C++ library stands in for the one of LLVM",
+            fix="call scenes.render.variant.load_mitsuba() before importing open3d, or render in a process of its own",
+        )
     raise UserError(
         "Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found",
         legal="LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)",
