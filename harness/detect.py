@@ -51,7 +51,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE|CAMERA",
         help="the lens of the depth pixels: a file, or a camera's nominal lens by name",
     )
-    add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}; default auto")
+    add(
+        "--crop",
+        default="auto",
+        metavar="KIND",
+        help=f"which part is the target: {LEGAL_CROP}; default auto, the largest surface less the 3 pixels of its rim"
+        " where the camera mixes in what is behind (depth aligned to a finer colour camera: --set crop.inset_px=8)",
+    )
     add("--detector", default="thesis", help="detector's name (default: thesis)")
     add(
         "--set",
@@ -238,7 +244,9 @@ def _print_capture(recording: Recording, cloud: Cloud, evidence: Evidence, crop:
     print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points{where}")
     if not cloud.organised and crop == "auto" and kept.sum() < cloud.valid.sum():
         off = cloud.valid.sum() - kept.sum()
-        print(f"note: {off} points lie off the largest cluster and are not judged; --crop none judges all of them")
+        print(
+            f"note: {off} points lie off the largest surface or on its rim: not judged; --crop none judges all of them"
+        )
     within = cloud.variance_m2[kept & np.isfinite(cloud.variance_m2)]
     temporal = f"; one frame's noise {_mm(float(np.sqrt(np.median(within))))}" if within.size else ""
     print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {_mm(evidence.scale_m)}{temporal}")

@@ -100,10 +100,10 @@ def _provenance(
         "machine": machine(),
         "started": started,
         "seconds": {
-            "in all": round(seconds, 1),
+            "this run in all": round(seconds, 1),
             "renders (not cached)": round(outcome.render_seconds, 1),
-            "frames (all workers)": round(sum(row["seconds_frames"] for row in runs), 1),
-            "detection and measurement (all workers)": round(sum(row["seconds_detect"] for row in runs), 1),
+            "frames (all workers, resumed trials too)": round(sum(row["seconds_frames"] for row in runs), 1),
+            "detection and measurement (likewise)": round(sum(row["seconds_detect"] for row in runs), 1),
         },
         "renders": {"done": outcome.renders_done, "cached": outcome.renders_cached},
         "trials": {"done": outcome.trials_done, "resumed": outcome.trials_resumed},

@@ -94,10 +94,14 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
 def _reason(experiment: Experiment, point: Point) -> str:
     """The reason that the experiment's file gives for a variation; empty for the main points."""
     study = experiment.config.sensitivity
-    for variation in study.vary if study is not None and point.variant != MAIN else ():
+    if study is None or point.variant == MAIN:
+        return ""
+    changed = set(point.values) - {"capture.frames"}
+    for variation in study.vary:
         if isinstance(variation, LabelledVariation):
-            if variation.label == point.variant:
-                return variation.reason
-        elif variation.path in point.values:
+            named = variation.label == point.variant
+        else:
+            named = changed == {variation.path} and point.variant.startswith(f"{variation.path}=")
+        if named:
             return variation.reason
     return ""
