@@ -11,6 +11,12 @@ from pathlib import Path
 
 from harness.vocabulary.errors import UserError
 
+NOT_WRITABLE = {
+    getattr(errno, name)
+    for name in ("EACCES", "EPERM", "EROFS", "ENOTDIR", "EEXIST", "EISDIR", "ENOENT", "ENAMETOOLONG", "EINVAL")
+}
+"""What the system says of a place where no file can be made (ENOENT for one inside /proc)."""
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
@@ -56,7 +62,7 @@ def _explained(error: OSError, path: Path) -> Exception:
         return UserError(
             f"{path}: the disk is full", fix="free some space and run the same command again; finished work is kept"
         )
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.EISDIR):
+    if error.errno in NOT_WRITABLE:
         reason = os.strerror(error.errno).lower()
         return UserError(f"{path}: cannot be written ({reason})", fix="name a folder that you may write to with --out")
     return error
