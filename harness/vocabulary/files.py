@@ -62,7 +62,7 @@ def _explained(error: OSError, path: Path) -> Exception:
         return UserError(
             f"{path}: the disk is full", fix="free some space and run the same command again; finished work is kept"
         )
-    if error.errno in NOT_WRITABLE:
+    if error.errno is not None and error.errno in NOT_WRITABLE:
         reason = os.strerror(error.errno).lower()
         return UserError(f"{path}: cannot be written ({reason})", fix="name a folder that you may write to with --out")
     return error

@@ -1,7 +1,8 @@
 """The continuous-wave imager: phasors to samples to filtered phasors to range, with a reason for each invalid pixel.
 
 Modelled: shot and read noise on the samples, companding, saturation, fixed pattern, the phase-space joint bilateral
-filter, three-frequency unwrapping, the engine's gates, the correction for the emitter beside the lens, rounding.
+filter, three-frequency unwrapping, the engine's gates, the correction for the emitter beside the lens, rounding; the
+lens' natural fall-off of light towards the edge of the image.
 Not modelled: harmonics of the modulation (wiggling), drift with temperature, lens blur and stray light beyond the
 pixel's own footprint, motion, cross-talk between pixels, per-pixel gain switching, and any post-processing beyond this.
 """
@@ -75,6 +76,21 @@ class AmcwImager:
         return outside
 
     @cached_property
+    def gathered(self) -> np.ndarray:
+        """(h, w): light that a pixel gathers from a surface of given radiance, relative to one on the axis.
+
+        Solid angle times the pupil's foreshortening: |d slopes / d pixel| cos^4, which is the cos^4 law for an
+        undistorted lens; barrel distortion widens outer pixels and gives part of it back. Not modelled: mechanical
+        vignetting and the growth of the pupil with angle that wide lenses are designed to have.
+        """
+        v, u = np.mgrid[self.region.row0 : self.region.row1, self.region.col0 : self.region.col1].astype(float)
+        lens = self.camera.nominal_lens
+        along_u = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
+        along_v = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
+        area = np.abs(along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0])
+        return np.asarray(area * lens.fx * lens.fy / (1 + (self.slopes**2).sum(axis=-1)) ** 2)
+
+    @cached_property
     def fixed_pattern_m(self) -> np.ndarray:
         """(h, w): this unit's error of range before the filter, cut from a field over the whole sensor."""
         facts = self.camera.fixed_pattern
@@ -91,7 +107,7 @@ class AmcwImager:
     def expose(self, view: NoiseFreeView) -> Exposure:
         """The noise-free samples of a view that covers this imager's region."""
         photons = self.camera.photons
-        electrons = photons.signal_electrons.value
+        electrons = photons.signal_electrons.value * self.gathered
         delay = np.exp(
             1j * 2 * np.pi * self._frequencies[:, None, None] * (2 * self.fixed_pattern_m / SPEED_OF_LIGHT_AIR)
         )

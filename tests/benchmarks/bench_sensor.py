@@ -1,0 +1,278 @@
+"""Speed of the simulated camera: ``pytest tests/benchmarks/bench_sensor.py --benchmark-only`` with one thread each.
+
+Nothing here asserts a time. The filter stands in one group in three languages, so that the table shows their ratios:
+the compiled kernel that the camera uses, the same in Dr.Jit (traced at each call, and frozen), and in NumPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from detectors.average import AverageConfig, RunningAverage
+from harness.vocabulary.geometry import Region
+from harness.vocabulary.seeds import random_stream
+from scenes.render.closed_form import plane_view
+from scenes.sensor import kernels
+from scenes.sensor.amcw import AmcwImager, Exposure
+from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.source import SimulatedUnit
+
+f4 = np.float32
+CAMERA = load_camera("azure_kinect_nfov")
+LENS = CAMERA.nominal_lens
+BOARD = Region(258, 408, 222, 422)
+"""30,000 pixels, about the board's part of a picture."""
+HALF = CAMERA.engine.window_px.value // 2
+CONCENTRATION = f4(CAMERA.engine.concentration.value)
+DIM = f4(CAMERA.engine.dim_amplitude_units.value)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """One frame's arrays at every stage."""
+
+    imager: AmcwImager
+    exposure: Exposure
+    normals: np.ndarray
+    unit: np.ndarray
+    amplitude: np.ndarray
+    saturated: np.ndarray
+    filtered: np.ndarray
+    edge: np.ndarray
+
+    def expose(self) -> None:
+        converter = self.imager.camera.converter
+        kernels.expose(
+            self.exposure.means,
+            self.exposure.sigma,
+            self.normals,
+            f4(converter.knee_units.value),
+            f4(converter.full_scale_units.value),
+            self.imager._cosines,
+            self.imager._sines,
+            self.unit,
+            self.amplitude,
+            self.saturated,
+        )
+
+    def filter(self, frequency: int) -> None:
+        planes = self.unit[:, frequency].reshape(2, *self.exposure.shape)
+        amplitude = self.amplitude[frequency].reshape(self.exposure.shape)
+        kernels.joint_bilateral(
+            planes, amplitude, HALF, CONCENTRATION, DIM, self.filtered[frequency], self.edge[frequency]
+        )
+
+    def decode(self) -> np.ndarray:
+        n = self.saturated.size
+        z_m, reason, strength = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
+        kernels.range_and_gates(
+            self.filtered.reshape(3, 3, n),
+            self.edge.reshape(3, n),
+            self.saturated,
+            self.imager._geometry,
+            self.imager.outside_mask.reshape(-1),
+            self.imager._tables,
+            self.imager._gates,
+            z_m,
+            reason,
+            strength,
+        )
+        return z_m
+
+
+def unit_on(region: Region) -> SimulatedUnit:
+    """A unit before a board of 0.75 m, with the margin that the filter needs."""
+    outer = region.grown(CAMERA.margin_px, LENS.height, LENS.width)
+    return SimulatedUnit(CAMERA, CameraConfig(), plane_view(CAMERA, outer, 0.75, 0.6, 0.1, 0.05))
+
+
+@pytest.fixture(scope="module")
+def stages() -> Stages:
+    view = plane_view(CAMERA, BOARD, 0.75, 0.6, 0.1, 0.05)
+    imager = AmcwImager(CAMERA, CameraConfig(), BOARD, view.slopes)
+    exposure = imager.expose(view)
+    n = exposure.sigma.size
+    arrays = Stages(
+        imager,
+        exposure,
+        random_stream(1).standard_normal((3, 3, n), dtype=f4),
+        np.empty((2, 3, n), f4),
+        np.empty((3, n), f4),
+        np.empty(n, np.uint8),
+        np.empty((3, 3, *exposure.shape), f4),
+        np.empty((3, *exposure.shape), f4),
+    )
+    arrays.expose()
+    for frequency in range(3):
+        arrays.filter(frequency)
+    return arrays
+
+
+# ---------------------------------------------------------------- whole frames
+
+
+@pytest.mark.benchmark(group="whole frame")
+@pytest.mark.parametrize("region", [BOARD, LENS.whole], ids=["30,000 pixels", "640 x 576"])
+def test_a_simulated_frame(benchmark: Any, region: Region) -> None:
+    unit, rng = unit_on(region), random_stream(1)
+    decoded = benchmark(unit.imager.frame, unit.exposure, rng)
+    assert np.isfinite(decoded.z_m).mean() > 0.3
+
+
+@pytest.mark.benchmark(group="whole frame")
+def test_a_simulated_frame_of_30_000_pixels_added_to_an_average(benchmark: Any) -> None:
+    unit, rng = unit_on(BOARD), random_stream(1)
+    capture = unit.capture(2, 1)
+    frame = next(capture.frames())
+    running = RunningAverage(capture, AverageConfig())
+
+    def step() -> None:
+        unit.imager.frame(unit.exposure, rng)
+        running.add(frame)
+
+    benchmark.pedantic(step, rounds=300, iterations=1, warmup_rounds=5)
+
+
+@pytest.mark.benchmark(group="whole frame")
+def test_add_30_000_pixels_to_an_average(benchmark: Any) -> None:
+    capture = unit_on(BOARD).capture(2, 1)
+    frame = next(capture.frames())
+    running = RunningAverage(capture, AverageConfig())
+    benchmark.pedantic(running.add, args=(frame,), rounds=300, iterations=1, warmup_rounds=5)
+
+
+# ---------------------------------------------------------------- each kernel, 30,000 pixels
+
+
+@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+def test_normals(benchmark: Any, stages: Stages) -> None:
+    rng, out = random_stream(1), np.empty(stages.normals.size, f4)
+    benchmark(lambda: kernels.normals_from_bits(rng.bit_generator.random_raw(out.size // 2).view(np.uint32), out))
+    assert out.std() == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+def test_expose(benchmark: Any, stages: Stages) -> None:
+    benchmark(stages.expose)
+
+
+@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+def test_filter_three_frequencies(benchmark: Any, stages: Stages) -> None:
+    def three() -> None:
+        for frequency in range(3):
+            stages.filter(frequency)
+
+    benchmark(three)
+
+
+@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+def test_range_and_gates(benchmark: Any, stages: Stages) -> None:
+    assert np.isfinite(benchmark(stages.decode)).all()
+
+
+# ---------------------------------------------------------------- the filter in three languages
+
+
+def numpy_filter(unit: np.ndarray, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`kernels.joint_bilateral` in NumPy: (filtered (3, h, w), edge (h, w)), the same formulas on shifted planes."""
+    h, w = amplitude.shape
+    pad = ((HALF, HALF), (HALF, HALF))
+    re, im, amp, inside = (np.pad(plane, pad) for plane in (*unit, amplitude, np.ones_like(amplitude)))
+    total = np.zeros((5, h, w), f4)
+    bright = amplitude > DIM
+    for dy in range(2 * HALF + 1):
+        for dx in range(2 * HALF + 1):
+            near = (slice(dy, dy + h), slice(dx, dx + w))
+            cosine = unit[0] * re[near] + unit[1] * im[near]
+            weight = np.where(bright, np.exp(CONCENTRATION * (cosine - f4(1))), f4(1)) * inside[near]
+            total[0] += weight * re[near]
+            total[1] += weight * im[near]
+            total[2] += weight * amp[near]
+            total[3] += weight
+            total[4] += inside[near] * (f4(1) - cosine)
+    return np.stack([total[0], total[1], total[2] / total[3]]), f4(0.5) * total[4]
+
+
+class DrjitFilter:
+    """`kernels.joint_bilateral` in Dr.Jit: one kernel, 25 neighbours gathered from planes that stay on the device."""
+
+    def __init__(self, unit: np.ndarray, amplitude: np.ndarray, frozen: bool) -> None:
+        from scenes.render.variant import load_mitsuba
+
+        self.mi = load_mitsuba()
+        import drjit as dr
+
+        self.dr = dr
+        dr.set_thread_count(1)
+        self.h, self.w = amplitude.shape
+        self.row = self.w + 2 * HALF
+        pad = ((HALF, HALF), (HALF, HALF))
+        planes = (*unit, amplitude, np.ones_like(amplitude))
+        self.planes = [self.mi.Float(np.pad(plane, pad).ravel()) for plane in planes]
+        index = np.arange(self.h)[:, None] * self.row + np.arange(self.w)
+        self.corner = self.mi.UInt32(index.ravel().astype(np.uint32))
+        dr.eval(self.planes, self.corner)
+        self._compute = dr.freeze(self._trace) if frozen else self._trace
+
+    def _trace(self, planes: Any, corner: Any) -> Any:
+        dr, mi = self.dr, self.mi
+        re0, im0, amp0 = (dr.gather(mi.Float, p, corner + HALF * self.row + HALF) for p in planes[:3])
+        bright = amp0 > float(DIM)
+        total = [mi.Float(0.0) for _ in range(5)]
+        for dy in range(2 * HALF + 1):
+            for dx in range(2 * HALF + 1):
+                re, im, amp, inside = (dr.gather(mi.Float, p, corner + dy * self.row + dx) for p in planes)
+                cosine = re0 * re + im0 * im
+                weight = dr.select(bright, dr.exp(float(CONCENTRATION) * (cosine - 1.0)), 1.0) * inside
+                terms = (weight * re, weight * im, weight * amp, weight, inside * (1.0 - cosine))
+                total = [a + b for a, b in zip(total, terms, strict=True)]
+        return total[0], total[1], total[2] / total[3], 0.5 * total[4]
+
+    def __call__(self) -> Any:
+        """Run it to the end: (re, im, mean amplitude, edge) on the device."""
+        out = self._compute(self.planes, self.corner)
+        self.dr.eval(out)
+        self.dr.sync_thread()
+        return out
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """(filtered (3, h, w), edge (h, w))."""
+        *filtered, edge = (np.array(plane).reshape(self.h, self.w) for plane in self())
+        return np.stack(filtered), edge
+
+
+def filter_inputs(stages: Stages) -> tuple[np.ndarray, np.ndarray]:
+    shape = stages.exposure.shape
+    return np.ascontiguousarray(stages.unit[:, 0]).reshape(2, *shape), stages.amplitude[0].reshape(shape)
+
+
+def assert_same(stages: Stages, filtered: np.ndarray, edge: np.ndarray) -> None:
+    """To 1e-4 of the size of the phasor's sum (25), the amplitude and the edge gate's threshold (4)."""
+    ours = stages.filtered[0]
+    assert np.abs(filtered[:2] - ours[:2]).max() < 25 * 1e-4
+    assert filtered[2] == pytest.approx(ours[2], rel=1e-4)
+    assert np.abs(edge - stages.edge[0]).max() < 4 * 1e-4
+
+
+@pytest.mark.benchmark(group="filter of one frequency, 30,000 pixels")
+def test_filter_numba(benchmark: Any, stages: Stages) -> None:
+    benchmark(stages.filter, 0)
+
+
+@pytest.mark.benchmark(group="filter of one frequency, 30,000 pixels")
+def test_filter_numpy(benchmark: Any, stages: Stages) -> None:
+    inputs = filter_inputs(stages)
+    assert_same(stages, *numpy_filter(*inputs))
+    benchmark(numpy_filter, *inputs)
+
+
+@pytest.mark.benchmark(group="filter of one frequency, 30,000 pixels")
+@pytest.mark.parametrize("frozen", [False, True], ids=["traced", "frozen"])
+def test_filter_drjit(benchmark: Any, stages: Stages, frozen: bool) -> None:
+    ours = DrjitFilter(*filter_inputs(stages), frozen)
+    assert_same(stages, *ours.arrays())
+    benchmark(ours)
