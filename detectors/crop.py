@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.segment import euclidean_clusters
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import MM
 
 MAX_SURFACE_TILT = 6.0
 """tan(80.5 degrees): a steeper step between neighbouring pixels is an edge, not a surface."""
 STEP_SIGMAS = 6.0
 """Of the noise of a difference between neighbours: below this a step may be noise."""
+RIM_PX = 3
+"""Width of the rim where a depth pixel mixes target and background: a 5 x 5 window (Azure Kinect's engine, OpenK4A)
+reaches 2 pixels, and the edge itself passes through a third. Kinect v2's 3 x 3 window leaves 2. Depth aligned to a
+finer colour camera needs as many *depth* pixels: 2.4 times as many for the Azure Kinect's binned WFOV at 1280 x 720."""
+WIDEST_SLOPE = 5.7
+"""tan(80 degrees): no camera sees so far off its axis; a cloud that does was not recorded from its origin."""
+CELL_SPACINGS = 1.5
+"""Side of a cell over the distance between neighbours: above sqrt 2, so that no cell of a cloud that was an image stays
+empty, however its rows lie; of random points one cell in five does, which joins the rest all the same."""
+MAX_RASTER = 4096
+"""Cells along one side of the raster that stands in for a missing pixel grid."""
 
 
 class _Crop(Config):
@@ -66,14 +78,20 @@ class PolygonCrop(_Crop):
 class AutoCrop(_Crop):
     """The largest smooth surface: neighbours are joined where the step in z is no more than a tilted surface and noise
     explain and the surface does not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, so
-    that damage and whatever lies inside its outline stay. Without a pixel grid: the largest cluster at
-    ``link_distance_mm`` (default: three times the usual distance between neighbours), which does not stop at creases.
+    that damage and whatever lies inside its outline stay; then ``inset_px`` comes off its rim (`RIM_PX` says why 3).
+    A background so close behind that the camera's blur leaves no crease is taken for target (13 mm behind the face, at
+    0.7 m with a 5 x 5 window; at 33 mm it is not).
+
+    Without a pixel grid: the same on a raster of x/z, y/z (of x, y where the cloud cannot have been recorded from its
+    origin) that holds the nearest point of each cell; all points of a kept cell are kept. ``smooth_px`` counts
+    distances between neighbours, ``inset_px`` is the least number of them that is taken off, and the image's edge,
+    which such a cloud does not tell, is a rim.
     """
 
     kind: Literal["auto"] = "auto"
+    inset_px: int = Field(default=RIM_PX, ge=0, le=200)
     crease_deg: float = Field(default=35.0, gt=0, le=90)
     smooth_px: int = Field(default=9, ge=3, le=99)
-    link_distance_mm: float | None = Field(default=None, gt=0)
 
 
 CropConfig = Annotated[NoCrop | BoxCrop | PolygonCrop | AutoCrop, Field(discriminator="kind")]
@@ -92,7 +110,7 @@ def crop(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> np.
     elif isinstance(config, PolygonCrop):
         mask = _polygon(cloud, config)
     elif isinstance(config, AutoCrop):
-        mask = _largest_surface(cloud, config)
+        mask = _largest_surface(cloud, config) if cloud.organised else _largest_on_raster(cloud, config)
     else:
         mask = cloud.valid
     if config.inset_px and cloud.organised:
@@ -152,15 +170,15 @@ def _holes_filled(mask: np.ndarray) -> np.ndarray:
 
 
 def _largest_surface(cloud: Cloud, config: AutoCrop) -> np.ndarray:
-    if not cloud.organised:
-        return _largest_cluster(cloud, config)
     valid = cloud.valid
     bend = _creases(cloud, config)
     right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), bend)
     down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), bend)
     largest = _largest_component(valid & ~bend, right, down)
-    # smoothing and comparing flag smooth_px pixels on each side of a crease or rim: given back where no step parts
-    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=config.smooth_px)
+    # smoothing, slope and comparison flag half + 1 + half pixels on each side of a crease or rim: given back where no
+    # step parts
+    reach = 2 * (config.smooth_px // 2) + 1
+    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=reach)
     rim = _largest_component(valid & (grown > 0), *_steps_only(cloud))
     return _holes_filled(largest | (rim & (grown > 0))) & valid
 
@@ -235,20 +253,58 @@ def _largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -
     return largest & nodes
 
 
-def _largest_cluster(cloud: Cloud, config: AutoCrop) -> np.ndarray:
+# ---------------------------------------------------------------- the same without a pixel grid
+
+
+def _largest_on_raster(cloud: Cloud, config: AutoCrop) -> np.ndarray:
+    """As `_largest_surface`; a hole's floor, an island without a grid, lies inside the outline as it does on one."""
+    mask = cloud.valid.copy()
+    raster, rows, columns = _raster(cloud.points_m[mask], cloud)
+    coarse = config.model_copy(update={"smooth_px": max(3, 2 * round(config.smooth_px / CELL_SPACINGS / 2) - 1)})
+    kept = _largest_surface(raster, coarse)
+    if config.inset_px:
+        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        kept = _inset(kept, math.ceil((config.inset_px - 1) / CELL_SPACINGS) + 1)
+    mask[mask] = kept[rows, columns]
+    return mask
+
+
+def _raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray]:
+    """A grid that holds the nearest of points (n, 3) in each cell, with an empty border; each point's row and column.
+
+    Seen from the camera, what shows through a hole lies inside its mouth, and what shows past the rim outside of it,
+    however oblique the view.
+    """
+    plan = _plan(points)
+    low, high = plan.min(axis=0), plan.max(axis=0)
+    side = max(CELL_SPACINGS * _spacing(plan), float((high - low).max()) / MAX_RASTER, 1e-9)
+    columns, rows = (np.floor((plan - low) / side).astype(int) + 1).T
+    shape = (int(rows.max()) + 2, int(columns.max()) + 2)
+    image = np.full((*shape, 3), np.nan)
+    # of repeated indices numpy keeps the last
+    far_first = np.argsort(-points[:, 2], kind="stable")
+    image[rows[far_first], columns[far_first]] = points[far_first]
+    none, zeros = np.full(shape, np.nan), np.zeros(shape, dtype=np.uint8)
+    region = Region(0, shape[0], 0, shape[1])
+    return Cloud(image, zeros, zeros.astype(int), none, region, cloud.z_step_m, cloud.n_frames), rows, columns
+
+
+def _plan(points: np.ndarray) -> np.ndarray:
+    """(n, 2) place of each point (n, 3) in the picture: x/z, y/z as the camera at the origin sees them, else x, y."""
+    x_y, z = points[:, :2], points[:, 2:]
+    if z.min() > 0 and float(np.abs(x_y / z).max()) < WIDEST_SLOPE:
+        seen: np.ndarray = x_y / z
+        return seen
+    return x_y
+
+
+def _spacing(places: np.ndarray) -> float:
+    """What nine in ten of the distances to the nearest neighbour do not exceed, of some 2000 places (n, 2)."""
     from scipy.spatial import cKDTree
 
-    mask = cloud.valid.copy()
-    points = cloud.points_m[mask]
-    if config.link_distance_mm is not None:
-        distance = config.link_distance_mm * MM
-    else:
-        some = points[:: max(1, len(points) // 2000)]
-        to_nearest = cKDTree(points).query(some, k=min(2, len(points)))[0].reshape(len(some), -1)[:, -1]
-        distance = max(3.0 * float(np.quantile(to_nearest, 0.9)), 1e-6)
-    labels = euclidean_clusters(points, distance)
-    mask[mask] = labels == np.argmax(np.bincount(labels))
-    return mask
+    some = places[:: max(1, len(places) // 2000)]
+    to_nearest = cKDTree(places).query(some, k=min(2, len(places)))[0].reshape(len(some), -1)[:, -1]
+    return float(np.quantile(to_nearest, 0.9))
 
 
 def _empty(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> UserError:

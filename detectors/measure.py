@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.hole_model import HoleFit, Patch, blurred_disc, fit_hole
+from detectors.hole_model import HoleFit, Patch, Sight, blurred_disc, fit_hole
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
@@ -31,14 +31,17 @@ class HoleModelConfig(Config):
     """What the model of a blurred hole takes for granted.
 
     ``blur_px``: side of the square over which the camera averages: 5 for the Azure Kinect's depth engine (5x5
-    bilateral on phasors, OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``linear_depth_mm``: beyond it the
-    filter loses deep neighbours (weight 0.74 at 50 mm for 198 MHz) and the contour at half depth is the better measure.
-    ``largest_invalid``: the part of the disc that may lack a range. ``largest_relative_error``: of the diameter; beyond
-    it diameter and depth cannot be told apart.
+    bilateral on phasors, OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: where the light
+    stands in the camera's frame (the Azure Kinect's, 14 mm beside the lens; its SDK's issue 812). ``linear_depth_mm``:
+    beyond it a neighbour at depth counts for less than half in the filter (weight 0.51 at 75 mm for 198 MHz), so that
+    the image is no average any more, and the contour at half depth is the safer measure. ``largest_invalid``: the part
+    of the disc that may lack a range. ``largest_relative_error``: of the diameter; beyond it diameter and depth cannot
+    be told apart.
     """
 
     blur_px: int = Field(default=5, ge=1, le=31)
-    linear_depth_mm: float = Field(default=50.0, gt=0)
+    emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
+    linear_depth_mm: float = Field(default=75.0, gt=0)
     largest_invalid: float = Field(default=0.1, ge=0, le=1)
     largest_relative_error: float = Field(default=0.3, gt=0)
 
@@ -141,7 +144,8 @@ class _Surroundings:
         sign = 1.0 if deviations.sum() >= 0 else -1.0
         peak = max(float(np.quantile(sign * deviations, 0.9)), 1e-9)
         metric = plane[1] @ plane[1].T
-        patch = Patch(residual, used, metric, config.blur_px)
+        sight = Sight.of(*plane, np.array(config.emitter_mm) * MM)
+        patch = Patch(residual, used, metric, config.blur_px, noise, sight)
         invalid = ~cloud.valid[cut]
         v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
         return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])
@@ -216,15 +220,18 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     inside = around.own | (around.invalid & _grown(around.own, 1))
     if float((around.invalid & inside).sum()) > config.largest_invalid * float(inside.sum()):
         return None, "part of the hole has no range"
+    too_deep = f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
     if around.peak_m > config.linear_depth_mm * MM:
-        return None, f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
+        return None, too_deep
     fit = fit_hole(around.patch, *_start(around))
     h, w = around.own.shape
     reach = np.pad(_grown(around.own, config.blur_px // 2 + 1), 1)
     at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
     if not (fit.converged and reach[at[0], at[1]]):
         return None, "the model of a blurred hole does not fit"
-    disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, around.patch.metric_m2, 1)[0]
+    if abs(fit.depth_m) > config.linear_depth_mm * MM:
+        return None, too_deep
+    disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, around.patch.metric_m2, 1)
     if float(disc[around.invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, "part of the hole has no range"
     variance = float(fit.covariance[2, 2])

@@ -61,7 +61,7 @@ class ThesisDetector:
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 1
+    version = 2
 
     def __init__(self, settings: ThesisConfig) -> None:
         self.settings = settings

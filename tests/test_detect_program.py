@@ -132,8 +132,19 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
     assert "single points" in capsys.readouterr().out
-    assert detect.main([str(cloud)]) == 0
-    assert "109 points lie off the largest cluster" in capsys.readouterr().out
+
+
+def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
+    assert detect.main([str(cloud), "--out", str(tmp_path / "out")]) == 0
+    assert "points lie off the largest surface or on its rim" in capsys.readouterr().out
+    (row,) = rows_of(tmp_path / "out" / "findings.csv")
+    v, u = np.mgrid[: plane.LENS.height, : plane.LENS.width]
+    assert int(row["points"]) == (np.hypot(u - plane.HOLE_U, v - plane.HOLE_V) < plane.HOLE_RADIUS_PX).sum()
+    told = json.loads((tmp_path / "out" / "findings.json").read_text())
+    assert told["settings"]["detector"]["settings"]["crop"]["inset_px"] == 3
 
 
 def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
