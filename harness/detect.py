@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -337,45 +338,16 @@ def _about(
 
 
 def _provenance(recording: Recording) -> dict[str, Any]:
-    """Program, versions, and the content of every file that can change a number."""
+    """Command, code, versions, and the content of every file that can change a number."""
     import hashlib
-    import platform
-    from importlib import metadata
+
+    from harness.vocabulary.provenance import record
 
     files = []
     for path in recording.files:
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
-    try:
-        version = metadata.version("tofpod")
-    except metadata.PackageNotFoundError:
-        version = "not installed"
-    packages = {name: metadata.version(name) for name in ("numpy", "scipy", "opencv-python-headless")}
-    return {
-        "tofpod": version,
-        "commit": _commit(),
-        "python": platform.python_version(),
-        "packages": packages,
-        "command": sys.argv,
-        "files": files,
-    }
-
-
-def _commit() -> str | None:
-    """The checkout's commit, with ``+changes`` where files differ from it; None outside a checkout."""
-    import subprocess
-
-    root = Path(__file__).resolve().parents[1]
-    git = ["git", "-C", str(root)]
-    try:
-        top = subprocess.run([*git, "rev-parse", "--show-toplevel", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    folder, commit = top.stdout.split("\n")[:2]
-    if Path(folder) != root:  # installed inside somebody else's repository
-        return None
-    return commit + ("+changes" if changed.stdout.strip() else "")
+    return {**record("python -m harness.detect " + shlex.join(sys.argv[1:])), "files": files}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from harness.experiment.schema import CaptureSource
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text
-from harness.vocabulary.provenance import commit_and_dirty, machine, versions
+from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
 
 
@@ -72,7 +72,6 @@ def _judged(point: Point) -> tuple[Judged, float]:
 
 def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[str, object]:
     """What stands beside the findings in their JSON."""
-    commit, dirty = commit_and_dirty()
     return {
         "capture": {
             "frames_used": cloud.n_frames,
@@ -80,11 +79,5 @@ def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[s
         },
         "threshold": {"k": threshold, "from": "given"},
         "settings": point.config.to_data(),
-        "provenance": {
-            "command": command,
-            "commit": commit,
-            "dirty": dirty,
-            "versions": versions(),
-            "machine": machine(),
-        },
+        "provenance": record(command),
     }

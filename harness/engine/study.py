@@ -21,7 +21,7 @@ from harness.experiment.load import resolved_yaml
 from harness.experiment.points import MAIN, Experiment
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, write_text
-from harness.vocabulary.provenance import commit_and_dirty, machine, versions
+from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
 from scenes.render.cache import read_view
 
@@ -77,7 +77,6 @@ def _provenance(
     experiment: Experiment, plan: Plan, outcome: Outcome, command: str, started: str, seconds: float
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
-    commit, dirty = commit_and_dirty()
     runs = [row for record in outcome.records.values() for row in record["runs"]]
     main = next((g for g in plan.groups if any(p.variant == MAIN for p in g.points)), plan.groups[0])
     view = read_view(main.damaged.path)
@@ -89,15 +88,11 @@ def _provenance(
                 noise[name] = round(float(pd.Series(view.indirect_noise_m[here]).median()) / MM, 4)
     return {
         "results_version": RESULTS_VERSION,
-        "command": command,
+        **record(command),
         "experiment": experiment.config.name,
         "digest": experiment.digest,
         "seed": experiment.config.seed,
-        "commit": commit,
-        "dirty": dirty,
-        "versions": versions(),
         "mitsuba_variant": view.variant if view is not None else None,
-        "machine": machine(),
         "started": started,
         "seconds": {
             "this run in all": round(seconds, 1),
