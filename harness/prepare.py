@@ -18,7 +18,7 @@ def _prepare() -> int:
     from detectors import load_detector
     from detectors.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
-    from scenes.render.closed_form import plane_view
+    from scenes.closed_form import plane_view
     from scenes.sensor.camera import CameraConfig, load_camera
     from scenes.sensor.source import SimulatedUnit
 

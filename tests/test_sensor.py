@@ -10,7 +10,7 @@ from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
-from scenes.render.closed_form import plane_view
+from scenes.closed_form import plane_view
 from scenes.sensor import kernels
 from scenes.sensor.amcw import AmcwImager
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_signal

@@ -13,7 +13,7 @@ from scipy import optimize
 
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import MM
-from scenes.render.closed_form import plane_view
+from scenes.closed_form import plane_view
 from scenes.sensor.camera import AmcwCamera, CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 

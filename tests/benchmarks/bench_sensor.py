@@ -15,7 +15,7 @@ import pytest
 from detectors.average import AverageConfig, RunningAverage
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
-from scenes.render.closed_form import plane_view
+from scenes.closed_form import plane_view
 from scenes.sensor import kernels
 from scenes.sensor.amcw import AmcwImager, Exposure
 from scenes.sensor.camera import CameraConfig, load_camera

@@ -24,7 +24,7 @@ from detectors.recordings import open_capture
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import Region
-from scenes.render.closed_form import plane_view
+from scenes.closed_form import plane_view
 from scenes.sensor.amcw import AmcwImager
 from scenes.sensor.camera import AmcwCamera, CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
