@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 
@@ -9,7 +10,8 @@ from harness.vocabulary.errors import exit_code_of
 
 
 def main() -> int:
-    """The program."""
+    """The program. Takes no options but --help."""
+    argparse.ArgumentParser(prog="python -m harness.prepare", description="Compile the inner loops once.").parse_args()
     return exit_code_of(_prepare)
 
 

@@ -157,6 +157,7 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
             "kind": "through",
             "true_diameter_mm": diameter,
             "true_depth_mm": 12.7,
+            "seen_depth_mm": 12.7,
             "true_x_mm": 254.0 - offset,
             "true_y_mm": 0.0,
             "true_offset_mm": offset,

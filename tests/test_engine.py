@@ -9,7 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import pandas as pd
 import pytest
@@ -17,7 +20,16 @@ import pytest
 from harness.engine.journal import Journal, without_nan
 from harness.engine.plan import plan_of
 from harness.engine.run import pending_counts
+from harness.engine.setup import SetUp
+from harness.engine.trial import _on_board, run_trial
 from harness.experiment.load import load_experiment
+from scenes.target.declaration import TargetConfig
+from scenes.target.pose import T_camera_board_of
+from scenes.target.truth import truth_of
+
+if TYPE_CHECKING:
+    from detectors.interface import Measurement
+    from scenes.sensor.source import SimulatedUnit
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -254,3 +266,81 @@ def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
     table = pd.read_csv(next((tmp_path / "out").glob("capture/*/summary.csv")))
     assert list(table.frames_used) == [1, 11]
     assert len(list((tmp_path / "out").glob("capture/*/point-*/findings.csv"))) == 2
+
+
+def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
+    custom = TINY.replace("{name: thesis}", "{name: custom, board: {width_mm: 200, height_mm: 100, thickness_mm: 10}}")
+    (tmp_path / "tiny.yaml").write_text(custom)
+    done = sweep(tmp_path / "out", experiment=tmp_path / "tiny.yaml")
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+    assert "neither holes nor dents" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
+    """A trial that raises becomes a failure with its traceback; the other trials end. Run without workers."""
+    from contextlib import contextmanager
+
+    from harness.engine import run, workers
+
+    class Here:
+        def submit(self, work, *arguments):
+            future: Future[object] = Future()
+            try:
+                future.set_result(work(*arguments))
+            except Exception as error:
+                future.set_exception(error)
+            return future
+
+    @contextmanager
+    def here(_count):
+        yield Here()
+
+    def faulty(task):
+        if task.role == "damaged" and task.repeat == 1:
+            raise ValueError("a bug of the detector")
+        return run_trial(task)
+
+    monkeypatch.setattr(workers, "pool", here)
+    monkeypatch.setattr(run, "run_trial", faulty)
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    plan = plan_of(experiment, finished / ".cache" / "renders")
+    outcome = run.run_plan(plan, Journal(finished.parent / "faulty"), 1, lambda _: None)
+    (failure,) = outcome.failures
+    assert failure.what.startswith("damaged-00001-")
+    assert "Traceback" in failure.why
+    assert failure.why.rstrip().endswith("ValueError: a bug of the detector")
+    assert outcome.trials_done == 3
+
+
+def test_changed_code_is_not_served_old_trials(finished, monkeypatch):
+    from harness.engine import plan
+
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    (group,) = plan_of(experiment, finished / ".cache" / "renders").groups
+    before = [key for key, _ in group.trials("hole_free", {})]
+    monkeypatch.setattr(plan, "source_digest", lambda folders, packages: "other code")
+    assert set(before).isdisjoint(key for key, _ in group.trials("hole_free", {}))
+
+
+def test_matching_places_findings_on_a_curved_face():
+    """The line of sight through a hole's centre meets a cylinder's face where the hole is."""
+    data = {
+        "name": "custom",
+        "board": {
+            "width_mm": 200,
+            "height_mm": 100,
+            "thickness_mm": 10,
+            "shape": {"kind": "cylinder", "radius_mm": 130, "straight_along": "y"},
+        },
+        "holes": [{"id": 1, "kind": "through", "diameter_mm": 10, "centre_mm": [70, 0]}],
+        "pose": {"distance_m": 0.6},
+    }
+    target = TargetConfig.from_data(data)
+    T_camera_board = T_camera_board_of(target.pose)
+    (damage,) = truth_of(target, T_camera_board)
+    unit = cast("SimulatedUnit", None)
+    set_up = SetUp(unit, unit, (damage,), target, T_camera_board)
+    deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
+    measured = [cast("Measurement", SimpleNamespace(extent_centre_m=deeper))]
+    assert _on_board(set_up, measured)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

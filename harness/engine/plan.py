@@ -12,12 +12,18 @@ from harness.engine.setup import SetUpRef
 from harness.engine.trial import PointTask, Role, TrialTask
 from harness.experiment.points import Experiment, Point
 from harness.experiment.schema import SimulatedSource
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import canonical_json, digest
+from harness.vocabulary.sources import source_digest
 from harness.vocabulary.units import MM
 from scenes.render.cache import render_key
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
+
+CODE = ("detectors", "harness/engine", "harness/evaluation", "harness/vocabulary", "scenes")
+PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless")
+"""What decides a trial's numbers beside its task: a change of any makes stored trials count as not done."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,15 @@ class Group:
 
     def _key(self, task: TrialTask) -> str:
         asked = [[point.digest, point.variant, point.threshold] for point in task.points]
-        content = [JOURNAL_VERSION, self.damaged.path.stem, self.hole_free.path.stem, task.role, task.repeat, asked]
+        content = [
+            JOURNAL_VERSION,
+            source_digest(CODE, PACKAGES),
+            self.damaged.path.stem,
+            self.hole_free.path.stem,
+            task.role,
+            task.repeat,
+            asked,
+        ]
         return f"{task.role}-{task.repeat:05d}-{digest(content)}"
 
 
@@ -114,6 +128,12 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
     source = points[0].config.source
     assert isinstance(source, SimulatedSource)
     target = source.target.declare()
+    if not target.damages:
+        raise UserError(
+            "the target has neither holes nor dents, so that there is nothing to find",
+            legal="at least one hole or dent",
+            fix="declare source.target.holes or source.target.dents",
+        )
     damaged, hole_free = (
         RenderJob(declared, source.camera.name, source.render, cache) for declared in (target, target.hole_free())
     )

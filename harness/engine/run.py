@@ -4,6 +4,7 @@ finished is in the journal; what the journal holds is not run again."""
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -19,6 +20,9 @@ from harness.engine.plan import Group, Plan, RenderJob
 from harness.engine.trial import Record, Role, TrialTask, run_trial
 from harness.report.example import ExampleCloud
 from harness.vocabulary.errors import UserError
+
+FAILURE_CHARACTERS = 4000
+"""Of a traceback, its end."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +132,15 @@ class _Run:
                 fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short",
             ) from error
         except UserError as error:
-            if not isinstance(work, _Trial):
+            if isinstance(work, _Render):
                 raise
-            self.outcome.failures.append(Failure(work.key, error.message))
-            self._trial_over(work)
+            self._failed(work, error.message)
+            return
+        except Exception as error:
+            # A bug in one trial costs that trial; its traceback (the worker's, as text) goes into the failures.
+            if isinstance(work, _Render):
+                raise
+            self._failed(work, "".join(traceback.format_exception(error))[-FAILURE_CHARACTERS:])
             return
         if isinstance(work, _Render):
             self._rendered(work.job, *result)
@@ -142,6 +151,12 @@ class _Run:
             self.journal.write(work.key, record)
             self.outcome.trials_done += 1
             self._keep(work, record)
+            self._trial_over(work)
+
+    def _failed(self, work: _Trial | _Examples, why: str) -> None:
+        what = work.key if isinstance(work, _Trial) else f"example clouds of set-up {work.group}"
+        self.outcome.failures.append(Failure(what, why))
+        if isinstance(work, _Trial):
             self._trial_over(work)
 
     def _rendered(self, job: RenderJob, found: bool, seconds: float) -> None:

@@ -19,7 +19,11 @@ from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM
+from scenes.target.face import face_of
 from scenes.target.truth import Damage
+
+SIGHT_STEPS = 8
+"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
 
 Role = Literal["hole_free", "damaged"]
 Record = dict[str, list[dict[str, Any]]]
@@ -131,8 +135,13 @@ def _on_board(set_up: SetUp, measured: Sequence[Measurement]) -> np.ndarray:
     centres = np.array([m.extent_centre_m for m in measured]).reshape(-1, 3)
     T_board_camera = invert(set_up.T_camera_board)
     board, lens = transform_points(T_board_camera, centres), T_board_camera[:3, 3]
-    share = lens[2] / (lens[2] - board[:, 2])
-    return np.asarray(lens[:2] + share[:, None] * (board[:, :2] - lens[:2]))
+    face = face_of(set_up.target.board)
+    place = board
+    for _ in range(SIGHT_STEPS):
+        height = np.nan_to_num(face.height_m(place[:, 0], place[:, 1]))
+        share = (lens[2] - height) / (lens[2] - board[:, 2])
+        place = lens + share[:, None] * (board - lens)
+    return np.asarray(place[:, :2])
 
 
 def _hole_row(
@@ -154,6 +163,7 @@ def _hole_row(
         "kind": damage.kind,
         "true_diameter_mm": damage.diameter_m / MM,
         "true_depth_mm": damage.depth_m / MM,
+        "seen_depth_mm": _seen_depth_m(set_up, inside) / MM,
         "true_x_mm": float(damage.centre_board_m[0]) / MM,
         "true_y_mm": float(damage.centre_board_m[1]) / MM,
         "true_offset_mm": float(np.linalg.norm(damage.centre_board_m - last.centre_board_m)) / MM,
@@ -163,6 +173,14 @@ def _hole_row(
         "state": _state(found is not None, float(missing.mean()), median_m, evidence.scale_m),
     }
     return row | _measured_columns(damage, found, largest)
+
+
+def _seen_depth_m(set_up: SetUp, inside: np.ndarray) -> float:
+    """How far behind the face the central rays through a hole end, along the optical axis: the median of those that
+    come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the backing."""
+    depth = set_up.seen_z_m.ravel()[inside] - set_up.true_z_m.ravel()[inside]
+    depth = depth[np.isfinite(depth)]
+    return float(np.median(depth[depth > depth.max() - 1 * MM])) if depth.size else float("nan")
 
 
 def _state(detected: bool, invalid_fraction: float, median_m: float, scale_m: float) -> str:

@@ -23,8 +23,9 @@ FOUND_RULE = (
     "as missed when it lies below, else as undecided."
 )
 GROUP = ["variant", "frames", "hole"]
-TRUTH = ["kind", "true_diameter_mm", "true_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
+TRUTH = ["kind", "true_diameter_mm", "true_depth_mm", "seen_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
 MEASURED = ["diameter_mm", "offset_mm", "error_mm"]
+FITTED = ["model_diameter_se_mm", "model_depth_mm", "model_depth_se_mm"]
 COLUMNS = [
     *GROUP,
     *TRUTH,
@@ -33,6 +34,7 @@ COLUMNS = [
     "state",
     "median_residual_mm",
     "invalid_fraction",
+    *FITTED,
     *(f"{measure}_{name}" for measure in ("extent", "model") for name in MEASURED),
 ]
 
@@ -69,7 +71,10 @@ def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
     ``rate_low``/``rate_high`` and ``status`` by `FOUND_RULE`; for the thesis' measure (``extent_``) and the model's
     (``model_``): ``measured`` trials with a finite diameter, ``diameter_mean_mm``, ``diameter_std_mm`` (n - 1),
     ``bias_mm`` with Student's interval, ``offset_mean_mm``, ``offset_std_mm``, ``offset_bias_mm``, ``error_mean_mm``;
-    and ``share_*``, the share of trials in each of `STATES`. Means are over the detected trials only, so they
+    ``model_diameter_se_mean_mm`` and ``model_depth_*`` of the model fit: means, scatter, stated standard errors and the
+    bias against ``seen_depth_mm`` (``true_depth_mm`` is the removed material; behind a through-hole one sees farther),
+    and ``model_diameter_covered``, the share of fits whose diameter lies within 1.96 of its own standard errors of the
+    truth; and ``share_*``, the share of trials in each of `STATES`. Means are over the detected trials only, so they
     are conditional on detection: a hole detected in few trials shows the sizes of its lucky trials.
     """
     import pandas as pd
@@ -84,6 +89,7 @@ def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
     out["status"] = [status_of(low, high) for low, high in zip(out["rate_low"], out["rate_high"], strict=True)]
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
+    out = pd.concat([out, _fitted(holes, out)], axis=1)
     out["median_residual_mm"] = groups["median_residual_mm"].mean()
     out["invalid_fraction"] = groups["invalid_fraction"].mean()
     for state in STATES:
@@ -147,6 +153,26 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
     out["offset_measured"] = offset.count()
     out["error_mean_mm"] = groups[f"{measure}_error_mm"].mean()
     return out.add_prefix(f"{measure}_")
+
+
+def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
+    """What only the model gives: depth, and the standard errors that each fit states, held against the truth."""
+    import pandas as pd
+
+    fits = holes[[*GROUP, "true_diameter_mm", "model_diameter_mm", *FITTED]].copy()
+    miss = (fits["model_diameter_mm"] - fits["true_diameter_mm"]).abs() / fits["model_diameter_se_mm"]
+    fits["covered"] = (miss <= 1.96).astype(float).where(miss.notna())
+    groups = fits.groupby(GROUP, sort=False)
+    out = pd.DataFrame(index=truth.index)
+    out["model_diameter_se_mean_mm"] = groups["model_diameter_se_mm"].mean()
+    out["model_diameter_covered"] = groups["covered"].mean()
+    out["model_depth_mean_mm"], out["model_depth_std_mm"] = (
+        groups["model_depth_mm"].mean(),
+        groups["model_depth_mm"].std(),
+    )
+    out["model_depth_se_mean_mm"] = groups["model_depth_se_mm"].mean()
+    out["model_depth_bias_mm"] = out["model_depth_mean_mm"] - truth["seen_depth_mm"]
+    return out
 
 
 def _order(column: pd.Series) -> pd.Series:

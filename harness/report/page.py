@@ -48,7 +48,7 @@ def write_report(
     """Write ``folder/report.html`` and return its path.
 
     ``provenance`` may hold: ``command``, ``commit``, ``dirty``, ``versions``, ``mitsuba_variant``, ``seed``,
-    ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``cache_hits``, ``failures`` (texts, or
+    ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``renders``, ``failures`` (texts, or
     mappings with their parts); whatever else it holds is shown as it is, and a missing one as not recorded. The same
     input gives the same bytes. Raises UserError where the folder cannot be written.
     """
@@ -89,6 +89,8 @@ def report_html(
         repeats=int(main["n"].max()) if len(main) else 0,
         holes=_hole_rows(main),
         figures=_figures(main, noise, clouds),
+        variant_repeats=_largest(summary.loc[summary["variant"] != MAIN, "n"]),
+        measures=_measure_rows(main),
         shapes=_shape_rows(clouds),
         rings=[f"{ring:g} R" for ring in RINGS],
         verdicts=verdicts,
@@ -213,6 +215,39 @@ def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
     ]
 
 
+def _measure_rows(main: pd.DataFrame) -> list[dict[str, str]]:
+    """Size, depth and centre of each hole with the most frames, by both measures, against the truth; text in mm."""
+    if main.empty:
+        return []
+    rows = main[main["frames"] == main["frames"].max()]
+    return [
+        {
+            "hole": str(row["hole"]),
+            "truth": _mm(row["true_diameter_mm"], 2),
+            "extent": _spread(row["extent_diameter_mean_mm"], row["extent_diameter_std_mm"]),
+            "model": _spread(row["model_diameter_mean_mm"], row["model_diameter_std_mm"]),
+            "model_se": _mm(row["model_diameter_se_mean_mm"], 2),
+            "covered": "–"
+            if row["model_diameter_covered"] != row["model_diameter_covered"]
+            else f"{100 * row['model_diameter_covered']:.0f} %",
+            "seen": _mm(row["seen_depth_mm"], 1),
+            "depth": _spread(row["model_depth_mean_mm"], row["model_depth_std_mm"]),
+            "depth_se": _mm(row["model_depth_se_mean_mm"], 2),
+            "extent_centre": _mm(row["extent_error_mean_mm"], 2),
+            "model_centre": _mm(row["model_error_mean_mm"], 2),
+        }
+        for _, row in rows.iterrows()
+    ]
+
+
+def _largest(counts: pd.Series) -> int | None:
+    return int(counts.max()) if len(counts) else None
+
+
+def _spread(mean: float, std: float) -> str:
+    return "–" if mean != mean else f"{mean:.2f} ± {std:.2f}"
+
+
 def _short(label: str) -> str:
     """A variant's label for a narrow column: of ``source.target.distance_m=0.5`` the last key, the value apart."""
     path, equals, value = label.partition("=")
@@ -278,7 +313,7 @@ def _provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         "machine",
         "mitsuba_variant",
         "indirect_noise_mm",
-        "cache_hits",
+        "renders",
         "versions",
     )
     others = [key for key in provenance if key not in expected and key not in SHOWN_APART]

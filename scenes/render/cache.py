@@ -14,25 +14,31 @@ import numpy as np
 from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import digest
+from harness.vocabulary.sources import source_digest
 from scenes.render.settings import RenderConfig
-from scenes.render.view import RENDER_VERSION, render_view
+from scenes.render.view import render_view
 from scenes.sensor.camera import AmcwCamera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import build_target
 from scenes.view import NoiseFreeView
 
+CODE = ("scenes/render", "scenes/target", "harness/vocabulary")
+PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numpy", "scipy")
+"""What decides a render's numbers beside its declaration. The variant (GPU or processor) is left out: it changes them
+by 1e-6."""
+
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 
 
 def render_key(target: TargetConfig, camera: AmcwCamera, config: RenderConfig) -> str:
-    """Digest of what a render depends on: target, optics and frequencies of the camera, work, version of the code.
+    """Digest of what a render depends on: target, optics and frequencies of the camera, work, and the code itself.
 
     The sensor's noise and engine are left out: cameras that differ there share renders.
     """
     optics = {part: camera.to_data()[part] for part in ("lens", "emitter")}
     return digest(
         {
-            "render_version": RENDER_VERSION,
+            "code": source_digest(CODE, PACKAGES),
             "target": target.to_data(),
             "optics": optics,
             "frequencies_hz": list(camera.frequencies_hz),

@@ -19,6 +19,10 @@ FINE = 16
 """Strata per side where a footprint meets an edge: one of 256 sub-rays is 0.4 % of a step."""
 
 
+KINK_M = 2e-5
+"""Sub-rays of one pixel that leave a plane by more have met an edge, such as that of a strip of tape."""
+
+
 @dataclass(frozen=True)
 class Hits:
     """What n rays from the lens met: true range, path out and back, amplitude of direct light, surface, texture place.
@@ -136,7 +140,7 @@ def _needs_fine(hits: Hits, coverage: np.ndarray, shape: tuple[int, int]) -> np.
     with np.errstate(invalid="ignore"):
         bend = np.abs(grid[:, 0, 0] + grid[:, -1, -1] - grid[:, 0, -1] - grid[:, -1, 0])
         bend = np.maximum(bend, np.abs(grid[:, 0, 0] + grid[:, -1, -1] - grid[:, 1, 1] - grid[:, 2, 2]))
-    kinked = ~(bend < 1e-4)
+    kinked = ~(bend < KINK_M)
     flagged = (uneven | kinked).reshape(h, w) | (coverage < 1)
     return np.asarray(ndimage.binary_dilation(flagged, np.ones((3, 3), bool)))
 

@@ -19,14 +19,13 @@ def load_mitsuba() -> Any:
     Dr.Jit 1.5 aborts the process at the first kernel with LLVM 14 to 16, so the LLVM of the wheel
     karellen-llvm-core is preferred to the system's; a path in DRJIT_LIBLLVM_PATH has the last word.
     """
-    _point_to_llvm()
     import mitsuba as mi
 
-    if mi.variant() in VARIANTS:
+    if mi.variant() in VARIANTS or _works(mi, "cuda_ad_mono"):
         return mi
-    for name in VARIANTS:
-        if _works(mi, name):
-            return mi
+    _point_to_llvm()
+    if _works(mi, "llvm_ad_mono"):
+        return mi
     if "open3d" in sys.modules:
         # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
         raise UserError(

@@ -20,9 +20,6 @@ from scenes.sensor.camera import AmcwCamera
 from scenes.target.mesh import Target
 from scenes.view import NoiseFreeView
 
-RENDER_VERSION = 1
-"""Raised by every change that can change a rendered number: it is part of the cache's key."""
-
 RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
 
@@ -135,7 +132,7 @@ def _face_light(
     """Indirect light of the pixels on the face (f + 1, n) and its noise (n,), from nodes on the undamaged face.
 
     Nodes float 1 mm above the face, so that tape does not bury them; what a node would see of a hole is taken as if the
-    face were whole, an error of at most the light from the hole's solid angle (measured: tests/test_render.py).
+    face were whole: an error of the order of the light from the hole's solid angle.
     """
     points = np.concatenate([slopes[face], np.ones((int(face.sum()), 1))], axis=-1)
     points *= (direct.range_m[face] / np.linalg.norm(points, axis=-1))[:, None]
