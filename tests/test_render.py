@@ -12,6 +12,7 @@ import trimesh
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from scenes.render import direct, variant
 from scenes.render.cache import cached_view, read_view, render_key
 from scenes.render.direct import cast, direct_light
 from scenes.render.indirect import gather_at_points, gather_in_pixels
@@ -283,3 +284,29 @@ def test_open3d_before_mitsuba_is_told_apart_from_a_missing_llvm():
     if "cannot open shared object file" in done.stderr:
         pytest.skip("Open3D lacks a system library")
     assert done.returncode == 0 or "Open3D was imported before it" in done.stderr
+
+
+def test_no_llvm_at_all_names_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(sys, "base_prefix", str(tmp_path))
+    monkeypatch.setattr(variant, "_system_has_recent_llvm", lambda: False)
+    mistake = variant._point_to_llvm()
+    assert mistake is not None
+    assert "karellen-llvm-core" in str(mistake)
+
+
+def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
+    """4 x 4 strata (16 x 16 at edges) against 32 x 32 in every pixel of three strips, two of them with tape: range
+    from the fused phases, on the face away from holes and rim."""
+    target = build_target(SMALL)
+    lit, lens, region = scene_of(*target.parts), CAMERA.nominal_lens, thesis_view.region
+    f = np.array(CAMERA.frequencies_hz)[:, None]
+    for top in (15, 30, 72):
+        rows, cols = (a.ravel() for a in np.meshgrid(np.arange(top, top + 4), np.arange(20, 400), indexing="ij"))
+        fine, _ = direct._sums(cast(lit, direct._strata(lens, region, rows, cols, 32)), 32**2, CAMERA.frequencies_hz)
+        turned = np.angle(thesis_view.phasor_direct[:, rows, cols] / fine)
+        error_m = (SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turned).sum(axis=0)
+        away = np.abs(thesis_view.range_m[rows, cols] - np.median(thesis_view.range_m[rows, cols])) < 0.2
+        assert np.sqrt((error_m[away] ** 2).mean()) < 2e-6
+        assert np.abs(error_m[away]).max() < 1e-5

@@ -19,11 +19,14 @@ def load_mitsuba() -> Any:
     Dr.Jit 1.5 aborts the process at the first kernel with LLVM 14 to 16, so the LLVM of the wheel
     karellen-llvm-core is preferred to the system's; a path in DRJIT_LIBLLVM_PATH has the last word.
     """
+    # Dr.Jit looks for LLVM when it is imported, so the path comes first; that there is none matters without a GPU only.
+    missing = _point_to_llvm()
     import mitsuba as mi
 
     if mi.variant() in VARIANTS or _works(mi, "cuda_ad_mono"):
         return mi
-    _point_to_llvm()
+    if missing is not None:
+        raise missing
     if _works(mi, "llvm_ad_mono"):
         return mi
     if "open3d" in sys.modules:
@@ -60,27 +63,29 @@ def _has_nvidia_driver() -> bool:
     return Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
 
 
-def _point_to_llvm() -> None:
+def _point_to_llvm() -> UserError | None:
+    """Set DRJIT_LIBLLVM_PATH where it is not set; the mistake to raise where no LLVM can be used."""
     if os.environ.get("DRJIT_LIBLLVM_PATH"):
         named = Path(os.environ["DRJIT_LIBLLVM_PATH"])
         if not named.exists():
-            raise UserError(
+            return UserError(
                 f"DRJIT_LIBLLVM_PATH names {named}, which does not exist",
                 legal="the path of a libLLVM shared library, version 17 or newer",
                 fix="mend or unset DRJIT_LIBLLVM_PATH",
             )
-        return
+        return None
     for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
         found = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
         if found:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
-            return
+            return None
     if sys.platform == "linux" and not _system_has_recent_llvm():
-        raise UserError(
+        return UserError(
             "no LLVM was found that Dr.Jit can use",
             legal="LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)",
             fix="pip install karellen-llvm-core (Linux x86-64), or apt install libllvm19, or set DRJIT_LIBLLVM_PATH",
         )
+    return None
 
 
 def _system_has_recent_llvm() -> bool:
