@@ -245,7 +245,7 @@ def _largest(counts: pd.Series) -> int | None:
 
 
 def _spread(mean: float, std: float) -> str:
-    return "–" if mean != mean else f"{mean:.2f} ± {std:.2f}"
+    return "–" if mean != mean else f"{mean:.2f}\u00a0±\u00a0{std:.2f}"
 
 
 def _short(label: str) -> str:
