@@ -1,4 +1,4 @@
-"""The thesis' claims as criteria that were fixed before any number was seen: one function a claim, each a verdict.
+"""The thesis' claims as criteria that are the same for every run: one function a claim, each a verdict.
 
 A verdict needs certainty in either direction: where an interval leaves room for both, it is "undecided". Nothing here
 is a parameter of the experiment, and nothing is chosen to make a claim come out.
