@@ -20,7 +20,8 @@ from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
 from scenes.render.view import render_view, target_region
-from scenes.sensor.camera import AmcwCamera, load_camera
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.camera import load_camera
 from scenes.target.declaration import TargetConfig, ThesisTargetConfig
 from scenes.target.mesh import Part, build_target
 
@@ -42,7 +43,7 @@ def frontal(z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo
 
 
 def scene_of(*parts: Part, camera=CAMERA):
-    return lit_scene(load_mitsuba(), parts, camera)
+    return lit_scene(load_mitsuba(), parts, camera.optics)
 
 
 SLOPES = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 21), np.linspace(-0.3, 0.3, 15)), axis=-1).reshape(-1, 2)
@@ -168,7 +169,7 @@ QUICK = RenderConfig(face_samples=1024, hole_samples=64, rest_samples=16, bounce
 
 @pytest.fixture(scope="module")
 def thesis_view():
-    return render_view(build_target(SMALL), CAMERA, QUICK)
+    return render_view(build_target(SMALL), CAMERA.optics, QUICK)
 
 
 def test_albedo_texture_is_looked_up_where_the_target_says(thesis_view):
@@ -204,7 +205,7 @@ def test_thesis_view_is_whole(thesis_view):
 
 
 def test_renders_repeat_exactly(thesis_view):
-    again = render_view(build_target(SMALL), CAMERA, QUICK)
+    again = render_view(build_target(SMALL), CAMERA.optics, QUICK)
     assert np.array_equal(again.phasor, thesis_view.phasor)
 
 
@@ -212,7 +213,7 @@ def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
     """Eight renders with other seeds: the spread of their ranges is what each reports, within 35 %, inside the holes
     where noise is white from pixel to pixel."""
     config = QUICK.model_copy(update={"face_samples": 64})
-    views = [render_view(build_target(SMALL), CAMERA, config.model_copy(update={"seed": s})) for s in range(8)]
+    views = [render_view(build_target(SMALL), CAMERA.optics, config.model_copy(update={"seed": s})) for s in range(8)]
     backing = views[0].surface == views[0].surface_names.index("backing")
     lit = backing & (np.abs(views[0].phasor_direct[0]) > 0.1)
     f = np.array(CAMERA.frequencies_hz)[:, None, None]
@@ -246,17 +247,17 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
 def test_target_out_of_view_is_refused():
     near = SMALL.model_copy(update={"pose": SMALL.pose.model_copy(update={"distance_m": 0.3})})
     with pytest.raises(UserError, match="covers columns"):
-        target_region(build_target(near), CAMERA)
+        target_region(build_target(near), CAMERA.optics)
 
 
 def test_cache_returns_the_same_view_and_heals_damage(tmp_path, thesis_view):
-    first, hit = cached_view(SMALL, CAMERA, QUICK, tmp_path)
+    first, hit = cached_view(SMALL, CAMERA.optics, QUICK, tmp_path)
     assert not hit
-    second, hit = cached_view(SMALL, CAMERA, QUICK, tmp_path)
+    second, hit = cached_view(SMALL, CAMERA.optics, QUICK, tmp_path)
     assert hit
     assert np.array_equal(first.phasor, second.phasor)
     assert second.region == first.region
-    path = tmp_path / f"{render_key(SMALL, CAMERA, QUICK)}.npz"
+    path = tmp_path / f"{render_key(SMALL, CAMERA.optics, QUICK)}.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert read_view(path) is None
@@ -264,18 +265,18 @@ def test_cache_returns_the_same_view_and_heals_damage(tmp_path, thesis_view):
     spoilt[len(whole) // 2] ^= 0xFF
     path.write_bytes(bytes(spoilt))
     assert read_view(path) is None
-    healed, hit = cached_view(SMALL, CAMERA, QUICK, tmp_path)
+    healed, hit = cached_view(SMALL, CAMERA.optics, QUICK, tmp_path)
     assert not hit
     assert np.array_equal(healed.phasor, first.phasor)
 
 
 def test_cache_key_changes_with_what_matters_only():
-    base = render_key(SMALL, CAMERA, QUICK)
-    assert render_key(SMALL.hole_free(), CAMERA, QUICK) != base
-    assert render_key(SMALL, CAMERA, QUICK.model_copy(update={"bounces": 2})) != base
+    base = render_key(SMALL, CAMERA.optics, QUICK)
+    assert render_key(SMALL.hole_free(), CAMERA.optics, QUICK) != base
+    assert render_key(SMALL, CAMERA.optics, QUICK.model_copy(update={"bounces": 2})) != base
     gate = CAMERA.engine.edge_threshold.model_copy(update={"value": 9.0})
     engine = CAMERA.engine.model_copy(update={"edge_threshold": gate})
-    assert render_key(SMALL, CAMERA.model_copy(update={"engine": engine}), QUICK) == base
+    assert render_key(SMALL, CAMERA.model_copy(update={"engine": engine}).optics, QUICK) == base
 
 
 def test_open3d_before_mitsuba_is_told_apart_from_a_missing_llvm():

@@ -11,18 +11,19 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
-from scenes.sensor import kernels
-from scenes.sensor.amcw import AmcwImager
+from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_signal
 from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, load_camera, read_camera
+from scenes.sensor.effects import NONE
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unwrap import unwrap_table
 
 f4 = np.float32
 CAMERA = load_camera("azure_kinect_nfov")
 NEAR_AXIS = Region(300, 360, 280, 360)
-QUIET = CameraConfig(noise=False, fixed_pattern_scale=0.0)
-CLEAN = CameraConfig(fixed_pattern_scale=0.0)
+QUIET = CameraConfig(effects=NONE.model_copy(update={"multipath": True, "saturation": True}))
+CLEAN = CameraConfig(effects=QUIET.effects.model_copy(update={"noise": True, "ambient": True}))
 
 
 def unit_at(distance_m: float, albedo: float = 0.6, config: CameraConfig = CLEAN, region: Region = NEAR_AXIS):
@@ -220,7 +221,10 @@ def test_fixed_pattern_has_the_size_and_length_of_its_facts():
 def test_fixed_pattern_belongs_to_the_unit_not_to_the_region():
     small, large = Region(300, 340, 300, 360), Region(290, 350, 280, 380)
     views = [plane_view(CAMERA, region, 0.8, 0.6, 0.05, 0.02) for region in (small, large)]
-    a, b = (SimulatedUnit(CAMERA, CameraConfig(noise=False), view) for view in views)
+    a, b = (
+        SimulatedUnit(CAMERA, CameraConfig(effects=NONE.model_copy(update={"fixed_pattern": True})), view)
+        for view in views
+    )
     assert np.array_equal(stack(a, 1)[0], stack(b, 1)[0][a.region.within(b.region)])
 
 

@@ -18,7 +18,7 @@ from harness.vocabulary.sources import source_digest
 from harness.vocabulary.units import MM
 from scenes.render.cache import render_key
 from scenes.render.settings import RenderConfig
-from scenes.sensor.camera import load_camera
+from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
 
 CODE = ("detectors", "harness/engine", "harness/evaluation", "harness/vocabulary", "scenes")
@@ -31,14 +31,14 @@ class RenderJob:
     """One view to render, or to find in the cache."""
 
     target: TargetConfig
-    camera: str
+    camera: CameraConfig
     config: RenderConfig
     folder: Path
 
     @cached_property
     def path(self) -> Path:
         """Where the cache keeps it."""
-        return self.folder / f"{render_key(self.target, load_camera(self.camera), self.config)}.npz"
+        return self.folder / f"{render_key(self.target, camera_of(self.camera).optics, self.config)}.npz"
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
             fix="declare source.target.holes or source.target.dents",
         )
     damaged, hole_free = (
-        RenderJob(declared, source.camera.name, source.render, cache) for declared in (target, target.hole_free())
+        RenderJob(declared, source.camera, source.render, cache) for declared in (target, target.hole_free())
     )
     ref = SetUpRef(str(damaged.path), str(hole_free.path), source.camera, target)
     return Group(points, damaged, hole_free, ref, points[0].config.seed)

@@ -116,7 +116,7 @@ class _Run:
     def start(self) -> None:
         """Submit every render; a group's trials follow when both its views are there."""
         for job in self.plan.renders:
-            arguments = (job.target.to_data(), job.camera, job.config.to_data(), str(job.folder))
+            arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
             self.pending[self.renderer.submit(workers.render, *arguments)] = _Render(job)
         self._tell()
 

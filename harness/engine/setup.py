@@ -16,7 +16,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.units import MM
 from scenes.render.cache import read_view
-from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.face import face_of
@@ -108,7 +108,7 @@ def _z_m(unit: SimulatedUnit) -> np.ndarray:
 @lru_cache(maxsize=4)
 def load_set_up(ref: SetUpRef) -> SetUp:
     """The set-up behind a reference, kept for the worker's next trials."""
-    camera = load_camera(ref.camera.name)
+    camera = camera_of(ref.camera)
     T_camera_board = T_camera_board_of(ref.target.pose)
     return SetUp(
         damaged=SimulatedUnit(camera, ref.camera, _stored_view(ref.damaged_path)),

@@ -40,16 +40,17 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def render(target_data: dict[str, Any], camera: str, render_data: dict[str, Any], folder: str) -> tuple[bool, float]:
+def render(
+    target_data: dict[str, Any], camera_data: dict[str, Any], render_data: dict[str, Any], folder: str
+) -> tuple[bool, float]:
     """Render a view into the cache, in a process of its own. Returns whether it was there, and its seconds."""
     from pathlib import Path
 
     from scenes.render.cache import cached_view
     from scenes.render.settings import RenderConfig
-    from scenes.sensor.camera import load_camera
+    from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.custom import TargetConfig
 
-    view, found = cached_view(
-        TargetConfig.from_data(target_data), load_camera(camera), RenderConfig.from_data(render_data), Path(folder)
-    )
+    target, optics = TargetConfig.from_data(target_data), camera_of(CameraConfig.from_data(camera_data)).optics
+    view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
     return found, view.seconds

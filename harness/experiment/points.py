@@ -15,7 +15,7 @@ from harness.experiment import recorded
 from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
 from harness.experiment.yaml_source import Source
 from harness.vocabulary.seeds import digest
-from scenes.sensor.camera import camera_digest, load_camera
+from scenes.sensor.camera import camera_digest, camera_of
 
 MAIN = "main"
 """The variant of every point that is not a variation of the sensitivity study."""
@@ -80,7 +80,7 @@ def point_of(
 def source_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
     """What decides the frames of a source, seeds aside: the full target and the camera's numbers, or files' content."""
     if isinstance(source, SimulatedSource):
-        camera = {**source.camera.to_data(), "facts": camera_digest(load_camera(source.camera.name))}
+        camera = {**source.camera.to_data(), "facts": camera_digest(camera_of(source.camera))}
         return {
             "kind": source.kind,
             "target": source.target.declare().to_data(),
@@ -94,11 +94,8 @@ def render_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
     """What decides the noise-free render: the target, the lens, the emitter, the modulation and the window's margin."""
     if not isinstance(source, SimulatedSource):
         return source_content(source)
-    camera = load_camera(source.camera.name)
-    optics = [camera.lens, camera.emitter, camera.modulation]
     return {
         "target": source.target.declare().to_data(),
-        "optics": [part.to_data() for part in optics],
-        "margin_px": camera.margin_px,
+        "optics": camera_of(source.camera).optics.content(),
         "render": source.render.to_data(),
     }

@@ -15,14 +15,14 @@ from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
+from scenes.optics import Optics
 from scenes.render.settings import RenderConfig
 from scenes.render.view import render_view
-from scenes.sensor.camera import AmcwCamera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import build_target
 from scenes.view import NoiseFreeView
 
-CODE = ("scenes/render", "scenes/target", "harness/vocabulary")
+CODE = ("scenes/render", "scenes/target", "scenes/optics.py", "scenes/view.py", "harness/vocabulary")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numpy", "scipy")
 """What decides a render's numbers beside its declaration. The variant (GPU or processor) is left out: it changes them
 by 1e-6."""
@@ -30,36 +30,31 @@ by 1e-6."""
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 
 
-def render_key(target: TargetConfig, camera: AmcwCamera, config: RenderConfig) -> str:
-    """Digest of what a render depends on: target, optics and frequencies of the camera, work, and the code itself.
+def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
+    """Digest of what a render depends on: target, optics of the camera, work, and the code itself.
 
     The sensor's noise and engine are left out: cameras that differ there share renders.
     """
-    optics = {part: camera.to_data()[part] for part in ("lens", "emitter")}
     return digest(
         {
             "code": source_digest(CODE, PACKAGES),
             "target": target.to_data(),
-            "optics": optics,
-            "frequencies_hz": list(camera.frequencies_hz),
-            "margin_px": camera.margin_px,
+            "optics": optics.content(),
             "render": config.to_data(),
         }
     )
 
 
-def cached_view(
-    target: TargetConfig, camera: AmcwCamera, config: RenderConfig, folder: Path
-) -> tuple[NoiseFreeView, bool]:
+def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path) -> tuple[NoiseFreeView, bool]:
     """The view of a declared target, and whether it came from the cache. A damaged file is rendered again.
 
     Raises UserError as `build_target` and `render_view` do, and where the folder cannot be written.
     """
-    path = folder / f"{render_key(target, camera, config)}.npz"
+    path = folder / f"{render_key(target, optics, config)}.npz"
     found = read_view(path)
     if found is not None:
         return found, True
-    view = render_view(build_target(target), camera, config)
+    view = render_view(build_target(target), optics, config)
     write_view(path, view)
     return view, False
 

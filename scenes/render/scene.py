@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.sensor.camera import AmcwCamera
+from scenes.optics import Optics
 from scenes.target.mesh import Part
 
 
@@ -63,7 +63,7 @@ class LitScene:
         return dr.select(lit, cone * cosine / squared, 0), distance
 
 
-def lit_scene(mi: Any, parts: Sequence[Part], camera: AmcwCamera) -> LitScene:
+def lit_scene(mi: Any, parts: Sequence[Part], optics: Optics) -> LitScene:
     """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo."""
     import drjit as dr
 
@@ -77,14 +77,13 @@ def lit_scene(mi: Any, parts: Sequence[Part], camera: AmcwCamera) -> LitScene:
     identity = np.zeros(int(registered.max()) + 1, np.uint32)
     for shape, number in zip(shapes, registered, strict=True):
         identity[number] = names.index(shape.id())
-    emitter = camera.emitter
     return LitScene(
         mi=mi,
         scene=scene,
         names=names,
-        emitter_m=camera.emitter_position_m,
-        cos_full=float(np.cos(np.deg2rad(emitter.full_half_angle_deg.value))),
-        cos_cutoff=float(np.cos(np.deg2rad(emitter.cutoff_half_angle_deg.value))),
+        emitter_m=optics.emitter_m,
+        cos_full=float(np.cos(np.deg2rad(optics.full_half_angle_deg))),
+        cos_cutoff=float(np.cos(np.deg2rad(optics.cutoff_half_angle_deg))),
         _identity=mi.UInt32(identity),
     )
 

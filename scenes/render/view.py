@@ -11,12 +11,12 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, invert, rotate_vectors, transform_points
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
+from scenes.optics import Optics
 from scenes.render.direct import DirectLight, direct_light, surface_rgb
 from scenes.render.indirect import between_nodes, gather_at_points, gather_in_pixels
 from scenes.render.scene import LitScene, lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
-from scenes.sensor.camera import AmcwCamera
 from scenes.target.mesh import Target
 from scenes.view import NoiseFreeView
 
@@ -24,9 +24,9 @@ RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
 
 
-def target_region(target: Target, camera: AmcwCamera) -> Region:
+def target_region(target: Target, optics: Optics) -> Region:
     """The sensor region that sees the target. Raises UserError where part of it lies outside the sensor or behind."""
-    lens = camera.nominal_lens
+    lens = optics.lens
     outline = transform_points(target.T_camera_board, target.outline_board_m)
     if outline[:, 2].min() <= 0.05:
         raise UserError(
@@ -39,31 +39,31 @@ def target_region(target: Target, camera: AmcwCamera) -> Region:
     if low.min() < 0 or high[0] > lens.width or high[1] > lens.height:
         raise UserError(
             f"the target covers columns {low[0]}..{high[0]} and rows {low[1]}..{high[1]}",
-            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {camera.title}",
+            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {optics.title}",
             fix="move the target away (distance), towards the axis (offset), or make it smaller",
         )
     tight = Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
-    return tight.grown(RIM_PX + camera.margin_px, lens.height, lens.width)
+    return tight.grown(RIM_PX + optics.margin_px, lens.height, lens.width)
 
 
-def render_view(target: Target, camera: AmcwCamera, config: RenderConfig) -> NoiseFreeView:
+def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFreeView:
     """The noise-free view of a target by a camera. Raises UserError as `target_region` and `load_mitsuba` do."""
     began = time.perf_counter()
     mi = load_mitsuba()
-    region = target_region(target, camera)
-    lens = camera.nominal_lens
-    lit = lit_scene(mi, target.parts, camera)
-    direct = direct_light(lit, lens, region, camera.frequencies_hz)
+    region = target_region(target, optics)
+    lens = optics.lens
+    lit = lit_scene(mi, target.parts, optics)
+    direct = direct_light(lit, lens, region, optics.frequencies_hz)
     slopes = lens.region_slopes(region)
     phasor, intensity = direct.phasor.copy(), direct.intensity.copy()
     noise_m = np.zeros(region.shape)
     if config.bounces > 0:
-        indirect, noise_m = _indirect(lit, target, camera, region, slopes, direct, config)
+        indirect, noise_m = _indirect(lit, target, optics, region, slopes, direct, config)
         phasor += indirect[:-1]
         intensity += indirect[-1].real
     return NoiseFreeView(
         region=region,
-        frequencies_hz=camera.frequencies_hz,
+        frequencies_hz=optics.frequencies_hz,
         phasor=phasor,
         phasor_direct=direct.phasor,
         intensity=intensity,
@@ -95,24 +95,24 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 def _indirect(
     lit: LitScene,
     target: Target,
-    camera: AmcwCamera,
+    optics: Optics,
     region: Region,
     slopes: np.ndarray,
     direct: DirectLight,
     config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indirect phasors (f + 1, h, w) and their noise in metres of range (h, w)."""
-    frequencies = camera.frequencies_hz
+    frequencies = optics.frequencies_hz
     shape = region.shape
     indirect = np.zeros((len(frequencies) + 1, *shape), complex)
     noise_m = np.zeros(shape)
     face = _on_face(target, direct, slopes)
     if face.any():
         indirect[:, face], noise_m[face] = _face_light(lit, target, frequencies, slopes, direct, face, config)
-    inside = _inside_outline(target, camera.nominal_lens, region)
+    inside = _inside_outline(target, optics.lens, region)
     for pixels, samples in ((~face & inside, config.hole_samples), (~face & ~inside, config.rest_samples)):
         if pixels.any():
-            corners = _pixel_corners(camera.nominal_lens, region, pixels)
+            corners = _pixel_corners(optics.lens, region, pixels)
             light = gather_in_pixels(lit, corners, frequencies, samples, config.bounces, config.seed)
             indirect[:, pixels] = light.mean
             total = direct.phasor[:, pixels] + light.mean[:-1]

@@ -14,7 +14,9 @@ from scipy import optimize
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
-from scenes.sensor.camera import AmcwCamera, CameraConfig, load_camera
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.effects import NONE
 from scenes.sensor.source import SimulatedUnit
 
 
@@ -34,7 +36,7 @@ def temporal_sigma_m(camera: AmcwCamera, distance_m: float, albedo: float, frame
     lens = camera.nominal_lens
     row, col = int(lens.cy), int(lens.cx)
     view = plane_view(camera, Region(row - 24, row + 24, col - 40, col + 40), distance_m, albedo, 0.05, 0.02)
-    unit = SimulatedUnit(camera, CameraConfig(fixed_pattern_scale=0.0), view)
+    unit = SimulatedUnit(camera, CameraConfig(effects=NONE.model_copy(update={"noise": True, "ambient": True})), view)
     z = np.stack([frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]).astype(float)
     return float(np.sqrt(np.nanvar(z, axis=0, ddof=1).mean()))
 

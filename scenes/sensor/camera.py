@@ -3,182 +3,27 @@
 from __future__ import annotations
 
 import difflib
-from functools import cached_property, lru_cache
+from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any
 
-import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.seeds import digest
-from harness.vocabulary.units import MM
+from harness.vocabulary.seeds import canonical_json, digest
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.effects import EffectsConfig
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 
-T = TypeVar("T")
-Positive = Field(gt=0)
+AnyCamera = AmcwCamera
+"""Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
 
-
-class Fact(Config, Generic[T]):
-    """One number of a camera with where it comes from.
-
-    ``tag``: R read in the named public source, D derived from such, S one secondary source, W measured on public
-    captures of a real unit, C calibrated at the calibration point, M a guess.
-    """
-
-    value: T
-    tag: Literal["R", "D", "S", "W", "C", "M"]
-    source: str
-
-
-class LensFacts(Config):
-    """The nominal lens; ``distortion`` is k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV's rational model."""
-
-    width_px: Fact[int]
-    height_px: Fact[int]
-    fx_px: Fact[float]
-    fy_px: Fact[float]
-    cx_px: Fact[float]
-    cy_px: Fact[float]
-    distortion: Fact[tuple[float, float, float, float, float, float, float, float]]
-
-    def lens(self) -> Lens:
-        """The lens in the program's own type."""
-        return Lens(
-            self.width_px.value,
-            self.height_px.value,
-            self.fx_px.value,
-            self.fy_px.value,
-            self.cx_px.value,
-            self.cy_px.value,
-            self.distortion.value,
-        )
-
-
-class EmitterFacts(Config):
-    """The light source: a point beside the lens, uniform intensity in a cone with a linear roll-off."""
-
-    position_mm: Fact[tuple[float, float, float]]
-    full_half_angle_deg: Fact[float]
-    cutoff_half_angle_deg: Fact[float]
-    mask_slopes: Fact[tuple[tuple[float, float], ...]]
-
-
-class ModulationFacts(Config):
-    """Continuous-wave modulation."""
-
-    frequencies_hz: Fact[tuple[float, ...]]
-    phases: Fact[int]
-    contrast: Fact[tuple[float, ...]]
-
-
-class PhotonFacts(Config):
-    """The photon budget: one gain, calibrated at one point; the rest is physics."""
-
-    signal_electrons: Fact[float]
-    calibration_sigma_mm: Fact[float]
-    calibration_distance_m: Fact[float]
-    calibration_albedo: Fact[float]
-    ambient_electrons: Fact[float]
-    read_noise_electrons: Fact[float]
-    electrons_per_unit: Fact[float]
-
-
-class ConverterFacts(Config):
-    """Companding converter: unit steps below the knee, then steps that double with each octave."""
-
-    knee_units: Fact[int]
-    full_scale_units: Fact[int]
-
-
-class FixedPatternFacts(Config):
-    """What is the same in every frame of one unit: a smooth and a per-pixel error of range."""
-
-    smooth_mm: Fact[float]
-    smooth_length_px: Fact[float]
-    pixel_mm: Fact[float]
-
-
-class EngineFacts(Config):
-    """The depth engine: phase-space filter, gates, output."""
-
-    window_px: Fact[int]
-    concentration: Fact[float]
-    dim_amplitude_units: Fact[float]
-    edge_threshold: Fact[float]
-    lattice_residual_turns: Fact[float]
-    amplitude_ratio: Fact[float]
-    min_amplitude_units: Fact[float]
-    min_amplitude_sum_units: Fact[float]
-    min_reflectivity_units_mm2: Fact[float]
-    min_range_mm: Fact[float]
-    max_range_mm: Fact[float]
-    output_step_mm: Fact[float]
-
-
-class AmcwCamera(Config):
-    """A continuous-wave time-of-flight imager: everything that its model needs, as data."""
-
-    name: str
-    title: str
-    kind: Literal["amcw_imager"]
-    lens: LensFacts
-    emitter: EmitterFacts
-    modulation: ModulationFacts
-    photons: PhotonFacts
-    converter: ConverterFacts
-    fixed_pattern: FixedPatternFacts
-    engine: EngineFacts
-
-    @model_validator(mode="after")
-    def _possible(self) -> AmcwCamera:
-        must_be_positive: dict[str, Any] = {
-            "lens.width_px": self.lens.width_px,
-            "lens.height_px": self.lens.height_px,
-            "lens.fx_px": self.lens.fx_px,
-            "lens.fy_px": self.lens.fy_px,
-            "photons.signal_electrons": self.photons.signal_electrons,
-            "photons.electrons_per_unit": self.photons.electrons_per_unit,
-            "engine.window_px": self.engine.window_px,
-            "engine.output_step_mm": self.engine.output_step_mm,
-        }
-        for key, fact in must_be_positive.items():
-            if not fact.value > 0:
-                raise ValueError(f"{key} must be above 0, not {fact.value}")
-        if min(self.modulation.frequencies_hz.value) <= 0:
-            raise ValueError("modulation.frequencies_hz must all be above 0")
-        if len(self.modulation.contrast.value) != len(self.modulation.frequencies_hz.value):
-            raise ValueError("modulation.contrast needs one value for each of modulation.frequencies_hz")
-        if self.modulation.phases.value < 3:
-            raise ValueError("modulation.phases must be at least 3 to tell phase, amplitude and offset apart")
-        if self.engine.window_px.value % 2 == 0:
-            raise ValueError("engine.window_px must be odd")
-        return self
-
-    @cached_property
-    def nominal_lens(self) -> Lens:
-        """The lens of the file."""
-        return self.lens.lens()
-
-    @cached_property
-    def emitter_position_m(self) -> np.ndarray:
-        """(3,) in the camera's frame."""
-        return np.array(self.emitter.position_mm.value) * MM
-
-    @property
-    def frequencies_hz(self) -> tuple[float, ...]:
-        """Modulation frequencies in the file's order."""
-        return self.modulation.frequencies_hz.value
-
-    @property
-    def margin_px(self) -> int:
-        """Pixels beyond a region whose light reaches it through the engine's window."""
-        return self.engine.window_px.value // 2
+_ADAPTER: TypeAdapter[AnyCamera] = TypeAdapter(AnyCamera)
 
 
 class CameraConfig(Config):
@@ -186,7 +31,7 @@ class CameraConfig(Config):
 
     name: str = Field("azure_kinect_nfov", description="a file of scenes/cameras/ without its ending")
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
-    noise: bool = Field(True, description="photon and read noise; false for the noise-free engine")
+    effects: EffectsConfig = EffectsConfig()
     fixed_pattern_scale: float = Field(
         1.0, ge=0, le=100, description="times the file's fixed pattern; 0 switches it off"
     )
@@ -194,6 +39,15 @@ class CameraConfig(Config):
         True,
         description="whether the engine's edge threshold acts; its rule is an inference, so studies vary it",
     )
+    minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="how far the unit has warmed up")
+    numbers: dict[str, Any] = Field(
+        default_factory=dict,
+        description="numbers of the camera's file to replace, such as lens.fx_px: 505.1, for one's own unit",
+    )
+
+    def __hash__(self) -> int:
+        # A mapping has no hash of its own, and workers keep by its declaration what they made of a camera.
+        return hash(canonical_json(self.to_data()))
 
 
 def camera_names() -> tuple[str, ...]:
@@ -202,7 +56,7 @@ def camera_names() -> tuple[str, ...]:
 
 
 @lru_cache
-def load_camera(name: str) -> AmcwCamera:
+def load_camera(name: str) -> AnyCamera:
     """The camera of that name. Raises UserError for an unknown name or a file that does not describe a camera."""
     path = CAMERA_FOLDER / f"{name}.yaml"
     if name not in camera_names():
@@ -215,7 +69,44 @@ def load_camera(name: str) -> AmcwCamera:
     return read_camera(path)
 
 
-def read_camera(path: Path) -> AmcwCamera:
+def camera_of(config: CameraConfig) -> AnyCamera:
+    """The camera that an experiment declares: its file, with the numbers that the experiment replaces.
+
+    Raises UserError as `load_camera` does, and naming each replaced number that does not exist or is impossible.
+    """
+    return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
+
+
+@lru_cache
+def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
+    import json
+
+    data = load_camera(name).to_data()
+    for path, value in json.loads(numbers_json).items():
+        at: Any = data
+        for key in path.split("."):
+            at = at.get(key) if isinstance(at, dict) else None
+        if not (isinstance(at, dict) and "value" in at):
+            near = difflib.get_close_matches(path, list(number_paths(data)), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise UserError(
+                f"source.camera.numbers: {name} has no number {path!r}{hint}",
+                legal=f"a number of scenes/cameras/{name}.yaml, such as lens.fx_px",
+            )
+        at.update(value=value, tag="U", source="set by the experiment")
+    return _validated(data, f"source.camera.numbers, put into {name},")
+
+
+def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Dotted paths of all numbers of a camera's plain data."""
+    paths: list[str] = []
+    for key, value in data.items():
+        if isinstance(value, dict):
+            paths += [prefix + key] if "value" in value else number_paths(value, f"{prefix}{key}.")
+    return paths
+
+
+def read_camera(path: Path) -> AnyCamera:
     """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
     try:
         data = YAML(typ="safe", pure=True).load(path.read_text())
@@ -223,13 +114,17 @@ def read_camera(path: Path) -> AmcwCamera:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     except YAMLError as error:
         raise UserError(f"{path}: is no valid YAML: {error}") from error
+    return _validated(data, str(path))
+
+
+def _validated(data: Any, where: str) -> AnyCamera:
     try:
-        return AmcwCamera.from_data(data)
+        return _ADAPTER.validate_python(data)
     except ValidationError as error:
         lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        raise UserError(f"{path} does not describe a camera:\n" + "\n".join(lines)) from error
+        raise UserError(f"{where} does not describe a camera:\n" + "\n".join(lines)) from error
 
 
-def camera_digest(camera: AmcwCamera) -> str:
-    """Digest of a camera's file: its numbers, tags and sources."""
+def camera_digest(camera: AnyCamera) -> str:
+    """Digest of a camera's numbers, tags and sources."""
     return digest(camera.to_data())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +13,9 @@ from harness.vocabulary.capture import Frame
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
-from scenes.sensor.amcw import AmcwImager, Exposure
-from scenes.sensor.camera import AmcwCamera, CameraConfig
+from scenes.sensor.camera import AnyCamera, CameraConfig
+from scenes.sensor.model import SensorModel, model_of
+from scenes.sensor.unit import frame_errors_m
 from scenes.view import NoiseFreeView
 
 
@@ -22,24 +23,24 @@ from scenes.view import NoiseFreeView
 class SimulatedUnit:
     """One unit of a camera before one view: everything that frames share. Build once, then `capture` many times."""
 
-    camera: AmcwCamera
+    camera: AnyCamera
     config: CameraConfig
     view: NoiseFreeView
 
     @cached_property
-    def imager(self) -> AmcwImager:
-        """The imager on the view's region."""
-        return AmcwImager(self.camera, self.config, self.view.region, self.view.slopes)
+    def model(self) -> SensorModel:
+        """The camera's model on the view's region."""
+        return model_of(self.camera, self.config, self.view.region, self.view.slopes)
 
     @cached_property
-    def exposure(self) -> Exposure:
-        """The noise-free samples."""
-        return self.imager.expose(self.view)
+    def exposure(self) -> Any:
+        """What the model keeps of the view for all frames."""
+        return self.model.expose(self.view)
 
     @cached_property
     def region(self) -> Region:
         """The view's region less the margin whose filter window is cut, except at the sensor's own border."""
-        outer, lens, m = self.view.region, self.camera.nominal_lens, self.camera.margin_px
+        outer, lens, m = self.view.region, self.camera.nominal_lens, self.camera.optics.margin_px
         return Region(
             outer.row0 + (m if outer.row0 > 0 else 0),
             outer.row1 - (m if outer.row1 < lens.height else 0),
@@ -99,14 +100,16 @@ class SimulatedCapture:
     @property
     def z_step_m(self) -> float:
         """The rounding step of the output."""
-        return self.unit.camera.engine.output_step_mm.value * MM
+        return self.unit.camera.z_step_m
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames; each call repeats the same noise."""
         rng = random_stream(self.seed, "frames", *self.labels)
+        camera, effects = self.unit.camera, self.unit.config.effects
+        errors_m = frame_errors_m(camera.unit, effects, random_stream(self.seed, "frame errors", *self.labels))
         cut = self.unit.cut
         for number in range(self.n_frames):
-            decoded = self.unit.imager.frame(self.unit.exposure, rng)
+            decoded = self.unit.model.frame(self.unit.exposure, rng, next(errors_m))
             yield Frame(
                 name=f"frame {number}",
                 z_m=decoded.z_m[cut],

@@ -16,8 +16,8 @@ from detectors.average import AverageConfig, RunningAverage
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
-from scenes.sensor import kernels
-from scenes.sensor.amcw import AmcwImager, Exposure
+from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw.imager import AmcwImager, Exposure
 from scenes.sensor.camera import CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 
@@ -119,7 +119,7 @@ def stages() -> Stages:
 @pytest.mark.parametrize("region", [BOARD, LENS.whole], ids=["30,000 pixels", "640 x 576"])
 def test_a_simulated_frame(benchmark: Any, region: Region) -> None:
     unit, rng = unit_on(region), random_stream(1)
-    decoded = benchmark(unit.imager.frame, unit.exposure, rng)
+    decoded = benchmark(unit.model.frame, unit.exposure, rng)
     assert np.isfinite(decoded.z_m).mean() > 0.3
 
 
@@ -131,7 +131,7 @@ def test_a_simulated_frame_of_30_000_pixels_added_to_an_average(benchmark: Any) 
     running = RunningAverage(capture, AverageConfig())
 
     def step() -> None:
-        unit.imager.frame(unit.exposure, rng)
+        unit.model.frame(unit.exposure, rng)
         running.add(frame)
 
     benchmark.pedantic(step, rounds=300, iterations=1, warmup_rounds=5)

@@ -25,8 +25,10 @@ from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
-from scenes.sensor.amcw import AmcwImager
-from scenes.sensor.camera import AmcwCamera, CameraConfig, load_camera
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.effects import NONE
 from scenes.sensor.source import SimulatedUnit
 
 LENS_CENTRE_PX = (332.0, 326.0)
@@ -39,6 +41,8 @@ BIN_M = 0.1
 LEAST_PIXELS = 300
 """Some 12 independent windows: the deviation of 22 frames is then known to 5 %."""
 LAGS = 5
+NOISE_ONLY = NONE.model_copy(update={"noise": True, "ambient": True})
+PATTERNED = NOISE_ONLY.model_copy(update={"fixed_pattern": True})
 UNIT_SEEDS = (1, 2, 3, 4, 5)
 SURFACE_DEGREE = 5
 BISQUARE = 4.685
@@ -274,7 +278,7 @@ def needed_albedo(wall: Wall, camera: AmcwCamera, start: float) -> float:
     measured = temporal_sigma_m(wall.z_m, wall.inner)
 
     def excess(log_albedo: float) -> float:
-        z_m = simulate(wall, camera, float(np.exp(log_albedo)), CameraConfig(fixed_pattern_scale=0.0))
+        z_m = simulate(wall, camera, float(np.exp(log_albedo)), CameraConfig(effects=NOISE_ONLY))
         return np.log(temporal_sigma_m(z_m, wall.inner) / measured)
 
     guess = np.log(start) + 2 * excess(np.log(start))
@@ -285,10 +289,12 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
     """Measure one wall, simulate it with the calibration point's albedo, and compare."""
     albedo = camera.photons.calibration_albedo.value
     everywhere = without_polygon(camera)
-    z_m = simulate(wall, everywhere, albedo, CameraConfig(fixed_pattern_scale=0.0))
+    z_m = simulate(wall, everywhere, albedo, CameraConfig(effects=NOISE_ONLY))
     average = wall.z_m.mean(axis=0)
     outside = AmcwImager(camera, CameraConfig(), wall.region, wall.slopes).outside_mask
-    patterned = (simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed)) for seed in UNIT_SEEDS)
+    patterned = (
+        simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed, effects=PATTERNED)) for seed in UNIT_SEEDS
+    )
     return WallCheck(
         wall,
         sigma_bins(wall, z_m, wall.mask, average, BIN_M),

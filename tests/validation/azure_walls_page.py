@@ -16,7 +16,7 @@ from harness.vocabulary.units import MM
 if TYPE_CHECKING:
     from azure_walls import FixedPattern, SigmaBin, WallCheck
 
-    from scenes.sensor.camera import AmcwCamera
+    from scenes.sensor.amcw.facts import AmcwCamera
 
 FIGURE = "azure_walls.svg"
 COLOURS = {"measured": INK, "simulated": ORANGE}

@@ -18,9 +18,12 @@ from scipy import ndimage
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
-from scenes.sensor import kernels
-from scenes.sensor.camera import AmcwCamera, CameraConfig
-from scenes.sensor.unwrap import UnwrapTable, unwrap_table
+from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.amcw.unwrap import UnwrapTable, unwrap_table
+from scenes.sensor.camera import CameraConfig
+from scenes.sensor.decoded import Decoded
+from scenes.sensor.unit import drift_m, static_error_m
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
@@ -36,15 +39,6 @@ class Exposure:
     means: np.ndarray
     sigma: np.ndarray
     shape: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """One frame from the engine: ``z_m`` (h, w) float32 with NaN where ``reason`` (h, w) uint8 is not VALID."""
-
-    z_m: np.ndarray
-    reason: np.ndarray
-    amplitude: np.ndarray
 
 
 class AmcwImager:
@@ -104,15 +98,24 @@ class AmcwImager:
         field = (facts.smooth_mm.value * smooth + facts.pixel_mm.value * pixel) * MM * self.config.fixed_pattern_scale
         return field[self.region.within(lens.whole)]
 
+    @cached_property
+    def static_error_m(self) -> np.ndarray:
+        """(h, w): all errors of range that frames of this unit share before the filter, as far as they are on."""
+        camera, config = self.camera, self.config
+        error = drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
+        error = error + static_error_m(camera.unit, config.effects, camera.name, config.unit_seed)
+        return np.asarray(error + self.fixed_pattern_m if config.effects.fixed_pattern else error)
+
     def expose(self, view: NoiseFreeView) -> Exposure:
         """The noise-free samples of a view that covers this imager's region."""
         photons = self.camera.photons
         electrons = photons.signal_electrons.value * self.gathered
         delay = np.exp(
-            1j * 2 * np.pi * self._frequencies[:, None, None] * (2 * self.fixed_pattern_m / SPEED_OF_LIGHT_AIR)
+            1j * 2 * np.pi * self._frequencies[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
         )
         contrast = np.array(self.camera.modulation.contrast.value)[:, None, None]
-        signal = contrast * electrons * view.phasor * delay / photons.electrons_per_unit.value
+        phasor = view.phasor if self.config.effects.multipath else view.phasor_direct
+        signal = contrast * electrons * phasor * delay / photons.electrons_per_unit.value
         samples = (
             signal.real[:, None] * self._cosines[None, :, None, None]
             + signal.imag[:, None] * self._sines[None, :, None, None]
@@ -120,15 +123,15 @@ class AmcwImager:
         variance = electrons * view.intensity + photons.ambient_electrons.value
         variance = variance + 2 * photons.read_noise_electrons.value**2
         sigma = np.sqrt(variance) / photons.electrons_per_unit.value
-        if not self.config.noise:
+        if not self.config.effects.noise:
             sigma = np.zeros_like(sigma)
         n = sigma.size
         return Exposure(
             samples.reshape(*samples.shape[:2], n).astype(f4), sigma.reshape(n).astype(f4), view.intensity.shape
         )
 
-    def frame(self, exposure: Exposure, rng: np.random.Generator) -> Decoded:
-        """One frame: noise from ``rng`` on the samples, then the depth engine."""
+    def frame(self, exposure: Exposure, rng: np.random.Generator, error_m: float = 0.0) -> Decoded:
+        """One frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
         n_frequencies, n_phases, n = exposure.means.shape
         normals = _standard_normals(rng, (n_frequencies, n_phases, n))
         unit = np.empty((2, n_frequencies, n), f4)
@@ -147,10 +150,10 @@ class AmcwImager:
             amplitude,
             saturated,
         )
-        return self._decode(unit, amplitude, saturated, exposure.shape)
+        return self._decode(unit, amplitude, saturated, exposure.shape, error_m)
 
     def _decode(
-        self, unit: np.ndarray, amplitude: np.ndarray, saturated: np.ndarray, shape: tuple[int, int]
+        self, unit: np.ndarray, amplitude: np.ndarray, saturated: np.ndarray, shape: tuple[int, int], error_m: float
     ) -> Decoded:
         """The depth engine: filter, unwrap, gate, correct, round."""
         engine = self.camera.engine
@@ -178,6 +181,7 @@ class AmcwImager:
             self.outside_mask.reshape(-1),
             self._tables,
             self._gates,
+            f4(error_m),
             z_m.reshape(-1),
             reason.reshape(-1),
             strength.reshape(-1),

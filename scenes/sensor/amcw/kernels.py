@@ -286,7 +286,7 @@ VALID, SATURATED, LOW_AMPLITUDE, AMPLITUDE_RATIO, UNWRAP, EDGE, OUT_OF_RANGE, OU
 @numba.njit(inline="always", **FAST)
 def _half_path(t0, t1, t2, combination, wraps, rows, columns, offset, metres_per_turn, m):  # type: ignore[no-untyped-def]
     """Half the light's path in metres and the squared lattice residual in turns^2; residual infinite where no wrap
-    counts fit. ``wraps`` (3, rows * columns) and the rest are from `scenes.sensor.unwrap`."""
+    counts fit. ``wraps`` (3, rows * columns) and the rest are from `scenes.sensor.amcw.unwrap`."""
     ka = -np.floor(combination[0, 0] * t0 + combination[0, 1] * t1 + combination[0, 2] * t2 + np.float32(0.5))
     kb = -np.floor(combination[1, 0] * t0 + combination[1, 1] * t1 + combination[1, 2] * t2 + np.float32(0.5))
     a = np.int32(ka) + np.int32(offset[0])
@@ -321,6 +321,7 @@ def range_and_gates(
     outside_mask: np.ndarray,
     tables: tuple,
     gates: tuple,
+    error_m: np.float32,
     z_m: np.ndarray,
     reason: np.ndarray,
     strength: np.ndarray,
@@ -330,7 +331,7 @@ def range_and_gates(
     Half the path s of light from the emitter at e by the point at range r along the unit ray u is
     (r + |r u - e|)/2, so r = (4 s^2 - e.e) / (4 s - 2 u.e). ``geometry`` (3, n) is u.e, e.e, u_z. ``gates``: edge sum,
     squared lattice residual, amplitude ratio, least amplitude, least 2/3 sum, least sum times range^2 (units m^2),
-    least range, greatest range, rounding step (m).
+    least range, greatest range, rounding step (m). ``error_m`` is added to half the path in every pixel.
     """
     combination, wraps, rows, columns, offset, metres_per_turn, lattice = tables
     g0, g1, g2, g3, g4, g5, g6, g7, g8 = gates
@@ -351,6 +352,7 @@ def range_and_gates(
         greatest = max(a0, max(a1, a2))
         amplitude = total * np.float32(2.0 / 3.0)
         half, residual2 = _half_path(t0, t1, t2, combination, wraps, rows, columns, offset, metres_per_turn, lattice)
+        half += error_m
         range_m = (np.float32(4) * half * half - geometry[1, i]) / (
             np.float32(4) * half - np.float32(2) * geometry[0, i]
         )

@@ -1,4 +1,4 @@
-"""Unwrapping several modulation frequencies whose ratios are integers: the tables behind `kernels.unwrap_three`."""
+"""Unwrapping several modulation frequencies whose ratios are integers: the tables behind `kernels.range_and_gates`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class UnwrapTable:
     unambiguous_m: float
 
     def for_kernel(self) -> tuple[np.ndarray, np.ndarray, int, int, np.ndarray, np.ndarray, np.ndarray]:
-        """What `scenes.sensor.kernels` takes: combination, wrap counts (3, a b), a, b, offset, metres, lattice."""
+        """What `scenes.sensor.amcw.kernels` takes: combination, wrap counts (3, a b), a, b, offset, metres, lattice."""
         rows, columns, _ = self.table.shape
         wraps = np.ascontiguousarray(self.table.reshape(rows * columns, 3).T)
         return self.combination, wraps, rows, columns, self.offset, self.metres_per_turn, self.lattice

@@ -1,0 +1,1 @@
+"""The continuous-wave (AMCW) imager: its numbers, its exposure, its depth engine."""

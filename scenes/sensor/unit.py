@@ -1,0 +1,35 @@
+"""Errors of range that belong to a unit as a whole or to a frame as a whole, the same for every kind of camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from harness.vocabulary.seeds import random_stream
+from harness.vocabulary.units import MM
+from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.facts import UnitFacts
+
+
+def static_error_m(facts: UnitFacts, effects: EffectsConfig, camera: str, unit_seed: int) -> float:
+    """The unit's constant error of range in metres, drawn from its seed; 0 where the effect is off."""
+    if not effects.unit_offset:
+        return 0.0
+    return float(random_stream(unit_seed, "unit offset", camera).standard_normal()) * facts.offset_mm.value * MM
+
+
+def drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:
+    """Error of range in metres ``minutes`` after power-on, for pixels with x/z = ``slope_x``; zeros where off."""
+    if not effects.warm_up_drift:
+        return np.zeros(slope_x.shape)
+    decayed = facts.drift_mm.value * MM * np.exp(-minutes / facts.drift_min.value)
+    return np.asarray(decayed * (1 + facts.drift_ramp.value * slope_x))
+
+
+def frame_errors_m(facts: UnitFacts, effects: EffectsConfig, rng: np.random.Generator) -> Iterator[float]:
+    """Endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few; 0 where off."""
+    while True:
+        jitter, sign, chance = rng.standard_normal(), rng.choice([-1.0, 1.0]), rng.random()
+        jump = sign * facts.jump_mm.value if chance < facts.jump_rate.value else 0.0
+        yield float(jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
