@@ -32,6 +32,12 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help="change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated",
     )
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated",
+    )
     parser.add_argument("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
     parser.add_argument(
         "--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)"
@@ -50,7 +56,7 @@ def _run(options: argparse.Namespace, given: list[str]) -> int:
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import SimulatedSource
 
-    experiment = load_experiment(options.experiment, options.overrides)
+    experiment = load_experiment(options.experiment, options.overrides, options.calibration)
     command = "python -m harness.sweep " + shlex.join(given)
     if not isinstance(experiment.config.source, SimulatedSource):
         from harness.engine.captures import judge_captures

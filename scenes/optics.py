@@ -31,7 +31,8 @@ class Optics:
     receives at ``emitter_m``: on Lambertian surfaces the light of a path is the same in both directions (Helmholtz'
     reciprocity), so it is described as an imager whose pixels are beams and whose emitter is the receiver.
     ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond a region whose light reaches it through
-    the camera's own filter. ``wavelength_nm``: at which surfaces need an albedo.
+    the camera's own filter. ``wavelength_nm``: at which surfaces need an albedo. The camera gives no range below
+    ``nearest_m`` or beyond ``farthest_m``, whatever the light; they change no render.
     """
 
     title: str
@@ -43,6 +44,8 @@ class Optics:
     footprint: PixelFootprint | BeamFootprint
     wavelength_nm: float
     margin_px: int
+    nearest_m: float = 0.0
+    farthest_m: float = float("inf")
 
     def content(self) -> dict[str, Any]:
         """Plain data of everything here that can change a render; equal for cameras that share renders."""

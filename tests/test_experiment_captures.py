@@ -10,7 +10,7 @@ import pytest
 
 from harness.experiment.load import load_experiment
 from harness.experiment.points import Experiment
-from harness.experiment.problems import ExperimentError
+from harness.vocabulary.declaration.problems import DeclarationError
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def loaded(folder: Path, text: str, *overrides: str) -> Experiment:
 
 
 def refused(folder: Path, text: str) -> str:
-    with pytest.raises(ExperimentError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         loaded(folder, text)
     return str(caught.value).replace(f"{folder}/", "")
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import BaseModel, Field, model_validator
 
-from harness.experiment import shape
-from harness.experiment.diagnose import validated
-from harness.experiment.yaml_source import parse_yaml
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import validated
+from harness.vocabulary.declaration.yaml_source import parse_yaml
 
 
 class Hole(Config):

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
-from harness.experiment import shape
 from harness.experiment.dotted import PathError, get_path, key_path, overridden, set_path
-from harness.experiment.yaml_source import KeyPath, Source, parse_yaml
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source, parse_yaml
 
 
 class Backing(Config):

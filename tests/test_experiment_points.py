@@ -13,8 +13,8 @@ from pydantic import Field
 import detectors
 from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.points import MAIN, Experiment, Point
-from harness.experiment.problems import ExperimentError
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration.problems import DeclarationError
 
 
 class TrialSettings(Config):
@@ -83,7 +83,7 @@ def loaded(folder: Path, text: str, *overrides: str) -> Experiment:
 
 
 def refused(folder: Path, text: str, *overrides: str) -> str:
-    with pytest.raises(ExperimentError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         loaded(folder, text, *overrides)
     return str(caught.value).replace(f"{folder}/", "")
 

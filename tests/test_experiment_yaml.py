@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.experiment.problems import ExperimentError
-from harness.experiment.yaml_source import MAX_BYTES, MAX_DEPTH, parse_yaml, read_yaml, to_yaml
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import MAX_BYTES, MAX_DEPTH, parse_yaml, read_yaml, to_yaml
 
 
 def refused(text: str) -> str:
-    with pytest.raises(ExperimentError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         parse_yaml(text, "x.yaml")
     return str(caught.value)
 
 
 def refused_file(path: Path) -> str:
-    with pytest.raises(ExperimentError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         read_yaml(path)
     return str(caught.value)
 
@@ -182,10 +182,10 @@ def test_a_file_that_is_too_large_is_not_parsed(tmp_path: Path) -> None:
 
 
 def test_an_experiment_error_survives_pickling() -> None:
-    with pytest.raises(ExperimentError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         parse_yaml("a: 1\na: 2", "x.yaml")
     copied = pickle.loads(pickle.dumps(caught.value))
-    assert isinstance(copied, ExperimentError)
+    assert isinstance(copied, DeclarationError)
     assert (str(copied), copied.problems) == (str(caught.value), caught.value.problems)
 
 

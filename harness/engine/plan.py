@@ -20,6 +20,7 @@ from scenes.render.cache import render_key
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
+from scenes.target.wavelength import at_wavelength
 
 CODE = ("detectors", "harness/engine", "harness/evaluation", "harness/vocabulary", "scenes")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless")
@@ -127,7 +128,7 @@ def plan_of(experiment: Experiment, cache: Path) -> Plan:
 def _group(points: tuple[Point, ...], cache: Path) -> Group:
     source = points[0].config.source
     assert isinstance(source, SimulatedSource)
-    target = source.target.declare()
+    target = at_wavelength(source.target.declare(), camera_of(source.camera).optics.wavelength_nm)
     if not target.damages:
         raise UserError(
             "the target has neither holes nor dents, so that there is nothing to find",

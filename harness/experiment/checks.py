@@ -8,19 +8,22 @@ from itertools import combinations
 from math import dist
 from pathlib import Path
 
-from harness.experiment import shape
 from harness.experiment.declared import DETECTOR_NAME, detector_names
-from harness.experiment.diagnose import nearest, wrong_choice
-from harness.experiment.problems import Problem
 from harness.experiment.recorded import recording_of
 from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
-from harness.experiment.yaml_source import Source
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
+from harness.vocabulary.declaration.problems import Problem
+from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
-from scenes.sensor.camera import camera_names
+from scenes.field_of_view import check_in_view
+from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
 from scenes.target.declaration import TargetConfig
+from scenes.target.wavelength import at_wavelength
 
 CAMERA_NAME = ("source", "camera", "name")
+CAMERA_NUMBERS = ("source", "camera", "numbers")
 
 
 def name_problems(source: Source) -> Iterator[Problem]:
@@ -48,6 +51,8 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     if mistake:
         place = source.place_of(("source", "target"))
         yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
+    else:
+        yield from _camera_problems(simulated.camera, target, source)
     pitch_mm = _smallest_pitch_mm(target)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
         yield Problem(
@@ -56,6 +61,30 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
             source.place_of(("matching", "radius_mm")),
             legal=f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart",
         )
+
+
+def _camera_problems(config: CameraConfig, target: TargetConfig, source: Source) -> Iterator[Problem]:
+    """Whether the camera can be made, sees the whole face within its range, and finds an albedo at its wavelength."""
+    if config.name not in camera_names():
+        return
+    found = _camera_mistake(config, target)
+    if found:
+        path, mistake = found
+        yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
+
+
+@lru_cache(maxsize=10_000)
+def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[tuple[str, ...], UserError] | None:
+    try:
+        optics = camera_of(config).optics
+    except UserError as error:
+        return (CAMERA_NUMBERS if config.numbers else CAMERA_NAME), error
+    try:
+        at_wavelength(target, optics.wavelength_nm)
+        check_in_view(target, optics)
+    except UserError as error:
+        return ("source", "target"), error
+    return None
 
 
 @lru_cache(maxsize=10_000)

@@ -6,8 +6,8 @@ from functools import lru_cache
 from typing import Any
 
 import detectors
-from harness.experiment import shape
 from harness.experiment.schema import ExperimentConfig
+from harness.vocabulary.declaration import shape
 
 DETECTOR_NAME = ("detector", "name")
 DETECTOR_SETTINGS = ("detector", "settings")

@@ -9,10 +9,10 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from harness.experiment import shape
-from harness.experiment.diagnose import dotted, nearest, shown, unknown_key
-from harness.experiment.problems import ExperimentError, Place, Problem
-from harness.experiment.yaml_source import KeyPath, Source, parse_yaml
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
+from harness.vocabulary.declaration.problems import DeclarationError, Place, Problem
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source, parse_yaml
 
 OPTION = "--set"
 NOT_VARIED = ("sweep", "sensitivity")
@@ -127,7 +127,7 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     for text in overrides:
         try:
             source = _override(source, text, declared_of(source.data))
-        except ExperimentError as error:
+        except DeclarationError as error:
             problems += error.problems
     return source, [*problems, *_in_vain(source, overrides)]
 
@@ -137,7 +137,7 @@ def _override(source: Source, text: str, declared: shape.Declared) -> Source:
     place = _place_of(text)
     if not equals or not name.strip() or not value_text.strip():
         fix = "write null for nothing" if equals and name.strip() else None
-        raise ExperimentError(OPTION, [Problem("not of the form path=value", place, "capture.frames=10", fix=fix)])
+        raise DeclarationError(OPTION, [Problem("not of the form path=value", place, "capture.frames=10", fix=fix)])
     path = key_path(name.strip())
     value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
     problem = path_problem(path, declared, place)
@@ -146,7 +146,7 @@ def _override(source: Source, text: str, declared: shape.Declared) -> Source:
             return source.with_value(path, set_path(source.data, path, value.data, declared), value)
         except PathError as error:
             problem = Problem(error.message, place)
-    raise ExperimentError(OPTION, [problem])
+    raise DeclarationError(OPTION, [problem])
 
 
 def _in_vain(source: Source, overrides: Sequence[str]) -> Iterator[Problem]:

@@ -6,24 +6,33 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.experiment import checks, shape
+from harness.experiment import checks
+from harness.experiment.calibrated import lens_numbers
 from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, forget_detectors, splices_of
-from harness.experiment.diagnose import validated
 from harness.experiment.dotted import OPTION, overridden, set_path
 from harness.experiment.points import Experiment
-from harness.experiment.problems import ExperimentError
 from harness.experiment.recorded import recording_of
 from harness.experiment.schema import ExperimentConfig, ValuesVariation
 from harness.experiment.unfold import unfolded
-from harness.experiment.yaml_source import KeyPath, Source, read_yaml, to_yaml
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import validated
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source, read_yaml, to_yaml
+from harness.vocabulary.errors import UserError
+from scenes.sensor.camera import CameraConfig
 
 
-def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
-    """Read, override (``path=value`` each), validate and unfold. Raises ExperimentError with all problems at once."""
+def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
+    """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
+
+    ``calibration``: a recording whose lens takes the place of the nominal one (`harness.experiment.calibrated`).
+    """
     forget_detectors()
     recording_of.cache_clear()
     source, problems = overridden(read_yaml(Path(path)), overrides, declared_of)
     source = _with_absolute_paths(source, Path(path).resolve().parent)
+    if calibration is not None:
+        source = _with_calibration(source, calibration)
     config, invalid = validated(ExperimentConfig, source, splices_of(source.data))
     problems += invalid
     problems += checks.name_problems(source)
@@ -31,7 +40,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
         problems += checks.joint_problems(config, source)
     points, unfolding = unfolded(source, None if problems else config)
     if problems or unfolding or config is None:
-        raise ExperimentError(str(path), [*problems, *unfolding])
+        raise DeclarationError(str(path), [*problems, *unfolding])
     return Experiment(config, points, _resolved_data(config, source), source)
 
 
@@ -69,6 +78,19 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
         names.append(("source", "intrinsics"))
     for at in names:
         data = _absolute(data, at, Path.cwd() if source.place_of(at).origin == OPTION else folder)
+    return Source(source.origin, source.text, data, source.values, source.keys)
+
+
+def _with_calibration(source: Source, recording: Path) -> Source:
+    """The recording's lens among the camera's replaced numbers; it counts before what the file says of the lens."""
+    if shape.get(source.data, ("source", "kind")) != "simulated":
+        raise UserError("a real capture brings its own lens", fix="leave out --calibration, or use source.intrinsics")
+    swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
+    single = shape.get(source.data, checks.CAMERA_NAME)
+    names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]
+    numbers = shape.get(source.data, checks.CAMERA_NUMBERS)
+    merged = {**(numbers if isinstance(numbers, dict) else {}), **lens_numbers(recording, map(str, names))}
+    data = set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data))
     return Source(source.origin, source.text, data, source.values, source.keys)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from harness.experiment import recorded
 from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
-from harness.experiment.yaml_source import Source
+from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.seeds import digest
 from scenes.sensor.camera import camera_digest, camera_of
 

@@ -9,14 +9,15 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from harness.experiment import checks, shape
+from harness.experiment import checks
 from harness.experiment.declared import declared_of, detector_version, splices_of
-from harness.experiment.diagnose import validated
 from harness.experiment.dotted import PathError, key_path, path_problem, set_path
 from harness.experiment.points import MAIN, Point, point_of
-from harness.experiment.problems import Place, Problem
 from harness.experiment.schema import ExperimentConfig
-from harness.experiment.yaml_source import KeyPath, Source
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import validated
+from harness.vocabulary.declaration.problems import Place, Problem
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source
 from harness.vocabulary.seeds import canonical_json
 
 FRAMES = "capture.frames"

@@ -22,7 +22,14 @@ from scenes.target.custom import TargetConfig
 from scenes.target.mesh import build_target
 from scenes.view import NoiseFreeView
 
-CODE = ("scenes/render", "scenes/target", "scenes/optics.py", "scenes/view.py", "harness/vocabulary")
+CODE = (
+    "scenes/render",
+    "scenes/target",
+    "scenes/optics.py",
+    "scenes/field_of_view.py",
+    "scenes/view.py",
+    "harness/vocabulary",
+)
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numpy", "scipy")
 """What decides a render's numbers beside its declaration. The variant (GPU or processor) is left out: it changes them
 by 1e-6."""

@@ -7,10 +7,10 @@ import time
 import cv2
 import numpy as np
 
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, invert, rotate_vectors, transform_points
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
+from scenes.field_of_view import seen_region
 from scenes.optics import Optics
 from scenes.render.direct import DirectLight, direct_light, surface_rgb
 from scenes.render.indirect import between_nodes, gather_at_points, gather_in_pixels
@@ -25,25 +25,9 @@ RIM_PX = 3
 
 
 def target_region(target: Target, optics: Optics) -> Region:
-    """The sensor region that sees the target. Raises UserError where part of it lies outside the sensor or behind."""
-    lens = optics.lens
-    outline = transform_points(target.T_camera_board, target.outline_board_m)
-    if outline[:, 2].min() <= 0.05:
-        raise UserError(
-            f"the target reaches to {outline[:, 2].min():.3f} m before the lens",
-            legal="all of the face at least 0.05 m in front of the camera",
-            fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
-        )
-    uv = lens.project(outline)
-    low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
-    if low.min() < 0 or high[0] > lens.width or high[1] > lens.height:
-        raise UserError(
-            f"the target covers columns {low[0]}..{high[0]} and rows {low[1]}..{high[1]}",
-            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {optics.title}",
-            fix="move the target away (distance), towards the axis (offset), or make it smaller",
-        )
-    tight = Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
-    return tight.grown(RIM_PX + optics.margin_px, lens.height, lens.width)
+    """The region of the sensor that a render of the target covers. Raises UserError as `seen_region` does."""
+    tight = seen_region(transform_points(target.T_camera_board, target.outline_board_m), optics)
+    return tight.grown(RIM_PX + optics.margin_px, optics.lens.height, optics.lens.width)
 
 
 def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFreeView:

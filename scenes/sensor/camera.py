@@ -8,11 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, TypeAdapter, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field, ValidationError
 
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration.diagnose import validated, wrong_choice
+from harness.vocabulary.declaration.problems import DeclarationError, Problem
+from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -23,7 +24,7 @@ CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 AnyCamera = AmcwCamera
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
 
-_ADAPTER: TypeAdapter[AnyCamera] = TypeAdapter(AnyCamera)
+KINDS: dict[str, type[AnyCamera]] = {"amcw_imager": AmcwCamera}
 
 
 class CameraConfig(Config):
@@ -108,18 +109,24 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 def read_camera(path: Path) -> AnyCamera:
     """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
-    try:
-        data = YAML(typ="safe", pure=True).load(path.read_text())
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
-    except YAMLError as error:
-        raise UserError(f"{path}: is no valid YAML: {error}") from error
-    return _validated(data, str(path))
+    source = read_yaml(path)
+    kind = source.data.get("kind")
+    if kind not in KINDS:
+        place = source.place_of(("kind",))
+        lacking = Problem("the file lacks the key `kind`", place, legal="one of " + ", ".join(KINDS))
+        raise DeclarationError(str(path), [wrong_choice(("kind",), kind, KINDS, place) if kind else lacking])
+    camera, problems = validated(KINDS[kind], source, {})
+    if problems or camera is None:
+        raise DeclarationError(str(path), problems)
+    if camera.name != path.stem:
+        message = f"`name` is {camera.name}, but the file is {path.name}"
+        raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])
+    return camera
 
 
 def _validated(data: Any, where: str) -> AnyCamera:
     try:
-        return _ADAPTER.validate_python(data)
+        return KINDS[data["kind"]].from_data(data)
     except ValidationError as error:
         lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
         raise UserError(f"{where} does not describe a camera:\n" + "\n".join(lines)) from error

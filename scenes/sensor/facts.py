@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Generic, Literal, TypeVar
+from collections.abc import Callable
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import numpy as np
+from pydantic import AfterValidator, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.lens import Lens
 
 T = TypeVar("T")
+
+TERMS = (0, 4, 5, 8)
+"""How many distortion terms OpenCV's models have."""
+STEEPEST = 6.0
+"""Slope from the axis up to which distortion is examined: 80 degrees."""
 
 
 class Fact(Config, Generic[T]):
@@ -22,16 +31,63 @@ class Fact(Config, Generic[T]):
     source: str
 
 
+def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
+    """A validator of a fact whose value, or each of whose values, must be what ``legal`` says."""
+
+    def check(fact: Fact[Any]) -> Fact[Any]:
+        for value in fact.value if isinstance(fact.value, tuple) else (fact.value,):
+            if not holds(value):
+                raise ValueError(f"the value is {value}; it must be {legal}")
+        return fact
+
+    return AfterValidator(check)
+
+
+above_zero = checked("above 0", lambda value: value > 0)
+zero_or_more = checked("0 or more", lambda value: value >= 0)
+share = checked("from 0 to 1", lambda value: 0 <= value <= 1)
+half_angle = checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)
+
+PositiveInt = Annotated[Fact[int], above_zero]
+Positive = Annotated[Fact[float], above_zero]
+NonNegative = Annotated[Fact[float], zero_or_more]
+Share = Annotated[Fact[float], share]
+HalfAngle = Annotated[Fact[float], half_angle]
+Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)]
+
+
+def _known_number_of_terms(fact: Fact[tuple[float, ...]]) -> Fact[tuple[float, ...]]:
+    if len(fact.value) not in TERMS:
+        raise ValueError(f"there are {len(fact.value)} terms; OpenCV's models have {', '.join(map(str, TERMS))}")
+    return fact
+
+
 class LensFacts(Config):
     """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none."""
 
-    width_px: Fact[int]
-    height_px: Fact[int]
-    fx_px: Fact[float]
-    fy_px: Fact[float]
+    width_px: PositiveInt
+    height_px: PositiveInt
+    fx_px: Positive
+    fy_px: Positive
     cx_px: Fact[float]
     cy_px: Fact[float]
-    distortion: Fact[tuple[float, ...]]
+    distortion: Annotated[Fact[tuple[float, ...]], AfterValidator(_known_number_of_terms)]
+
+    @model_validator(mode="after")
+    def _sees_each_direction_once(self) -> LensFacts:
+        corner, limit = self._corner_slope(), unfolded_slope(self.lens().distortion)
+        if corner > limit:
+            raise ValueError(
+                f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the corner "
+                f"of the sensor lies at {corner:.3g}"
+            )
+        return self
+
+    def _corner_slope(self) -> float:
+        """Distance of the farthest corner from the principal point, in focal lengths."""
+        x = max(self.cx_px.value, self.width_px.value - 1 - self.cx_px.value) / self.fx_px.value
+        y = max(self.cy_px.value, self.height_px.value - 1 - self.cy_px.value) / self.fy_px.value
+        return float(np.hypot(x, y))
 
     def lens(self) -> Lens:
         """The lens in the program's own type."""
@@ -56,11 +112,23 @@ class UnitFacts(Config):
     displacement that every frame has.
     """
 
-    frames_per_second: Fact[float]
-    offset_mm: Fact[float]
+    frames_per_second: Positive
+    offset_mm: NonNegative
     drift_mm: Fact[float]
-    drift_min: Fact[float]
+    drift_min: Positive
     drift_ramp: Fact[float]
-    jump_rate: Fact[float]
-    jump_mm: Fact[float]
-    jitter_mm: Fact[float]
+    jump_rate: Share
+    jump_mm: NonNegative
+    jitter_mm: NonNegative
+
+
+def unfolded_slope(distortion: tuple[float, ...]) -> float:
+    """The largest distorted slope up to which radial distortion grows with the true one; infinite where it always
+    does within `STEEPEST`. ``distortion``: k1 k2 p1 p2 k3 k4 k5 k6; the tangential part is left out."""
+    k1, k2, _, _, k3, k4, k5, k6 = distortion
+    slope = np.linspace(0.0, STEEPEST, 6001)
+    s = slope**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distorted = slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
+    back = np.flatnonzero(~(np.diff(distorted) > 0))
+    return float(distorted[back[0]]) if back.size else float("inf")

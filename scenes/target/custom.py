@@ -165,6 +165,17 @@ class RoomConfig(Config):
     )
 
 
+class WavelengthConfig(Config):
+    """Albedos at another wavelength than 850 nm, of every surface that the target has; ``tape`` of all strips."""
+
+    wavelength_nm: Annotated[float, Field(ge=300.0, le=2000.0)]
+    board: Albedo
+    tape: Albedo | None = None
+    backing: Albedo | None = None
+    floor: Albedo | None = None
+    back_wall: Albedo | None = None
+
+
 class PoseConfig(Config):
     """Where the face's centre is (camera axes), and how the board is turned: about its x, then y, then z."""
 
@@ -188,6 +199,9 @@ class TargetConfig(Config):
     backing: BackingConfig | None = None
     room: RoomConfig | None = None
     pose: PoseConfig = PoseConfig()
+    other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
+        default=(), description="for cameras that do not work near 850 nm"
+    )
 
     @model_validator(mode="after")
     def _ids_once(self) -> Self:

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike
 from harness.vocabulary.units import MM
 from scenes.target.custom import BoardConfig, CylinderConfig, PolynomialConfig, SphereConfig
 
+OUTLINE_STEPS = 64
+"""Points along each side of the outline."""
+
 
 class Face(ABC):
     """A smooth height field with z(0, 0) = 0. Arguments broadcast; every answer is vectorised."""
@@ -128,3 +131,12 @@ def face_of(board: BoardConfig) -> Face:
             )
         )
     return PolynomialFace(())
+
+
+def outline_board_m(board: BoardConfig) -> np.ndarray:
+    """(n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame."""
+    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
+    side = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False)
+    end = np.ones(OUTLINE_STEPS)
+    x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
+    return face_of(board).point(half_x * x, half_y * y)

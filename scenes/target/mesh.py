@@ -10,7 +10,7 @@ import numpy as np
 from harness.vocabulary.units import MM
 from scenes.target.checks import check_target
 from scenes.target.custom import TapeConfig, TargetConfig
-from scenes.target.face import Face, face_of
+from scenes.target.face import Face, face_of, outline_board_m
 from scenes.target.pose import T_camera_board_of
 from scenes.target.solid import cutter, sheet, subtract
 from scenes.target.surroundings import backing_corners_board_m, floor_corners_camera_m, wall_corners_camera_m
@@ -24,8 +24,6 @@ COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 """How far facets may be off a bent face: well under a camera's noise, and finer below shallow dents (depth / 400)."""
 TAPE_SINK_M = 0.1e-3
 """How deep a strip's underside lies in the board, so that no two surfaces coincide."""
-OUTLINE_STEPS = 64
-"""Points along each side of the outline."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ def build_target(config: TargetConfig) -> Target:
         ),
         truth=truth,
         T_camera_board=T_camera_board,
-        outline_board_m=_outline(config, face_of(config.board)),
+        outline_board_m=outline_board_m(config.board),
     )
 
 
@@ -175,11 +173,3 @@ def _size_m(config: TargetConfig) -> tuple[float, float]:
 def _sagitta_m(config: TargetConfig) -> float:
     depths_m = [dent.depth_mm * MM for dent in config.dents]
     return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
-
-
-def _outline(config: TargetConfig, face: Face) -> np.ndarray:
-    half_x, half_y = np.array(_size_m(config)) / 2
-    side = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False)
-    end = np.ones(OUTLINE_STEPS)
-    x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
-    return face.point(half_x * x, half_y * y)

@@ -29,6 +29,7 @@ from scenes.target.custom import (
     RoomConfig,
     TapeConfig,
     TargetConfig,
+    WavelengthConfig,
 )
 
 THICKNESS_MM = 12.7
@@ -127,6 +128,10 @@ class ThesisTargetConfig(Config):
     )
     back_wall_albedo_850: Albedo = _open(0.6, [0.3, 0.6, 0.85], "Not stated. A painted wall. A guess.")
 
+    other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
+        default=(), description="for cameras that do not work near 850 nm, as the thesis' three do"
+    )
+
     def declare(self) -> TargetConfig:
         """The full declaration. Whether the parts fit together is checked when it is built."""
         return TargetConfig(
@@ -155,6 +160,7 @@ class ThesisTargetConfig(Config):
                 tilt_y_deg=self.tilt_y_deg,
                 roll_deg=self.roll_deg,
             ),
+            other_wavelengths=self.other_wavelengths,
         )
 
     def _holes(self) -> tuple[HoleConfig, ...]:

@@ -16,8 +16,8 @@ from pydantic import BaseModel, Discriminator, Tag, TypeAdapter
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
 from pydantic.fields import FieldInfo
 
-from harness.experiment.yaml_source import KeyPath
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration.yaml_source import KeyPath
 
 LONGEST_NOTE = 100
 """Characters of a field's description that a message repeats; longer ones are essays, not limits."""

@@ -67,7 +67,7 @@ class Problem:
         return "\n".join(lines)
 
 
-class ExperimentError(UserError):
+class DeclarationError(UserError):
     """Everything that is wrong with an experiment, in the order of the file."""
 
     def __init__(self, origin: str, problems: Iterable[Problem]) -> None:
@@ -77,7 +77,7 @@ class ExperimentError(UserError):
         super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(map(str, self.problems)))
 
     def __reduce__(self) -> tuple[object, ...]:
-        return ExperimentError, (self.origin, self.problems)
+        return DeclarationError, (self.origin, self.problems)
 
 
 def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:

@@ -20,7 +20,7 @@ from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from harness.experiment.problems import ExperimentError, Place, Problem
+from harness.vocabulary.declaration.problems import DeclarationError, Place, Problem
 
 KeyPath = tuple[str | int, ...]
 """Where a value is in the data: keys of mappings and indices of lists."""
@@ -69,32 +69,34 @@ class Source:
 
 
 def read_yaml(path: Path) -> Source:
-    """Read a file whose top level is a mapping. Raises ExperimentError with every problem of the text and its place."""
+    """Read a file whose top level is a mapping. Raises DeclarationError with every problem of the text, and places."""
     origin = str(path)
     text = _decoded(origin, _bytes_of(Path(path)))
     source = parse_yaml(text, origin)
     if not isinstance(source.data, dict):
         kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
-        raise ExperimentError(
+        raise DeclarationError(
             origin, [Problem(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: averaging`")]
         )
     return source
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
-    """Parse ``text[start:]``; places are those in the whole text. Raises ExperimentError.
+    """Parse ``text[start:]``; places are those in the whole text. Raises DeclarationError.
 
     ``is_argument``: the text is an argument of the command line, so that places have no line number.
     """
     place = _places_in(text, origin, start, is_argument)
     version = _OTHER_VERSION.search(text)
     if version:
-        raise ExperimentError(origin, [Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))])
+        raise DeclarationError(
+            origin, [Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))]
+        )
     root = _composed(text[start:], origin, place)
     builder = _Builder(place)
     data = builder.build(root, (), ()) if root is not None else None
     if builder.problems:
-        raise ExperimentError(origin, builder.problems)
+        raise DeclarationError(origin, builder.problems)
     builder.values.setdefault((), place(0, 0))
     return Source(origin, text, data, builder.values, builder.keys)
 
@@ -125,13 +127,13 @@ def _bytes_of(path: Path) -> bytes:
     except FileNotFoundError:
         found = sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
         beside = ", ".join(found[:10]) or None
-        raise ExperimentError(origin, [Problem("there is no such file", None, legal=beside)]) from None
+        raise DeclarationError(origin, [Problem("there is no such file", None, legal=beside)]) from None
     except IsADirectoryError:
-        raise ExperimentError(origin, [Problem("this is a folder, not a YAML file", None)]) from None
+        raise DeclarationError(origin, [Problem("this is a folder, not a YAML file", None)]) from None
     except OSError as error:
-        raise ExperimentError(origin, [Problem(f"cannot be read ({error.strerror})", None)]) from error
+        raise DeclarationError(origin, [Problem(f"cannot be read ({error.strerror})", None)]) from error
     if len(content) > MAX_BYTES:
-        raise ExperimentError(
+        raise DeclarationError(
             origin, [Problem("the file is too large for an experiment", None, legal=f"at most {MAX_BYTES} bytes")]
         )
     return content
@@ -146,7 +148,7 @@ def _decoded(origin: str, content: bytes) -> str:
         line_start = before.rfind("\n") + 1
         where = Place(origin, before.count("\n") + 1, len(before) - line_start + 1, before[line_start:] + rest)
         problem = Problem(f"byte 0x{content[error.start]:02x} is not UTF-8", where, fix="save the file as UTF-8")
-        raise ExperimentError(origin, [problem]) from None
+        raise DeclarationError(origin, [problem]) from None
 
 
 def _places_in(text: str, origin: str, start: int, is_argument: bool) -> Callable[[int, int], Place]:
@@ -183,7 +185,7 @@ def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Nod
         problem = Problem(f"character U+{ord(text[index]):04X} is not allowed in YAML", place(index, index + 1))
     except YAMLError as error:
         problem = Problem(f"no valid YAML: {error}", place(0, 1))
-    raise ExperimentError(origin, [problem]) from None
+    raise DeclarationError(origin, [problem]) from None
 
 
 def _first_too_deep(text: str) -> int | None:

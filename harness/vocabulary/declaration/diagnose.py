@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from harness.experiment import shape
-from harness.experiment.problems import Place, Problem
-from harness.experiment.shape import Declared
-from harness.experiment.yaml_source import KeyPath, Source
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.problems import Place, Problem
+from harness.vocabulary.declaration.shape import Declared
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source
 
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 """Booleans of YAML 1.1, text in YAML 1.2."""
@@ -155,7 +155,9 @@ def _problem(one: _Located | list[_Located], declared: Declared, source: Source)
     if one.kind in ("value_error", "assertion_error"):
         where = f"`{dotted(path)}`: " if path else ""
         message = where + str(one.context.get("error", one.text))
-        return Problem(message, source.place_of(path), legal=shape.legal_at(annotation))
+        # what a validator of a whole mapping says is complete; its keys are no help
+        legal = None if isinstance(value, dict) else shape.legal_at(annotation)
+        return Problem(message, source.place_of(path), legal=legal)
     if isinstance(value, dict | list) and one.kind in ("model_type", "dict_type", "tuple_type", "list_type"):
         return Problem(f"`{dotted(path)}` is {shown(value)}", source.place_of(path), shape.legal_at(annotation))
     message = f"`{dotted(path)}` is {shown(value)}: {_in_words_of_yaml(one.text)}"

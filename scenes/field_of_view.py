@@ -1,0 +1,49 @@
+"""Whether a camera sees a target, and on which part of its sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Region, transform_points
+from scenes.optics import Optics
+from scenes.target.custom import TargetConfig
+from scenes.target.face import outline_board_m
+from scenes.target.pose import T_camera_board_of
+
+NEAREST_M = 0.05
+"""Between the face and the lens' plane, whatever the camera."""
+
+
+def check_in_view(config: TargetConfig, optics: Optics) -> None:
+    """Raise UserError where a part of the face is out of the camera's field of view or range."""
+    outline = transform_points(T_camera_board_of(config.pose), outline_board_m(config.board))
+    seen_region(outline, optics)
+    range_m = np.linalg.norm(outline, axis=-1)
+    if range_m.min() < optics.nearest_m or range_m.max() > optics.farthest_m:
+        raise UserError(
+            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
+            legal=f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}",
+            fix="change target.pose.distance_m (or target.distance_m)",
+        )
+
+
+def seen_region(outline_camera_m: np.ndarray, optics: Optics) -> Region:
+    """The pixels on which an outline (n, 3) lies. Raises UserError where part of it is off the sensor or behind it."""
+    lens = optics.lens
+    nearest_m = float(outline_camera_m[:, 2].min())
+    if nearest_m <= NEAREST_M:
+        raise UserError(
+            f"the target reaches to {nearest_m:.3f} m before the lens",
+            legal=f"all of the face at least {NEAREST_M:g} m in front of the camera",
+            fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
+        )
+    uv = lens.project(outline_camera_m)
+    low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
+    if low.min() < 0 or high[0] > lens.width or high[1] > lens.height:
+        raise UserError(
+            f"the target covers columns {low[0]}..{high[0]} and rows {low[1]}..{high[1]}",
+            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {optics.title}",
+            fix="move the target away (distance), towards the axis (offset), or make it smaller",
+        )
+    return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))

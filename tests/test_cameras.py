@@ -1,0 +1,151 @@
+"""Camera files, what an experiment may change of them, and what a camera can and cannot look at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.experiment.calibrated import lens_numbers
+from harness.experiment.load import load_experiment
+from harness.sweep import main
+from harness.vocabulary.errors import UserError
+from scenes.field_of_view import check_in_view
+from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, camera_of, load_camera, read_camera
+from scenes.sensor.facts import unfolded_slope
+from scenes.target.declaration import target_from_data
+from scenes.target.mesh import build_target
+from scenes.target.wavelength import at_wavelength
+
+AZURE = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
+SMOKE = "experiments/smoke.yaml"
+
+
+def thesis(**facts):
+    return target_from_data({"name": "thesis", **facts}).declare()
+
+
+@pytest.mark.parametrize("name", camera_names())
+def test_every_camera_file_is_read_and_names_its_sources(name):
+    camera = load_camera(name)
+    assert camera.name == name
+    lens = camera.optics.lens
+    assert 0 < lens.cx < lens.width and 0 < lens.cy < lens.height
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("fx_px: {value: 504.647", "fx_px: {value: 0.0", ":12:10: `lens.fx_px`: the value is 0.0; it must be above 0"),
+        ("width_px: {value: 640", "width_px: {valu: 640", "`lens.width_px` lacks the key `value`"),
+        ("  width_px: {value: 640", "  widht_px: {value: 640", "did you mean: width_px"),
+        ("[0.5825, 0.0061", "[-3.0, 0.0061", "distortion folds the image: it turns back at 0.202"),
+        ("kind: amcw_imager", "kind: amcw_imgr", "did you mean: amcw_imager"),
+        ("kind: amcw_imager\n", "", "the file lacks the key `kind`"),
+        ("name: azure_kinect_nfov", "name: other", "`name` is other, but the file is azure_kinect_nfov.yaml"),
+        ("wavelength_nm: {value: 850.0", "wavelength_nm: {value: 850000.0", "from 300 to 2000 nanometres"),
+        ("tag: W", "tag: Q", "is none of the legal values"),
+        ("lens:", "lens: [", "azure_kinect_nfov.yaml:"),
+        ("[-14.0, 0.0, 1.0]", "[-14.0, .nan, 1.0]", "emitter.position_mm"),
+    ],
+)
+def test_a_bad_camera_file_is_one_message_with_file_line_and_key(tmp_path, old, new, wanted):
+    assert old in AZURE
+    path = tmp_path / "azure_kinect_nfov.yaml"
+    path.write_text(AZURE.replace(old, new, 1))
+    with pytest.raises(UserError) as caught:
+        read_camera(path)
+    assert wanted in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_impossible_frequencies_are_named(tmp_path):
+    path = tmp_path / "azure_kinect_nfov.yaml"
+    path.write_text(AZURE.replace("[198.0e+6", "[-198.0e+6", 1))
+    with pytest.raises(UserError, match="frequencies_hz"):
+        read_camera(path)
+
+
+def test_distortion_unfolds_up_to_where_its_slope_vanishes():
+    # r (1 - r^2) grows until r = 1/sqrt 3, where it is 2 / (3 sqrt 3)
+    folded = unfolded_slope((-1.0, 0, 0, 0, 0, 0, 0, 0))
+    assert folded == pytest.approx(2 / 3**1.5, abs=1e-6)
+    assert unfolded_slope((0.0,) * 8) == np.inf
+    assert unfolded_slope((0.1, 0, 0, 0, 0, 0, 0, 0)) == np.inf
+    # the image of a rational model with a pole goes on for ever
+    assert unfolded_slope((0, 0, 0, 0, 0, -1.0, 0, 0)) == np.inf
+
+
+def test_an_experiment_replaces_numbers_of_a_camera():
+    own = camera_of(CameraConfig(numbers={"lens.fx_px": 500.0, "emitter.position_mm": [-20.0, 0.0, 0.0]}))
+    nominal = load_camera("azure_kinect_nfov")
+    assert own.optics.lens.fx == 500.0 and own.lens.fx_px.tag == "U"
+    assert own.optics.emitter_m.tolist() == [-0.02, 0.0, 0.0]
+    assert own.optics.lens.fy == nominal.optics.lens.fy
+    assert own.optics.content() != nominal.optics.content()
+    assert camera_of(CameraConfig()) is nominal
+    with pytest.raises(UserError, match=r"no number 'lens.fx'; did you mean 'lens.f[xy]_px'"):
+        camera_of(CameraConfig(numbers={"lens.fx": 500.0}))
+    with pytest.raises(UserError, match=r"lens.fx_px.*above 0"):
+        camera_of(CameraConfig(numbers={"lens.fx_px": -1.0}))
+
+
+def test_albedos_near_850_nm_hold_and_others_must_be_declared():
+    target = thesis()
+    for wavelength_nm in (830.0, 850.0, 860.0, 870.0):
+        assert at_wavelength(target, wavelength_nm).material.albedo_850 == 0.6
+    with pytest.raises(UserError, match="no albedo at 940 nm"):
+        at_wavelength(target, 940.0)
+    entry = {"wavelength_nm": 940.0, "board": 0.5, "tape": 0.4, "backing": 0.3, "floor": 0.2, "back_wall": 0.1}
+    other = at_wavelength(thesis(other_wavelengths=[entry]), 945.0)
+    albedos = {part.name: part.albedo_850 for part in build_target(other).parts}
+    assert albedos["board"] == pytest.approx(0.5, rel=1e-3)
+    assert (albedos["tape_1"], albedos["backing"], albedos["floor"], albedos["back_wall"]) == (0.4, 0.3, 0.2, 0.1)
+    with pytest.raises(UserError, match="at 940 nm there is no albedo for tape, floor"):
+        partial = {key: value for key, value in entry.items() if key not in ("tape", "floor")}
+        at_wavelength(thesis(other_wavelengths=[partial]), 940.0)
+
+
+def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
+    optics = load_camera("azure_kinect_nfov").optics
+    check_in_view(thesis(), optics)
+    with pytest.raises(UserError, match="covers columns"):
+        check_in_view(thesis(distance_m=0.35), optics)
+    near = type(optics)(**{**optics.__dict__, "nearest_m": 0.8})
+    with pytest.raises(UserError, match=r"lies 0.\d+ to 0.\d+ m from the camera"):
+        check_in_view(thesis(), near)
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        ("source.target.distance_m=0.35", "smoke.yaml:9:11: the target covers columns"),
+        ("source.camera.numbers={lens.fx_px: 0.0}", "lens.fx_px"),
+        ("source.camera.numbers={wavelength_nm: 940.0}", "the target has no albedo at 940 nm"),
+        ("source.camera.name=azure_kinect_nfv", "did you mean: azure_kinect_nfov"),
+        ("source.camera.effects.wigling=true", "did you mean: source.camera.effects.wiggling"),
+    ],
+)
+def test_mistakes_about_cameras_end_with_one_message(override, wanted, capsys, tmp_path):
+    assert main([SMOKE, "--dry-run", "--out", str(tmp_path), "--set", override]) == 2
+    assert wanted in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recordings_own_lens_takes_the_nominal_ones_place(shared_data):
+    recording = next((shared_data / "azure_mkv").glob("*.mkv"))
+    numbers = lens_numbers(recording, ["azure_kinect_nfov"])
+    (point, *_) = load_experiment(SMOKE, [], recording).points
+    lens = camera_of(point.config.source.camera).optics.lens
+    nominal = load_camera("azure_kinect_nfov").optics.lens
+    assert lens.fx == numbers["lens.fx_px"] != nominal.fx
+    # five published units agree to 0.3 px in focal length and scatter by some 10 px in their centre
+    assert abs(lens.fx - nominal.fx) < 1 and abs(lens.cx - nominal.cx) < 20
+    with pytest.raises(UserError, match=r"512 x 424"):
+        lens_numbers(recording, ["kinect_v2"])
+
+
+def test_a_calibration_that_is_none_is_refused(tmp_path, capsys):
+    path = tmp_path / "not.mkv"
+    path.write_bytes(b"no recording")
+    assert main([SMOKE, "--dry-run", "--out", str(tmp_path / "out"), "--calibration", str(path)]) == 2
+    assert "not.mkv" in capsys.readouterr().err
