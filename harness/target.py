@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from pydantic import ValidationError
-
     from scenes.target.declaration import TargetConfig
     from scenes.target.mesh import Target
 
@@ -73,82 +70,27 @@ def _summary(target: Target) -> str:
 
 
 def _declared(name_or_path: str) -> TargetConfig:
-    from pydantic import ValidationError
-
-    from scenes.target.declaration import target_from_data
+    from harness.vocabulary.declaration.diagnose import validated, wrong_choice
+    from harness.vocabulary.declaration.problems import DeclarationError, Problem
+    from harness.vocabulary.declaration.yaml_source import read_yaml
+    from scenes.target.declaration import TARGETS
 
     if name_or_path in NAMED_TARGETS:
-        return target_from_data({"name": name_or_path}).declare()
-    path = Path(name_or_path)
-    data = _read(path)
-    try:
-        json.dumps(data)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: holds something that is no number, text, list or mapping ({error})") from error
-    try:
-        return target_from_data(data).declare()
-    except ValidationError as error:
+        return TARGETS[name_or_path].from_data({"name": name_or_path}).declare()
+    if not Path(name_or_path).exists():
         raise UserError(
-            "the declaration is not valid:\n" + "\n".join(_problems(path, data, error)),
-            legal="name: thesis with its open facts, or name: custom with board, holes, dents, tapes, ...",
-            fix="mend the places named above; millimetres, metres and degrees are in the keys' names",
-        ) from error
-
-
-def _read(path: Path) -> Any:
-    """Data of a YAML or JSON file. JSON is read as YAML 1.2, which contains it, so that places are known in both."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise UserError(
-            f"{path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as text ({error})") from error
-    try:
-        return YAML(typ="rt").load(text.replace("\t", "  ") if path.suffix.lower() == ".json" else text)
-    except MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-        raise UserError(f"{place}: {error.problem or 'not valid YAML'}", fix="mend the file's syntax") from error
-    except YAMLError as error:
-        raise UserError(f"{path}: not valid YAML ({error})") from error
-
-
-def _problems(path: Path, data: Any, error: ValidationError) -> list[str]:
-    """One line a problem: file:line:column, the key, what is wrong."""
-    lines = []
-    for problem in error.errors():
-        line, column, keys = _place(data, problem["loc"])
-        where = f"{path}:{line}:{column}" if line else str(path)
-        lines.append(f"  - {where}: {'.'.join(keys) or 'the whole file'}: {problem['msg']}")
-    return lines
-
-
-def _place(data: Any, loc: tuple[int | str, ...]) -> tuple[int, int, list[str]]:
-    """Line and column (from 1; 0 if unknown) of the deepest node on pydantic's path that exists, and the path's keys.
-
-    The path also names which kind of a union was tried; such steps are no keys of the data and are passed over.
-    """
-    line = column = 0
-    keys: list[str] = []
-    for depth, step in enumerate(loc):
-        if isinstance(data, dict) and step in data:
-            place = data.lc.key(step)  # type: ignore[attr-defined]
-        elif isinstance(data, list) and isinstance(step, int) and step < len(data):
-            place = data.lc.item(step)  # type: ignore[attr-defined]
-        elif depth == len(loc) - 1:
-            # A key that is missing: the message is about it, its place is its parent's.
-            return line, column, [*keys, str(step)]
-        else:
-            continue
-        line, column = place[0] + 1, place[1] + 1
-        data = data[step]
-        keys.append(str(step))
-    return line, column, keys
+            f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
+        )
+    source = read_yaml(Path(name_or_path))
+    name = source.data.get("name")
+    if name not in TARGETS:
+        place = source.place_of(("name",))
+        lacking = Problem("the file lacks the key `name`", place, legal=f"one of {', '.join(TARGETS)}")
+        raise DeclarationError(name_or_path, [wrong_choice(("name",), name, TARGETS, place) if name else lacking])
+    config, problems = validated(TARGETS[name], source, {})
+    if problems or config is None:
+        raise DeclarationError(name_or_path, problems)
+    return config.declare()
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from scenes.target.custom import (
 from scenes.target.thesis import OpenFact, ThesisTargetConfig, open_facts
 
 __all__ = [
+    "TARGETS",
     "AnyTargetConfig",
     "BackingConfig",
     "BoardConfig",
@@ -53,6 +54,12 @@ __all__ = [
 ]
 
 AnyTargetConfig = Annotated[ThesisTargetConfig | TargetConfig, Field(discriminator="name")]
+
+TARGETS: dict[str, type[ThesisTargetConfig] | type[TargetConfig]] = {
+    "thesis": ThesisTargetConfig,
+    "custom": TargetConfig,
+}
+"""The kinds by name."""
 
 
 def target_from_data(data: Any) -> ThesisTargetConfig | TargetConfig:

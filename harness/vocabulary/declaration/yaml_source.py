@@ -76,7 +76,7 @@ def read_yaml(path: Path) -> Source:
     if not isinstance(source.data, dict):
         kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
         raise DeclarationError(
-            origin, [Problem(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: averaging`")]
+            origin, [Problem(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: thesis`")]
         )
     return source
 
@@ -134,7 +134,7 @@ def _bytes_of(path: Path) -> bytes:
         raise DeclarationError(origin, [Problem(f"cannot be read ({error.strerror})", None)]) from error
     if len(content) > MAX_BYTES:
         raise DeclarationError(
-            origin, [Problem("the file is too large for an experiment", None, legal=f"at most {MAX_BYTES} bytes")]
+            origin, [Problem("the file is too large for a declaration", None, legal=f"at most {MAX_BYTES} bytes")]
         )
     return content
 
