@@ -16,11 +16,14 @@ NEAREST_M = 0.05
 
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
-    """Raise UserError where a part of the face is out of the camera's field of view or range."""
+    """Raise UserError where a part of the face is out of the camera's field of view, or all of it out of its range.
+
+    A face partly out of range is legal: its pixels there have no range, as they would have in the real camera.
+    """
     outline = transform_points(T_camera_board_of(config.pose), outline_board_m(config.board))
     seen_region(outline, optics)
     range_m = np.linalg.norm(outline, axis=-1)
-    if range_m.min() < optics.nearest_m or range_m.max() > optics.farthest_m:
+    if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(
             f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
             legal=f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}",

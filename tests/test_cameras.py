@@ -110,7 +110,9 @@ def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
     check_in_view(thesis(), optics)
     with pytest.raises(UserError, match="covers columns"):
         check_in_view(thesis(distance_m=0.35), optics)
-    near = type(optics)(**{**optics.__dict__, "nearest_m": 0.8})
+    partly = type(optics)(**{**optics.__dict__, "nearest_m": 0.72})
+    check_in_view(thesis(), partly)
+    near = type(optics)(**{**optics.__dict__, "nearest_m": 0.9})
     with pytest.raises(UserError, match=r"lies 0.\d+ to 0.\d+ m from the camera"):
         check_in_view(thesis(), near)
 

@@ -10,13 +10,15 @@ from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
+from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.closed_form import plane_view
-from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.unwrap import unwrap_table
-from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_signal
-from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, load_camera, read_camera
+from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m, with_signal
+from scenes.sensor.camera import CameraConfig, load_camera
 from scenes.sensor.effects import NONE
+from scenes.sensor.normals import normals_from_bits
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32
@@ -49,9 +51,10 @@ def test_output_is_whole_millimetres():
 
 
 def test_gain_meets_the_calibration_point():
-    electrons = calibrated_signal_electrons(CAMERA, frames=100, seed=5)
+    electrons = calibrated_signal_electrons(CAMERA, frames=60, seed=5)
     assert CAMERA.photons.signal_electrons.value == pytest.approx(electrons, rel=0.03)
-    assert temporal_sigma_m(CAMERA, 1.5, 0.8, 100, seed=6) == pytest.approx(0.89e-3, rel=0.02)
+    sigma_m = temporal_sigma_m(CAMERA, 1.5, 0.8, 100, seed=6)
+    assert with_jitter_m(CAMERA, sigma_m) == pytest.approx(0.89e-3, rel=0.02)
 
 
 def test_phase_noise_follows_the_closed_form():
@@ -62,7 +65,7 @@ def test_phase_noise_follows_the_closed_form():
     phases = []
     rng = random_stream(3)
     for _ in range(60):
-        unit, _amplitude = exposed(imager, exposure, rng)
+        unit, *_ = imager.phasors(exposure, rng)
         phases.append(np.angle((unit[0] + 1j * unit[1]) * np.exp(-1j * np.angle(view.phasor.reshape(3, -1)))))
     measured = np.std(phases, axis=0, ddof=1)
     electrons = CAMERA.photons.signal_electrons.value * view.intensity.ravel()
@@ -71,30 +74,22 @@ def test_phase_noise_follows_the_closed_form():
         assert np.sqrt((measured[f] ** 2).mean() / (expected**2).mean()) == pytest.approx(1, abs=0.015)
 
 
-def exposed(imager: AmcwImager, exposure, rng):
-    n = exposure.sigma.size
-    unit, amplitude = np.empty((2, 3, n), f4), np.empty((3, n), f4)
-    normals = rng.standard_normal((3, 3, n), dtype=f4)
-    kernels.expose(
-        exposure.means,
-        exposure.sigma,
-        normals,
-        f4(256),
-        f4(32704),
-        imager._cosines,
-        imager._sines,
-        unit,
-        amplitude,
-        np.empty(n, np.uint8),
-    )
-    return unit, amplitude
+def expose(means, sigma, normals, knee=256.0, limit=32704.0, gains=(1.0,)):
+    """`kernels.expose` on (f, k, n) samples: unit phasors (2, f, n), amplitudes (f, n), saturated (n,)."""
+    f, k, n = means.shape
+    steps = 2 * np.pi * np.arange(k) / k
+    unit, amplitude, saturated = np.empty((2, f, n), f4), np.empty((f, n), f4), np.empty(n, np.uint8)
+    limits, each = np.full(n, limit, f4), np.array(gains, f4)
+    cosines, sines = np.cos(steps).astype(f4), np.sin(steps).astype(f4)
+    kernels.expose(means, sigma, limits, normals, f4(knee), each, cosines, sines, unit, amplitude, saturated)
+    return unit, amplitude, saturated
 
 
 def test_normals_are_normal():
     """Kolmogorov-Smirnov at alpha 0.001 on 200,000 draws, against the transform in double precision, and the tails."""
     bits = np.random.default_rng(8).integers(0, 2**32, 200_000, dtype=np.uint32)
     out = np.empty(200_000, f4)
-    kernels.normals_from_bits(bits, out)
+    normals_from_bits(bits, out)
     u, v = ((bits[:100_000] >> 8) + 0.5) / 2**24, (bits[100_000:] >> 8) / 2**24
     radius = np.sqrt(-2 * np.log(u))
     assert out[:100_000] == pytest.approx(radius * np.cos(2 * np.pi * v), abs=2e-5)
@@ -116,57 +111,71 @@ def test_normal_samples_match_true_poisson_wells(electrons):
     wells = rng.poisson(electrons * (1 + modulated) / 2, (3, n)) - rng.poisson(electrons * (1 - modulated) / 2, (3, n))
     wells = wells + rng.normal(0, read * np.sqrt(2), (3, n))
     true_re = (2 / 3 * np.cos(steps) @ wells).ravel()
-    means = np.broadcast_to((electrons * modulated).astype(f4), (3, n))[None]
-    unit, amplitude = np.empty((2, 1, n), f4), np.empty((1, n), f4)
-    kernels.expose(
-        np.ascontiguousarray(means),
-        np.full(n, np.sqrt(electrons + 2 * read**2), f4),
-        rng.standard_normal((1, 3, n)).astype(f4),
-        f4(256),
-        f4(32704),
-        np.cos(steps).astype(f4),
-        np.sin(steps).astype(f4),
-        unit,
-        amplitude,
-        np.empty(n, np.uint8),
-    )
+    means = np.ascontiguousarray(np.broadcast_to((electrons * modulated).astype(f4), (3, n))[None])
+    sigma = np.full(n, np.sqrt(electrons + 2 * read**2), f4)
+    unit, amplitude, _ = expose(means, sigma, rng.standard_normal((1, 3, n)).astype(f4))
     ours = unit[0, 0] * amplitude[0]
     assert ours.var() == pytest.approx(true_re.var(), rel=0.03)
     # the kernel rounds samples to whole units; a uniform dither of that size makes both continuous
     assert stats.ks_2samp(ours + rng.uniform(-0.3, 0.3, n), true_re + rng.uniform(-0.3, 0.3, n)).pvalue > 0.001
 
 
-@pytest.mark.parametrize(("size", "step"), [(100, 1), (300, 1), (600, 2), (1500, 4), (20_000, 64)])
-def test_companding_steps_double_with_each_octave(size, step):
+@pytest.mark.parametrize(
+    ("knee", "size", "step"),
+    [(256, 100, 1), (256, 511, 1), (256, 600, 2), (256, 1500, 4), (256, 20_000, 64), (128, 250, 1), (128, 300, 2)],
+)
+def test_companding_steps_double_with_each_octave(knee, size, step):
     value = f4(size + 0.37 * step)
-    cosines, sines = np.array([1, 0, 0], f4), np.zeros(3, f4)
-    unit, amplitude, saturated = np.empty((2, 1, 1), f4), np.empty((1, 1), f4), np.empty(1, np.uint8)
+    # one sample beside two zeros has the phasor (2/3) value
     means = np.array([[[value], [0], [0]]], f4)
-    args = (np.zeros(1, f4), np.zeros((1, 3, 1), f4), f4(256), f4(32704), cosines, sines, unit, amplitude, saturated)
-    kernels.expose(means, *args)
+    _, amplitude, saturated = expose(means, np.zeros(1, f4), np.zeros((1, 3, 1), f4), knee)
     assert amplitude[0, 0] * 1.5 == pytest.approx(step * np.floor(value / step + 0.5), abs=1e-2)
     assert saturated[0] == 0
 
 
-@pytest.mark.parametrize("bright", [True, False])
-def test_bilateral_filter_equals_brute_force(bright):
+def test_a_saturated_pixel_has_no_phasor():
+    means = np.array([[[900.0, 1100.0], [0, 0], [0, 0]], [[100.0, 100.0], [0, 0], [0, 0]]], f4)
+    unit, amplitude, saturated = expose(means, np.zeros(2, f4), np.zeros((2, 3, 2), f4), 128, 1000.0, (1.0, 2.0))
+    assert saturated.tolist() == [0, 1]
+    assert (unit[:, :, 1] == 0).all() and (amplitude[:, 1] == 0).all()
+    # steps of 4 between 512 and 1023; the second frequency's gain is 2
+    assert amplitude[:, 0] == pytest.approx([900 * 2 / 3, 2 * 100 * 2 / 3])
+
+
+@pytest.mark.parametrize("bright", [True, False], ids=["bright", "dim"])
+@pytest.mark.parametrize(
+    ("half", "sigma_px", "drop_dim", "by_amplitude"), [(2, np.inf, False, False), (1, 3.0, True, True)]
+)
+def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, by_amplitude):
+    """Both cameras' variants, on a step of phase, against the formulas in NumPy; one pixel in eight is dim."""
     rng = np.random.default_rng(2)
     h, w = 9, 14
     phase = np.where(np.arange(w) < 7, 0.3, 1.4) + 0.2 * rng.standard_normal((h, w))
     unit = np.stack([np.cos(phase), np.sin(phase)]).astype(f4)
     amplitude = rng.uniform(50, 90, (h, w)).astype(f4) if bright else rng.uniform(1, 20, (h, w)).astype(f4)
+    amplitude[rng.random((h, w)) < 1 / 8] = 5.0
+    offset = np.arange(-half, half + 1)
+    space = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma_px**2))
     filtered, edge = np.empty((3, h, w), f4), np.empty((h, w), f4)
-    kernels.joint_bilateral(unit, amplitude, 2, f4(3.6067), f4(24), filtered, edge)
+    switches = f4(3.6067), f4(24), drop_dim, by_amplitude
+    kernels.joint_bilateral(unit, amplitude, space.astype(f4), *switches, filtered, edge)
     phasor = unit[0] + 1j * unit[1]
     for y in range(h):
         for x in range(w):
-            near = (slice(max(y - 2, 0), y + 3), slice(max(x - 2, 0), x + 3))
+            rows, columns = slice(max(y - half, 0), y + half + 1), slice(max(x - half, 0), x + half + 1)
+            near = rows, columns
             gap = 1 - np.real(phasor[near] * np.conj(phasor[y, x]))
-            weight = np.exp(-3.6067 * gap) if bright else np.ones_like(gap)
-            expected = (weight * phasor[near]).sum()
+            weight = np.ones_like(gap)
+            if amplitude[y, x] > 24:
+                weight = np.exp(-3.6067 * gap) * ((amplitude[near] >= 24) if drop_dim else 1)
+            edge_sum = (gap * (weight > 0)).sum() / 2
+            weight = weight * space[rows.start - y + half :, columns.start - x + half :][: gap.shape[0], : gap.shape[1]]
+            value = phasor[near] * (amplitude[near] if by_amplitude else 1)
+            expected = (weight * value).sum()
+            strength = abs(expected) if by_amplitude else (weight * amplitude[near]).sum()
             assert filtered[0, y, x] + 1j * filtered[1, y, x] == pytest.approx(expected, rel=1e-4, abs=1e-4)
-            assert filtered[2, y, x] == pytest.approx((weight * amplitude[near]).sum() / weight.sum(), rel=1e-4)
-            assert edge[y, x] == pytest.approx(gap.sum() / 2, rel=1e-3, abs=1e-4)
+            assert filtered[2, y, x] == pytest.approx(strength / weight.sum(), rel=1e-4)
+            assert edge[y, x] == pytest.approx(edge_sum, rel=1e-3, abs=1e-4)
 
 
 def test_noise_is_as_smooth_as_a_box_of_five_makes_it():
@@ -182,20 +191,40 @@ def test_noise_is_as_smooth_as_a_box_of_five_makes_it():
         assert (d[:, lag:] * d[:, :-lag]).mean() / variance == pytest.approx(expected, abs=0.02)
 
 
+def unwrapped(table, half_path):
+    """Half the path (n,) that the kernel finds from exact wrapped phases, and its squared residual."""
+    turn = np.ascontiguousarray(((half_path[:, None] / table.unambiguous_m * table.lattice) % 1).T, f4)
+    half, residual2 = np.empty(half_path.size, f4), np.empty(half_path.size, f4)
+    ranging.half_path(turn, half_path.size, table.for_kernel, half, residual2)
+    return half, residual2
+
+
 def test_unwrapping_recovers_every_distance():
-    table = unwrap_table(CAMERA.frequencies_hz)
+    table = unwrap_table(CAMERA.frequencies_hz, "least_squares")
     assert sorted(map(tuple, np.abs(table.combination))) == [(3, 2, 4), (3, 4, 3)]
     assert table.metres_per_turn * 1000 == pytest.approx([381.18, 363.85, 103.96], abs=0.01)
     half_path = np.linspace(0.06, 13.9, 20_000)
-    turn = (half_path[:, None] / table.unambiguous_m * table.lattice) % 1
-    found = [kernels._half_path(f4(a), f4(b), f4(c), *table.for_kernel()) for a, b, c in turn]
-    assert np.abs(np.array([f[0] for f in found]) - half_path).max() < 5e-6
-    assert max(f[1] for f in found) < 1e-10
+    half, residual2 = unwrapped(table, half_path)
+    assert np.abs(half - half_path).max() < 5e-6
+    assert residual2.max() < 1e-10
+
+
+@pytest.mark.parametrize("fusion", ["least_squares", "mean"])
+@pytest.mark.parametrize("frequencies_mhz", [(20.0,), (100.0, 80.0), (80.0, 16.0), (31.0, 30.0, 12.5)])
+def test_unwrapping_of_other_cameras(frequencies_mhz, fusion):
+    """One to three frequencies, up to the range after which all of them repeat: c / 2 by their greatest divisor."""
+    table = unwrap_table(tuple(f * 1e6 for f in frequencies_mhz), fusion)
+    repeats_m = {(20.0,): 20, (100.0, 80.0): 20, (80.0, 16.0): 16, (31.0, 30.0, 12.5): 0.5}[frequencies_mhz]
+    assert table.unambiguous_m == pytest.approx(SPEED_OF_LIGHT_AIR / (2e6 * repeats_m))
+    half_path = np.linspace(0.02, min(0.99 * table.unambiguous_m, 30), 5_000)
+    half, residual2 = unwrapped(table, half_path)
+    assert np.abs(half - half_path).max() < 3e-5
+    assert residual2.max() < 1e-9
 
 
 def test_unrelated_frequencies_are_refused():
     with pytest.raises(UserError, match="share no base frequency"):
-        unwrap_table((100e6, 100e6 * np.sqrt(2), 57.3e6))
+        unwrap_table((100e6, 100e6 * np.sqrt(2), 57.3e6), "mean")
 
 
 def test_emitter_beside_the_lens_is_corrected_for():
@@ -272,16 +301,3 @@ def test_more_light_less_noise():
     """Shot-limited: four times the light halves the deviation (rounding and read noise allow 10 %)."""
     dim, bright = (temporal_sigma_m(with_signal(CAMERA, e), 2.5, 0.5, 60, 1) for e in (1000, 4000))
     assert dim / bright == pytest.approx(2, rel=0.1)
-
-
-def test_camera_file_errors_name_file_and_key(tmp_path):
-    text = read_text = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
-    path = tmp_path / "mine.yaml"
-    path.write_text(text.replace("fx_px: {value: 504.647", "fx_px: {value: 0.0"))
-    with pytest.raises(UserError, match=r"mine\.yaml(.|\n)*lens\.fx_px must be above 0"):
-        read_camera(path)
-    path.write_text(read_text.replace("  window_px:", "  widow_px:"))
-    with pytest.raises(UserError, match=r"engine\.widow_px(.|\n)*engine\.window_px|engine\.window_px(.|\n)*widow_px"):
-        read_camera(path)
-    with pytest.raises(UserError, match="did you mean 'azure_kinect_nfov'"):
-        load_camera("azure_kinect_nfv")

@@ -18,13 +18,14 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 
-AnyCamera = AmcwCamera
+AnyCamera = AmcwCamera | ScannedLidar
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
 
-KINDS: dict[str, type[AnyCamera]] = {"amcw_imager": AmcwCamera}
+KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar]] = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar}
 
 
 class CameraConfig(Config):
@@ -39,6 +40,13 @@ class CameraConfig(Config):
     edge_gate: bool = Field(
         True,
         description="whether the engine's edge threshold acts; its rule is an inference, so studies vary it",
+    )
+    ambient_uw_cm2_nm: float = Field(
+        0.04,
+        ge=0,
+        le=200,
+        description="irradiance by daylight or lamps at the camera's wavelength, microwatts per square centimetre and "
+        "nanometre; 0.04 is a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 full sun",
     )
     minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="how far the unit has warmed up")
     numbers: dict[str, Any] = Field(

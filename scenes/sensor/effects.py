@@ -19,8 +19,12 @@ class EffectsConfig(Config):
     fixed_pattern: bool = Field(True, description="the unit's own error of range in each pixel")
     unit_offset: bool = Field(True, description="the unit's own constant error of range")
     warm_up_drift: bool = Field(True, description="error of range that decays after power-on")
-    ambient: bool = Field(True, description="the noise of daylight or lamps; its level is the camera's number")
-    saturation: bool = Field(True, description="samples beyond the converter's full scale are invalid")
+    ambient: bool = Field(
+        True, description="light of the surroundings, as much as `ambient_uw_cm2_nm`: its noise, and the room it takes"
+    )
+    saturation: bool = Field(
+        True, description="what exceeds a pixel's or its converter's full scale is cut off and invalid"
+    )
     frame_jumps: bool = Field(True, description="whole frames displaced: rare jumps, and a small jitter")
 
 

@@ -10,6 +10,8 @@ from harness.vocabulary.geometry import Region
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera, CameraConfig
 from scenes.sensor.decoded import Decoded
+from scenes.sensor.lidar.facts import ScannedLidar
+from scenes.sensor.lidar.scanner import LidarScanner
 from scenes.view import NoiseFreeView
 
 
@@ -27,4 +29,6 @@ class SensorModel(Protocol):
 
 def model_of(camera: AnyCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> SensorModel:
     """The model of a camera's kind on a region whose pixels look along ``slopes`` (h, w, 2)."""
+    if isinstance(camera, ScannedLidar):
+        return LidarScanner(camera, config, region, slopes)
     return AmcwImager(camera, config, region, slopes)

@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy import ndimage
 
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.sensor.effects import EffectsConfig
 from scenes.sensor.facts import UnitFacts
+
+
+def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
+    """White noise (h, w) of unit variance made smooth: unit variance, autocorrelation exp(-k^2 / 2 length^2), periodic.
+
+    Through a Gaussian of s it has autocorrelation exp(-k^2 / 4 s^2), so s = length / sqrt 2, and its variance falls to
+    1 / (4 pi s^2).
+    """
+    s = length_px / np.sqrt(2)
+    return np.asarray(ndimage.gaussian_filter(white, s, mode="wrap") * (2 * np.sqrt(np.pi) * s))
 
 
 def static_error_m(facts: UnitFacts, effects: EffectsConfig, camera: str, unit_seed: int) -> float:

@@ -1,4 +1,4 @@
-"""Speed of the simulated camera: ``pytest tests/benchmarks/bench_sensor.py --benchmark-only`` with one thread each.
+"""Speed of the simulated imagers: ``pytest tests/benchmarks/bench_sensor.py --benchmark-only`` with one thread each.
 
 Nothing here asserts a time. The filter stands in one group in three languages, so that the table shows their ratios:
 the compiled kernel that the camera uses, the same in Dr.Jit (traced at each call, and frozen), and in NumPy.
@@ -17,15 +17,19 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.imager import AmcwImager, Exposure
+from scenes.sensor.amcw.exposure import Exposure
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.normals import standard_normals
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32
 CAMERA = load_camera("azure_kinect_nfov")
-LENS = CAMERA.nominal_lens
+assert isinstance(CAMERA, AmcwCamera)
 BOARD = Region(258, 408, 222, 422)
 """30,000 pixels, about the board's part of a picture."""
+V2_BOARD = Region(137, 287, 156, 356)
 HALF = CAMERA.engine.window_px.value // 2
 CONCENTRATION = f4(CAMERA.engine.concentration.value)
 DIM = f4(CAMERA.engine.dim_amplitude_units.value)
@@ -37,57 +41,26 @@ class Stages:
 
     imager: AmcwImager
     exposure: Exposure
-    normals: np.ndarray
     unit: np.ndarray
     amplitude: np.ndarray
     saturated: np.ndarray
     filtered: np.ndarray
     edge: np.ndarray
 
-    def expose(self) -> None:
-        converter = self.imager.camera.converter
-        kernels.expose(
-            self.exposure.means,
-            self.exposure.sigma,
-            self.normals,
-            f4(converter.knee_units.value),
-            f4(converter.full_scale_units.value),
-            self.imager._cosines,
-            self.imager._sines,
-            self.unit,
-            self.amplitude,
-            self.saturated,
-        )
-
-    def filter(self, frequency: int) -> None:
-        planes = self.unit[:, frequency].reshape(2, *self.exposure.shape)
-        amplitude = self.amplitude[frequency].reshape(self.exposure.shape)
+    def filter_one(self) -> None:
+        """The filter of the first frequency."""
+        planes, amplitude = filter_inputs(self)
+        window = self.imager._window
         kernels.joint_bilateral(
-            planes, amplitude, HALF, CONCENTRATION, DIM, self.filtered[frequency], self.edge[frequency]
+            planes, amplitude, window, CONCENTRATION, DIM, False, False, self.filtered[0], self.edge[0]
         )
 
-    def decode(self) -> np.ndarray:
-        n = self.saturated.size
-        z_m, reason, strength = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
-        kernels.range_and_gates(
-            self.filtered.reshape(3, 3, n),
-            self.edge.reshape(3, n),
-            self.saturated,
-            self.imager._geometry,
-            self.imager.outside_mask.reshape(-1),
-            self.imager._tables,
-            self.imager._gates,
-            z_m,
-            reason,
-            strength,
-        )
-        return z_m
 
-
-def unit_on(region: Region) -> SimulatedUnit:
+def unit_on(region: Region, camera: AmcwCamera = CAMERA) -> SimulatedUnit:
     """A unit before a board of 0.75 m, with the margin that the filter needs."""
-    outer = region.grown(CAMERA.margin_px, LENS.height, LENS.width)
-    return SimulatedUnit(CAMERA, CameraConfig(), plane_view(CAMERA, outer, 0.75, 0.6, 0.1, 0.05))
+    lens = camera.nominal_lens
+    outer = region.grown(camera.margin_px, lens.height, lens.width)
+    return SimulatedUnit(camera, CameraConfig(name=camera.name), plane_view(camera, outer, 0.75, 0.6, 0.1, 0.05))
 
 
 @pytest.fixture(scope="module")
@@ -95,30 +68,24 @@ def stages() -> Stages:
     view = plane_view(CAMERA, BOARD, 0.75, 0.6, 0.1, 0.05)
     imager = AmcwImager(CAMERA, CameraConfig(), BOARD, view.slopes)
     exposure = imager.expose(view)
-    n = exposure.sigma.size
-    arrays = Stages(
-        imager,
-        exposure,
-        random_stream(1).standard_normal((3, 3, n), dtype=f4),
-        np.empty((2, 3, n), f4),
-        np.empty((3, n), f4),
-        np.empty(n, np.uint8),
-        np.empty((3, 3, *exposure.shape), f4),
-        np.empty((3, *exposure.shape), f4),
-    )
-    arrays.expose()
-    for frequency in range(3):
-        arrays.filter(frequency)
-    return arrays
+    unit, amplitude, saturated = imager.phasors(exposure, random_stream(1))
+    return Stages(imager, exposure, unit, amplitude, saturated, *imager.filter(unit, amplitude, exposure.shape))
 
 
 # ---------------------------------------------------------------- whole frames
 
 
 @pytest.mark.benchmark(group="whole frame")
-@pytest.mark.parametrize("region", [BOARD, LENS.whole], ids=["30,000 pixels", "640 x 576"])
-def test_a_simulated_frame(benchmark: Any, region: Region) -> None:
-    unit, rng = unit_on(region), random_stream(1)
+@pytest.mark.parametrize(
+    ("name", "region"),
+    [("azure_kinect_nfov", BOARD), ("azure_kinect_nfov", None), ("kinect_v2", V2_BOARD), ("kinect_v2", None)],
+    ids=["Azure 30,000 pixels", "Azure 640 x 576", "v2 30,000 pixels", "v2 512 x 424"],
+)
+def test_a_simulated_frame(benchmark: Any, name: str, region: Region | None) -> None:
+    camera = load_camera(name)
+    assert isinstance(camera, AmcwCamera)
+    unit, rng = unit_on(region or camera.nominal_lens.whole, camera), random_stream(1)
+    unit.model.frame(unit.exposure, rng)
     decoded = benchmark(unit.model.frame, unit.exposure, rng)
     assert np.isfinite(decoded.z_m).mean() > 0.3
 
@@ -145,33 +112,29 @@ def test_add_30_000_pixels_to_an_average(benchmark: Any) -> None:
     benchmark.pedantic(running.add, args=(frame,), rounds=300, iterations=1, warmup_rounds=5)
 
 
-# ---------------------------------------------------------------- each kernel, 30,000 pixels
+# ---------------------------------------------------------------- each part, 30,000 pixels
 
 
-@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+@pytest.mark.benchmark(group="parts, 30,000 pixels")
 def test_normals(benchmark: Any, stages: Stages) -> None:
-    rng, out = random_stream(1), np.empty(stages.normals.size, f4)
-    benchmark(lambda: kernels.normals_from_bits(rng.bit_generator.random_raw(out.size // 2).view(np.uint32), out))
-    assert out.std() == pytest.approx(1, abs=0.02)
+    rng = random_stream(1)
+    assert benchmark(standard_normals, rng, stages.exposure.means.shape).std() == pytest.approx(1, abs=0.02)
 
 
-@pytest.mark.benchmark(group="kernels, 30,000 pixels")
-def test_expose(benchmark: Any, stages: Stages) -> None:
-    benchmark(stages.expose)
+@pytest.mark.benchmark(group="parts, 30,000 pixels")
+def test_normals_and_samples(benchmark: Any, stages: Stages) -> None:
+    benchmark(stages.imager.phasors, stages.exposure, random_stream(1))
 
 
-@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+@pytest.mark.benchmark(group="parts, 30,000 pixels")
 def test_filter_three_frequencies(benchmark: Any, stages: Stages) -> None:
-    def three() -> None:
-        for frequency in range(3):
-            stages.filter(frequency)
-
-    benchmark(three)
+    benchmark(stages.imager.filter, stages.unit, stages.amplitude, stages.exposure.shape)
 
 
-@pytest.mark.benchmark(group="kernels, 30,000 pixels")
+@pytest.mark.benchmark(group="parts, 30,000 pixels")
 def test_range_and_gates(benchmark: Any, stages: Stages) -> None:
-    assert np.isfinite(benchmark(stages.decode)).all()
+    decoded = benchmark(stages.imager._decode, stages.filtered, stages.edge, stages.saturated, 0.0)
+    assert np.isfinite(decoded.z_m).all()
 
 
 # ---------------------------------------------------------------- the filter in three languages
@@ -260,7 +223,7 @@ def assert_same(stages: Stages, filtered: np.ndarray, edge: np.ndarray) -> None:
 
 @pytest.mark.benchmark(group="filter of one frequency, 30,000 pixels")
 def test_filter_numba(benchmark: Any, stages: Stages) -> None:
-    benchmark(stages.filter, 0)
+    benchmark(stages.filter_one)
 
 
 @pytest.mark.benchmark(group="filter of one frequency, 30,000 pixels")

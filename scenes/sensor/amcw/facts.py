@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import model_validator
@@ -12,68 +12,161 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.optics import Optics, PixelFootprint
-from scenes.sensor.facts import Fact, LensFacts, UnitFacts
+from scenes.sensor.facts import (
+    Fact,
+    HalfAngle,
+    LensFacts,
+    NonNegative,
+    Positive,
+    PositiveInt,
+    Share,
+    UnitFacts,
+    Wavelength,
+    above_zero,
+    checked,
+    share,
+)
+
+PositiveEach = Annotated[Fact[tuple[float, ...]], above_zero]
+ShareEach = Annotated[Fact[tuple[float, ...]], share]
+Window = Annotated[Fact[int], checked("an odd number above 0", lambda value: value > 0 and value % 2 == 1)]
+Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
+WIDEST_PX = 2128
+"""Longest row, the filter's window included: `kernels.STRIDE`, written again so that declarations compile nothing."""
 
 
 class EmitterFacts(Config):
-    """The light source: a point beside the lens, uniform intensity in a cone with a linear roll-off."""
+    """The light source: a point beside the lens, uniform intensity in a cone with a linear roll-off.
+
+    ``irradiance_w_m2``: its light on a surface that faces it on the axis at 1 m, averaged over an exposure; only
+    ambient light is measured by it. ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a
+    convex polygon outside which the camera gives no range; None where there is none.
+    """
 
     position_mm: Fact[tuple[float, float, float]]
-    full_half_angle_deg: Fact[float]
-    cutoff_half_angle_deg: Fact[float]
-    mask_slopes: Fact[tuple[tuple[float, float], ...]]
+    full_half_angle_deg: HalfAngle
+    cutoff_half_angle_deg: HalfAngle
+    irradiance_w_m2: Positive
+    mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
 
 
 class ModulationFacts(Config):
-    """Continuous-wave modulation."""
+    """Continuous-wave modulation: one value per frequency but for ``phases``.
 
-    frequencies_hz: Fact[tuple[float, ...]]
-    phases: Fact[int]
-    contrast: Fact[tuple[float, ...]]
+    ``contrast``: amplitude of the fundamental by the light's mean. ``wiggling_residual``: what is left, after limited
+    bandwidth and factory calibration, of the harmonics that square light under square demodulation would show.
+    """
+
+    frequencies_hz: PositiveEach
+    phases: Phases
+    contrast: ShareEach
+    wiggling_residual: ShareEach
+
+    @model_validator(mode="after")
+    def _one_value_each(self) -> ModulationFacts:
+        count = len(self.frequencies_hz.value)
+        if not 1 <= count <= 3:
+            raise ValueError(f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3")
+        for key in ("contrast", "wiggling_residual"):
+            if len(getattr(self, key).value) != count:
+                raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
+        return self
 
 
 class PhotonFacts(Config):
-    """The photon budget: one gain, calibrated at one point; the rest is physics."""
+    """The photon budget: one gain, calibrated at one point; the rest is physics.
 
-    signal_electrons: Fact[float]
-    calibration_sigma_mm: Fact[float]
-    calibration_distance_m: Fact[float]
-    calibration_albedo: Fact[float]
-    ambient_electrons: Fact[float]
-    read_noise_electrons: Fact[float]
-    electrons_per_unit: Fact[float]
+    ``signal_electrons``: of both wells in one exposure, albedo 1, facing, on the axis at 1 m. ``full_well_electrons``
+    of one well (None: only the converter saturates). ``band_nm``: width of the band-pass filter before the sensor.
+    """
+
+    signal_electrons: Positive
+    calibration_sigma_mm: Positive
+    calibration_distance_m: Positive
+    calibration_albedo: Positive
+    read_noise_electrons: NonNegative
+    electrons_per_unit: Positive
+    full_well_electrons: Positive | None = None
+    band_nm: Positive
 
 
 class ConverterFacts(Config):
-    """Companding converter: unit steps below the knee, then steps that double with each octave."""
+    """Companding converter of a sample's size: unit steps below twice the knee, doubling with each octave above.
 
-    knee_units: Fact[int]
-    full_scale_units: Fact[int]
+    A knee of half the full scale or more makes a linear converter.
+    """
+
+    knee_units: PositiveInt
+    full_scale_units: PositiveInt
 
 
 class FixedPatternFacts(Config):
     """What is the same in every frame of one unit: a smooth and a per-pixel error of range."""
 
-    smooth_mm: Fact[float]
-    smooth_length_px: Fact[float]
-    pixel_mm: Fact[float]
+    smooth_mm: NonNegative
+    smooth_length_px: Positive
+    pixel_mm: NonNegative
+
+
+class ResidualByAmplitudeFacts(Config):
+    """Lattice residual that dim pixels may have: ``scale_turns`` A^``slope`` of the amplitude A of the brightest
+    frequency, at most ``greatest_turns`` and at least the engine's ``lattice_residual_turns``."""
+
+    scale_turns: Positive
+    slope: Fact[float]
+    greatest_turns: Positive
+
+
+class FlyingPixelFacts(Config):
+    """The gate on the finished range image, 3x3: a pixel goes where its neighbours reach more than ``near_mm`` nearer
+    and ``far_mm`` farther, either more than ``most_mm``, and their summed amplitudes scatter by ``relative_deviation``
+    of their mean or more (the mean taken as at least ``least_mean_units``)."""
+
+    relative_deviation: NonNegative
+    least_mean_units: NonNegative
+    near_mm: NonNegative
+    far_mm: NonNegative
+    most_mm: NonNegative
 
 
 class EngineFacts(Config):
-    """The depth engine: phase-space filter, gates, output."""
+    """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is none.
 
-    window_px: Fact[int]
-    concentration: Fact[float]
-    dim_amplitude_units: Fact[float]
-    edge_threshold: Fact[float]
-    lattice_residual_turns: Fact[float]
-    amplitude_ratio: Fact[float]
-    min_amplitude_units: Fact[float]
-    min_amplitude_sum_units: Fact[float]
-    min_reflectivity_units_mm2: Fact[float]
-    min_range_mm: Fact[float]
-    max_range_mm: Fact[float]
-    output_step_mm: Fact[float]
+    ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
+    ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
+    weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
+    ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: whether the limits of
+    range are meant along the ray or along the optical axis.
+    """
+
+    window_px: Window
+    filter_on: Fact[Literal["unit_phasors", "phasors"]]
+    spatial_sigma_px: Positive | None = None
+    concentration: NonNegative
+    dim_amplitude_units: NonNegative
+    drop_dim_neighbours: Fact[bool]
+    fusion: Fact[Literal["least_squares", "mean"]]
+    amplitude_gains: PositiveEach
+    edge_threshold: Positive | None = None
+    lattice_residual_turns: Positive | None = None
+    residual_by_amplitude: ResidualByAmplitudeFacts | None = None
+    amplitude_ratio: Share | None = None
+    min_amplitude_units: NonNegative
+    min_amplitude_sum_units: NonNegative
+    min_reflectivity_units_mm2: NonNegative | None = None
+    min_range_mm: Positive
+    max_range_mm: Positive
+    limits_along: Fact[Literal["ray", "axis"]]
+    flying_pixels: FlyingPixelFacts | None = None
+    output_step_mm: Positive
+
+    @model_validator(mode="after")
+    def _gates_can_hold(self) -> EngineFacts:
+        if self.min_range_mm.value >= self.max_range_mm.value:
+            raise ValueError("min_range_mm must be less than max_range_mm")
+        if self.residual_by_amplitude and not self.lattice_residual_turns:
+            raise ValueError("residual_by_amplitude needs lattice_residual_turns, the least that it gives")
+        return self
 
 
 class AmcwCamera(Config):
@@ -82,7 +175,7 @@ class AmcwCamera(Config):
     name: str
     title: str
     kind: Literal["amcw_imager"]
-    wavelength_nm: Fact[float]
+    wavelength_nm: Wavelength
     lens: LensFacts
     emitter: EmitterFacts
     modulation: ModulationFacts
@@ -93,28 +186,12 @@ class AmcwCamera(Config):
     engine: EngineFacts
 
     @model_validator(mode="after")
-    def _possible(self) -> AmcwCamera:
-        must_be_positive: dict[str, Any] = {
-            "lens.width_px": self.lens.width_px,
-            "lens.height_px": self.lens.height_px,
-            "lens.fx_px": self.lens.fx_px,
-            "lens.fy_px": self.lens.fy_px,
-            "photons.signal_electrons": self.photons.signal_electrons,
-            "photons.electrons_per_unit": self.photons.electrons_per_unit,
-            "engine.window_px": self.engine.window_px,
-            "engine.output_step_mm": self.engine.output_step_mm,
-        }
-        for key, fact in must_be_positive.items():
-            if not fact.value > 0:
-                raise ValueError(f"{key} must be above 0, not {fact.value}")
-        if min(self.modulation.frequencies_hz.value) <= 0:
-            raise ValueError("modulation.frequencies_hz must all be above 0")
-        if len(self.modulation.contrast.value) != len(self.modulation.frequencies_hz.value):
-            raise ValueError("modulation.contrast needs one value for each of modulation.frequencies_hz")
-        if self.modulation.phases.value < 3:
-            raise ValueError("modulation.phases must be at least 3 to tell phase, amplitude and offset apart")
-        if self.engine.window_px.value % 2 == 0:
-            raise ValueError("engine.window_px must be odd")
+    def _parts_fit_each_other(self) -> AmcwCamera:
+        widest_px = WIDEST_PX - self.engine.window_px.value + 1
+        if self.lens.width_px.value > widest_px:
+            raise ValueError(f"lens.width_px is {self.lens.width_px.value}; the model takes {widest_px} at most")
+        if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
+            raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
         return self
 
     @cached_property
@@ -134,8 +211,8 @@ class AmcwCamera(Config):
 
     @property
     def margin_px(self) -> int:
-        """Pixels beyond a region whose light reaches it through the engine's window."""
-        return self.engine.window_px.value // 2
+        """Pixels beyond a region whose light reaches it through the engine's windows."""
+        return self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0)
 
     @property
     def z_step_m(self) -> float:
@@ -155,4 +232,6 @@ class AmcwCamera(Config):
             footprint=PixelFootprint(),
             wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
+            nearest_m=self.engine.min_range_mm.value * MM,
+            farthest_m=self.engine.max_range_mm.value * MM,
         )

@@ -1,44 +1,35 @@
 """The continuous-wave imager: phasors to samples to filtered phasors to range, with a reason for each invalid pixel.
 
-Modelled: shot and read noise on the samples, companding, saturation, fixed pattern, the phase-space joint bilateral
-filter, three-frequency unwrapping, the engine's gates, the correction for the emitter beside the lens, rounding; the
-lens' natural fall-off of light towards the edge of the image.
-Not modelled: harmonics of the modulation (wiggling), drift with temperature, lens blur and stray light beyond the
-pixel's own footprint, motion, cross-talk between pixels, per-pixel gain switching, and any post-processing beyond this.
+One model for every camera of its kind; what tells them apart is data (`scenes.sensor.amcw.facts`).
+Modelled: shot and read noise on the samples, harmonics, ambient light, companding, saturation, fixed pattern and drift,
+the phase-space joint bilateral filter, unwrapping of one to three frequencies, the engine's gates, the correction for
+the emitter beside the lens, rounding; the lens' natural fall-off of light towards the edge of the image.
+Not modelled: lens blur and stray light beyond the pixel's own footprint, motion, cross-talk between pixels, per-pixel
+gain switching, errors of phase that differ between frequencies other than harmonics, and any post-processing beyond
+this. Real engines keep tables of each unit's lens, emitter and phase offsets; here they are exact, and what such tables
+leave is the fixed pattern and the unit's offset.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
 
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
-from scenes.sensor.amcw import kernels
+from harness.vocabulary.units import MM
+from scenes.sensor.amcw import kernels, ranging
+from scenes.sensor.amcw.exposure import Exposure, exposure_of
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.unwrap import UnwrapTable, unwrap_table
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.decoded import Decoded
-from scenes.sensor.unit import drift_m, static_error_m
+from scenes.sensor.normals import standard_normals
+from scenes.sensor.unit import drift_m, smooth_field, static_error_m
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """What the converter sees of one view before noise, in converter units, flat over n = h w pixels.
-
-    ``means`` (f, k, n): noise-free samples; ``sigma`` (n,): deviation of each sample; ``shape``: (h, w).
-    """
-
-    means: np.ndarray
-    sigma: np.ndarray
-    shape: tuple[int, int]
 
 
 class AmcwImager:
@@ -49,22 +40,24 @@ class AmcwImager:
         self.config = config
         self.region = region
         self.slopes = slopes
-        self._frequencies = np.array(camera.frequencies_hz)
         phases = 2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
         self._cosines = np.cos(phases).astype(f4)
         self._sines = np.sin(phases).astype(f4)
+        self._gains = np.array(camera.engine.amplitude_gains.value, f4)
 
     @cached_property
     def unwrap(self) -> UnwrapTable:
         """The unwrapping tables of this camera's frequencies."""
-        return unwrap_table(self.camera.frequencies_hz)
+        return unwrap_table(self.camera.frequencies_hz, self.camera.engine.fusion.value)
 
     @cached_property
     def outside_mask(self) -> np.ndarray:
-        """(h, w) bool: pixels that look beyond the illuminated polygon."""
-        corners = np.array(self.camera.emitter.mask_slopes.value)
+        """(h, w) bool: pixels that look beyond the illuminated polygon, if the camera has one."""
         x, y = self.slopes[..., 0], self.slopes[..., 1]
         outside = np.zeros(x.shape, bool)
+        if self.camera.emitter.mask_slopes is None:
+            return outside
+        corners = np.array(self.camera.emitter.mask_slopes.value)
         for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             outside |= (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) < 0
         return outside
@@ -91,10 +84,7 @@ class AmcwImager:
         lens = self.camera.nominal_lens
         rng = random_stream(self.config.unit_seed, "fixed pattern", self.camera.name)
         smooth, pixel = rng.standard_normal((2, lens.height, lens.width), dtype=f4)
-        # White noise through a Gaussian of s has autocorrelation exp(-k^2 / 4 s^2): s = l / sqrt 2; its variance falls
-        # to 1 / (4 pi s^2).
-        s = facts.smooth_length_px.value / np.sqrt(2)
-        smooth = ndimage.gaussian_filter(smooth, s, mode="wrap") * (2 * np.sqrt(np.pi) * s)
+        smooth = smooth_field(smooth, facts.smooth_length_px.value)
         field = (facts.smooth_mm.value * smooth + facts.pixel_mm.value * pixel) * MM * self.config.fixed_pattern_scale
         return field[self.region.within(lens.whole)]
 
@@ -108,85 +98,85 @@ class AmcwImager:
 
     def expose(self, view: NoiseFreeView) -> Exposure:
         """The noise-free samples of a view that covers this imager's region."""
-        photons = self.camera.photons
-        electrons = photons.signal_electrons.value * self.gathered
-        delay = np.exp(
-            1j * 2 * np.pi * self._frequencies[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
-        )
-        contrast = np.array(self.camera.modulation.contrast.value)[:, None, None]
-        phasor = view.phasor if self.config.effects.multipath else view.phasor_direct
-        signal = contrast * electrons * phasor * delay / photons.electrons_per_unit.value
-        samples = (
-            signal.real[:, None] * self._cosines[None, :, None, None]
-            + signal.imag[:, None] * self._sines[None, :, None, None]
-        )
-        variance = electrons * view.intensity + photons.ambient_electrons.value
-        variance = variance + 2 * photons.read_noise_electrons.value**2
-        sigma = np.sqrt(variance) / photons.electrons_per_unit.value
-        if not self.config.effects.noise:
-            sigma = np.zeros_like(sigma)
-        n = sigma.size
-        return Exposure(
-            samples.reshape(*samples.shape[:2], n).astype(f4), sigma.reshape(n).astype(f4), view.intensity.shape
-        )
+        return exposure_of(self.camera, self.config, view, self.gathered, self.static_error_m)
 
     def frame(self, exposure: Exposure, rng: np.random.Generator, error_m: float = 0.0) -> Decoded:
         """One frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
-        n_frequencies, n_phases, n = exposure.means.shape
-        normals = _standard_normals(rng, (n_frequencies, n_phases, n))
+        unit, amplitude, saturated = self.phasors(exposure, rng)
+        return self._decode(*self.filter(unit, amplitude, exposure.shape), saturated, error_m)
+
+    def phasors(self, exposure: Exposure, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One noisy reading: unit phasors (2, f, n), amplitudes (f, n) times the gains, saturated (n,) uint8."""
+        n_frequencies, _, n = exposure.means.shape
         unit = np.empty((2, n_frequencies, n), f4)
         amplitude = np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
-        converter = self.camera.converter
         kernels.expose(
             exposure.means,
             exposure.sigma,
-            normals,
-            f4(converter.knee_units.value),
-            f4(converter.full_scale_units.value),
+            exposure.limit,
+            standard_normals(rng, exposure.means.shape),
+            f4(self.camera.converter.knee_units.value),
+            self._gains,
             self._cosines,
             self._sines,
             unit,
             amplitude,
             saturated,
         )
-        return self._decode(unit, amplitude, saturated, exposure.shape, error_m)
+        return unit, amplitude, saturated
 
-    def _decode(
-        self, unit: np.ndarray, amplitude: np.ndarray, saturated: np.ndarray, shape: tuple[int, int], error_m: float
-    ) -> Decoded:
-        """The depth engine: filter, unwrap, gate, correct, round."""
+    def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """The engine's joint bilateral filter: phasors and amplitudes (f, 3, h, w), and edge sums (f, h, w)."""
         engine = self.camera.engine
-        n_frequencies = unit.shape[1]
-        filtered = np.empty((n_frequencies, 3, *shape), f4)
-        edge = np.empty((n_frequencies, *shape), f4)
-        for f in range(n_frequencies):
+        filtered = np.empty((len(amplitude), 3, *shape), f4)
+        edge = np.empty((len(amplitude), *shape), f4)
+        for f in range(len(amplitude)):
             kernels.joint_bilateral(
                 unit[:, f].reshape(2, *shape),
                 amplitude[f].reshape(shape),
-                engine.window_px.value // 2,
+                self._window,
                 f4(engine.concentration.value),
                 f4(engine.dim_amplitude_units.value),
+                engine.drop_dim_neighbours.value,
+                engine.filter_on.value == "phasors",
                 filtered[f],
                 edge[f],
             )
-        z_m = np.empty(shape, f4)
-        reason = np.empty(shape, np.uint8)
-        strength = np.empty(shape, f4)
-        kernels.range_and_gates(
+        return filtered, edge
+
+    def _decode(self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float) -> Decoded:
+        """The rest of the depth engine: unwrap, correct, gate, round."""
+        n_frequencies, _, *shape = filtered.shape
+        z_m, total, reason = np.empty(shape, f4), np.empty(shape, f4), np.empty(shape, np.uint8)
+        ranging.range_and_gates(
             filtered.reshape(n_frequencies, 3, -1),
             edge.reshape(n_frequencies, -1),
             saturated,
             self._geometry,
             self.outside_mask.reshape(-1),
-            self._tables,
+            self.unwrap.for_kernel,
             self._gates,
             f4(error_m),
             z_m.reshape(-1),
             reason.reshape(-1),
-            strength.reshape(-1),
+            total.reshape(-1),
         )
-        return Decoded(z_m, reason, strength)
+        if self._flying_gate:
+            ranging.gate_flying_pixels(z_m, total, reason, self._flying_gate)
+        ranging.round_valid(z_m.reshape(-1), reason.reshape(-1), f4(self.camera.z_step_m))
+        return Decoded(z_m, reason, total / f4(n_frequencies))
+
+    @cached_property
+    def _window(self) -> np.ndarray:
+        """(k, k) float32: the filter's weights by distance."""
+        engine = self.camera.engine
+        half = engine.window_px.value // 2
+        if engine.spatial_sigma_px is None:
+            return np.ones((2 * half + 1, 2 * half + 1), f4)
+        squared = np.arange(-half, half + 1) ** 2
+        gauss = np.exp(-squared / (2 * engine.spatial_sigma_px.value**2))
+        return np.asarray(np.outer(gauss, gauss), f4)
 
     @cached_property
     def _geometry(self) -> np.ndarray:
@@ -198,30 +188,29 @@ class AmcwImager:
         return np.stack([along, np.full_like(along, emitter @ emitter), 1 / length]).reshape(3, -1).astype(f4)
 
     @cached_property
-    def _tables(self) -> tuple[np.ndarray, np.ndarray, int, int, np.ndarray, np.ndarray, np.ndarray]:
-        return self.unwrap.for_kernel()
+    def _gates(self) -> ranging.Gates:
+        engine = self.camera.engine
+        edge, lattice, by_amplitude = engine.edge_threshold, engine.lattice_residual_turns, engine.residual_by_amplitude
+        values = {
+            "edge": edge.value if edge and self.config.edge_gate else np.inf,
+            "residual": lattice.value if lattice else np.inf,
+            "residual_most": by_amplitude.greatest_turns.value if by_amplitude else np.inf,
+            "residual_scale": by_amplitude.scale_turns.value if by_amplitude else 0.0,
+            "residual_slope": by_amplitude.slope.value if by_amplitude else 0.0,
+            "ratio": engine.amplitude_ratio.value if engine.amplitude_ratio else np.inf,
+            "least": engine.min_amplitude_units.value,
+            "total": engine.min_amplitude_sum_units.value,
+            "reflectivity": (r.value if (r := engine.min_reflectivity_units_mm2) else 0.0) * MM**2,
+            "nearest_m": engine.min_range_mm.value * MM,
+            "farthest_m": engine.max_range_mm.value * MM,
+            "axial": engine.limits_along.value == "axis",
+        }
+        return ranging.Gates(**{name: f4(value) for name, value in values.items()})
 
     @cached_property
-    def _gates(self) -> tuple[np.float32, ...]:
-        engine = self.camera.engine
-        values = (
-            engine.edge_threshold.value if self.config.edge_gate else np.inf,
-            engine.lattice_residual_turns.value**2,
-            engine.amplitude_ratio.value,
-            engine.min_amplitude_units.value,
-            engine.min_amplitude_sum_units.value,
-            engine.min_reflectivity_units_mm2.value * MM**2,
-            engine.min_range_mm.value * MM,
-            engine.max_range_mm.value * MM,
-            engine.output_step_mm.value * MM,
-        )
-        return tuple(f4(value) for value in values)
-
-
-def _standard_normals(rng: np.random.Generator, shape: tuple[int, int, int]) -> np.ndarray:
-    """Standard normals from the generator's raw words; one more word where the count is odd."""
-    count = int(np.prod(shape))
-    even = count + count % 2
-    out = np.empty(even, f4)
-    kernels.normals_from_bits(rng.bit_generator.random_raw(even // 2).view(np.uint32), out)
-    return out[:count].reshape(shape)
+    def _flying_gate(self) -> ranging.FlyingGate | None:
+        facts = self.camera.engine.flying_pixels
+        if facts is None:
+            return None
+        lengths_m = (f4(mm.value * MM) for mm in (facts.near_mm, facts.far_mm, facts.most_mm))
+        return ranging.FlyingGate(f4(facts.relative_deviation.value), f4(facts.least_mean_units.value), *lengths_m)

@@ -1,0 +1,229 @@
+"""The numbers of a scanned lidar, as its file holds them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from pydantic import model_validator
+
+from harness.vocabulary.config import Config
+from harness.vocabulary.lens import Lens
+from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
+from scenes.optics import BeamFootprint, Optics
+from scenes.sensor.facts import Fact, HalfAngle, LensFacts, NonNegative, Positive, Share, UnitFacts, Wavelength
+
+NS = 1e-9
+"""Seconds in a nanosecond."""
+MRAD = 1e-3
+"""Radians in a milliradian."""
+MW = 1e-3
+"""Watts in a milliwatt."""
+UW_CM2 = 1e-2
+"""W/m^2 in a microwatt per square centimetre."""
+FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
+SMOOTHING_PX = 1
+"""Half width of the on-device smoothing's window."""
+
+
+class ReceiverFacts(Config):
+    """The one detector that stares at the whole field, beside the transmitter, which is the origin."""
+
+    position_mm: Fact[tuple[float, float, float]]
+    full_half_angle_deg: HalfAngle
+    cutoff_half_angle_deg: HalfAngle
+
+
+class BeamFacts(Config):
+    """The beam at rest: round, Gaussian in angle. ``power_mw``: of its light, averaged over the code; only ambient
+    light is measured by it."""
+
+    fwhm_mrad: Positive
+    power_mw: Positive
+
+
+class ScanFacts(Config):
+    """The raster: a column is one sweep of the fast axis, from point to point every ``point_ns``.
+
+    ``sweep_jitter_mm``: standard deviation of an error of range that the points of one sweep in one frame share.
+    """
+
+    point_ns: Positive
+    sweep_jitter_mm: NonNegative
+
+
+class CodeFacts(Config):
+    """The transmitted code and the pulse that its correlation makes.
+
+    ``correlation_fwhm_ns``: width of the correlation's peak, taken as Gaussian. ``band_floor``: the spectrum ends at
+    the last line above this share of its greatest. ``integration_ns``: how much of the return makes one point.
+    """
+
+    period_ns: Positive
+    correlation_fwhm_ns: Positive
+    band_floor: Share
+    integration_ns: Positive
+
+
+class LidarPhotonFacts(Config):
+    """The photon budget. Electrons are primary ones, before the avalanche, of one point's integration.
+
+    ``signal_electrons``: from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard
+    deviation. ``band_nm``: width of the filter before the detector. ``room_albedo``: mean over its field of view, for
+    the ambient light, which reaches the one detector from the whole field. ``calibration_*``: the two published points
+    to which the gain and the confidence threshold are fitted.
+    """
+
+    signal_electrons: Positive
+    excess_noise_factor: Positive
+    amplifier_electrons: NonNegative
+    band_nm: Positive
+    room_albedo: Share
+    full_scale_electrons: Positive
+    calibration_sigma_mm: Positive
+    calibration_distance_m: Positive
+    calibration_albedo: Share
+    calibration_reach_m: Positive
+    calibration_reach_albedo: Share
+
+
+class RippleFacts(Config):
+    """What is the same in every frame of one unit: smooth ripples of range."""
+
+    smooth_mm: NonNegative
+    smooth_length_px: Positive
+
+
+class LidarEngineFacts(Config):
+    """Processing on the device: smoothing, confidence, limits and step of the output.
+
+    ``side_weight``: of the pixels beside, above and below in the 3 x 3 smoothing; the corners have its square.
+    ``agree_deviations``: a neighbour joins where its half path differs by at most so many expected deviations.
+    ``least_agreeing``: share of the window's weights that must agree. ``confidence_electrons``: least strength.
+    """
+
+    side_weight: Share
+    agree_deviations: Positive
+    least_agreeing: Share
+    confidence_electrons: NonNegative
+    min_range_mm: NonNegative
+    output_step_mm: Positive
+
+
+class ScannedLidar(Config):
+    """A lidar that sends one beam per pixel, one after the other: everything that its model needs, as data.
+
+    Co-ordinates are at the transmitter: pixels are directions of the beam.
+    """
+
+    name: str
+    title: str
+    kind: Literal["scanned_lidar"]
+    wavelength_nm: Wavelength
+    lens: LensFacts
+    receiver: ReceiverFacts
+    beam: BeamFacts
+    scan: ScanFacts
+    code: CodeFacts
+    photons: LidarPhotonFacts
+    fixed_pattern: RippleFacts
+    unit: UnitFacts
+    engine: LidarEngineFacts
+
+    @model_validator(mode="after")
+    def _possible(self) -> ScannedLidar:
+        if not 0 < self.code.band_floor.value < 1:
+            raise ValueError("code.band_floor must be above 0 and below 1")
+        if self.integration_points > 3:
+            raise ValueError("code.integration_ns may span at most three times scan.point_ns")
+        if self.receiver.cutoff_half_angle_deg.value < self.receiver.full_half_angle_deg.value:
+            raise ValueError("receiver.cutoff_half_angle_deg must not be below receiver.full_half_angle_deg")
+        if self.engine.min_range_mm.value * MM >= self.unambiguous_m:
+            raise ValueError("engine.min_range_mm must lie within the range of one period of the code")
+        if len(self.weights) < 3:
+            raise ValueError("code.period_ns must be longer: fewer than three spectral lines are within the band")
+        return self
+
+    @cached_property
+    def nominal_lens(self) -> Lens:
+        """The lens of the file: without distortion it is the raster of the beam's directions."""
+        return self.lens.lens()
+
+    @property
+    def receiver_m(self) -> np.ndarray:
+        """(3,) the receiver in the camera's frame."""
+        return np.array(self.receiver.position_mm.value) * MM
+
+    @property
+    def period_s(self) -> float:
+        """The code's period."""
+        return self.code.period_ns.value * NS
+
+    @property
+    def unambiguous_m(self) -> float:
+        """Half the path of light in one period."""
+        return SPEED_OF_LIGHT_AIR * self.period_s / 2
+
+    @property
+    def integration_points(self) -> float:
+        """How many points' time the integration of one point spans."""
+        return self.code.integration_ns.value / self.scan.point_ns.value
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(K,) the correlation pulse's spectrum on lines 1..K of the comb, 1 at frequency 0 (which is filtered out)."""
+        deviation_s = self.code.correlation_fwhm_ns.value * NS / FWHM_PER_DEVIATION
+        last_hz = np.sqrt(-2 * np.log(self.code.band_floor.value)) / (2 * np.pi * deviation_s)
+        lines = np.arange(1, int(last_hz * self.period_s) + 1)
+        return np.asarray(np.exp(-0.5 * (2 * np.pi * lines / self.period_s * deviation_s) ** 2))
+
+    @cached_property
+    def bandwidth_rad_s(self) -> float:
+        """Root mean square angular frequency of the correlation pulse's spectrum."""
+        omega = 2 * np.pi * np.arange(1, len(self.weights) + 1) / self.period_s
+        return float(np.sqrt((self.weights * omega**2).sum() / self.weights.sum()))
+
+    @cached_property
+    def field_sr(self) -> float:
+        """The field's solid angle as a flat aperture sees it: foreshortened by the cosine to the axis."""
+        lens = self.nominal_lens
+        slopes = lens.region_slopes(lens.whole)
+        return float((1 / (1 + (slopes**2).sum(axis=-1)) ** 2).sum() / (lens.fx * lens.fy))
+
+    def ambient_electrons(self, irradiance_uw_cm2_nm: float) -> float:
+        """Electrons of one integration from daylight or lamps of that spectral irradiance on the whole field.
+
+        A surface of albedo a under irradiance E has the radiance a E / pi, and sends from the field's solid angle what
+        the beam of power P sends from albedo 1 at 1 m when P a / pi / 1 m^2 equals a E / pi times that angle.
+        """
+        irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
+        by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
+        return self.photons.signal_electrons.value * by_beam
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels beyond a region whose light reaches it through the integration and the smoothing."""
+        return int(np.ceil(self.integration_points / 2)) + SMOOTHING_PX
+
+    @property
+    def z_step_m(self) -> float:
+        """The rounding step of the output's z."""
+        return self.engine.output_step_mm.value * MM
+
+    @cached_property
+    def optics(self) -> Optics:
+        """What the render needs: pixels are beams from the origin, and the receiver stands where an emitter would."""
+        return Optics(
+            title=self.title,
+            lens=self.nominal_lens,
+            emitter_m=self.receiver_m,
+            full_half_angle_deg=self.receiver.full_half_angle_deg.value,
+            cutoff_half_angle_deg=self.receiver.cutoff_half_angle_deg.value,
+            frequencies_hz=tuple(float(k / self.period_s) for k in range(1, len(self.weights) + 1)),
+            footprint=BeamFootprint(self.beam.fwhm_mrad.value * MRAD),
+            wavelength_nm=self.wavelength_nm.value,
+            margin_px=self.margin_px,
+            nearest_m=self.engine.min_range_mm.value * MM,
+            farthest_m=self.unambiguous_m,
+        )

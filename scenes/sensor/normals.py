@@ -1,0 +1,97 @@
+"""Standard normals for the cameras' noise: vector code from a generator's raw words. One core, float32."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+from numba.extending import intrinsic
+
+FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
+"""How all kernels of the cameras are compiled. No assumption of finiteness: an unlit pixel may divide by zero and is
+gated out later."""
+
+TWO_PI = np.float32(2.0 * math.pi)
+
+
+@numba.njit(**FAST)
+def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
+    """Standard normals (2 n,) float32 from uniform 32-bit words (2 n,), by Box and Muller's transform.
+
+    Elementary functions are short polynomials so that the loop becomes vector code: a third of the time of NumPy's
+    ziggurat. Relative error below 1e-5; 2^-25 as the least uniform number ends the tails at 5.9 deviations.
+    """
+    n = np.uint64(out.size // 2)
+    for i in range(n):
+        # the upper 24 bits of a word fill a float32 exactly
+        u = (np.float32(bits[i] >> np.uint32(8)) + np.float32(0.5)) * np.float32(2.0**-24)
+        v = np.float32(bits[n + i] >> np.uint32(8)) * np.float32(2.0**-24)
+        radius = np.sqrt(np.float32(-2) * _log(u))
+        sine, cosine = _sincos_turns(v)
+        out[i] = radius * cosine
+        out[n + i] = radius * sine
+
+
+@numba.njit(inline="always", **FAST)
+def _log(u):  # type: ignore[no-untyped-def]
+    """Natural logarithm of a positive float32: exponent from the bits, mantissa by an atanh series."""
+    word: Any = float_bits(u)  # type: ignore[call-arg]
+    exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
+    mantissa = bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
+    big = mantissa > np.float32(1.41421356)
+    mantissa = mantissa * np.float32(0.5) if big else mantissa
+    exponent = exponent + np.int32(1) if big else exponent
+    q = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
+    s = q * q
+    series = np.float32(2 / 3) + s * (np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9)))
+    return np.float32(exponent) * np.float32(0.69314718) + q * (np.float32(2) + s * series)
+
+
+@numba.njit(inline="always", **FAST)
+def _sincos_turns(v):  # type: ignore[no-untyped-def]
+    """Sine and cosine of v turns, 0 <= v < 1: reduced to an eighth of a turn, Taylor to x^7 and x^8 (error 4e-7)."""
+    quarter = np.floor(v * np.float32(4) + np.float32(0.5))
+    x = (v - quarter * np.float32(0.25)) * TWO_PI
+    x2 = x * x
+    sine = x * (np.float32(1) + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040))))
+    cosine = np.float32(1) + x2 * (
+        np.float32(-0.5) + x2 * (np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320)))
+    )
+    k = np.int32(quarter)
+    odd = (k & np.int32(1)) == np.int32(1)
+    a = cosine if odd else sine
+    b = sine if odd else cosine
+    a = -a if (k & np.int32(2)) != np.int32(0) else a
+    b = -b if ((k + np.int32(1)) & np.int32(2)) != np.int32(0) else b
+    return a, b
+
+
+@intrinsic
+def float_bits(context, value):  # type: ignore[no-untyped-def]
+    """The bits of a float32 as a uint32."""
+
+    def build(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], context.get_value_type(numba.types.uint32))
+
+    return numba.types.uint32(numba.types.float32), build
+
+
+@intrinsic
+def bits_float(context, value):  # type: ignore[no-untyped-def]
+    """The float32 whose bits are a uint32."""
+
+    def build(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], context.get_value_type(numba.types.float32))
+
+    return numba.types.float32(numba.types.uint32), build
+
+
+def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normals (shape) float32 from the generator's raw words; one more word where the count is odd."""
+    count = math.prod(shape)
+    even = count + count % 2
+    out = np.empty(even, np.float32)
+    normals_from_bits(rng.bit_generator.random_raw(even // 2).view(np.uint32), out)
+    return out[:count].reshape(shape)
