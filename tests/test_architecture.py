@@ -59,7 +59,7 @@ def test_no_further_code_folder():
     assert folders <= {*ROOMS, "tests"}
 
 
-@pytest.mark.parametrize("program", ["sweep", "detect", "target"])
+@pytest.mark.parametrize("program", ["sweep", "detect", "target", "validate", "prepare"])
 def test_help_loads_nothing_heavy(program):
     code = (
         f"import sys; sys.argv = ['x', '--help']\n"

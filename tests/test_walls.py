@@ -7,19 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
-from validation.azure_walls import (
-    Wall,
-    WallCheck,
-    check_folder,
-    correlation,
-    covariance,
-    deviations,
-    fixed_pattern,
-    robust_inverse_fit,
-    walls_camera,
-)
+from validation.azure_walls import Wall, WallCheck, check_folder, walls_camera
 from validation.azure_walls_page import figure, page, table
 
+from harness.scorecard.pattern import fixed_pattern
+from harness.scorecard.planes import robust_inverse_fit
+from harness.scorecard.temporal import correlation, covariance, deviations
 from harness.vocabulary.geometry import Region
 from scenes.sensor.camera import load_camera
 

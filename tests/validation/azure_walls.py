@@ -21,6 +21,9 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from detectors.recordings import open_capture
+from harness.scorecard.pattern import FixedPattern, fixed_pattern
+from harness.scorecard.planes import fit_plane
+from harness.scorecard.temporal import correlation, deviations, temporal_sigma_m
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import Region
@@ -40,12 +43,9 @@ FIELD_DEG = 32.5
 BIN_M = 0.1
 LEAST_PIXELS = 300
 """Some 12 independent windows: the deviation of 22 frames is then known to 5 %."""
-LAGS = 5
 NOISE_ONLY = NONE.model_copy(update={"noise": True, "ambient": True})
 PATTERNED = NOISE_ONLY.model_copy(update={"fixed_pattern": True})
 UNIT_SEEDS = (1, 2, 3, 4, 5)
-SURFACE_DEGREE = 5
-BISQUARE = 4.685
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,8 @@ class Wall:
     @cached_property
     def plane(self) -> tuple[float, float, float]:
         """(distance in m, slope along x, slope along y) of z = d + sx x + sy y, so 1/z = (1 - sx X - sy Y)/d."""
-        z = self.z_m.mean(axis=0)[self.mask]
-        basis = np.column_stack([np.ones(z.size), self.slopes[self.mask]])
-        (a, b, c), _ = robust_inverse_fit(basis, z)
-        return float(1 / a), float(-b / a), float(-c / a)
+        plane = fit_plane(self.z_m.mean(axis=0)[self.mask], self.slopes[self.mask])
+        return plane.distance_m, plane.slope_x, plane.slope_y
 
     @property
     def angle_deg(self) -> np.ndarray:
@@ -90,20 +88,6 @@ class SigmaBin:
     def ratio(self) -> float:
         """Simulated by measured."""
         return self.simulated_m / self.measured_m
-
-
-@dataclass(frozen=True)
-class FixedPattern:
-    """What stays of a wall's average after a smooth surface and the temporal noise are taken off.
-
-    ``std_m``; ``length_px`` of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12; ``pixel_m``: the part
-    that is white before the engine's window of 5, told by its triangle up to lag 5; ``covariance_m2`` (lags 0..20).
-    """
-
-    std_m: float
-    length_px: float
-    pixel_m: float
-    covariance_m2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -174,26 +158,7 @@ def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig
     return np.stack([frame.z_m[cut] for frame in frames]).astype(float)
 
 
-def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients c with 1/z = basis c, and which points count, by Tukey's bisquare on the residuals of z."""
-    weight = np.ones_like(z)
-    for _ in range(15):
-        # an error of z is z^2 times one of 1/z
-        row = np.sqrt(weight) * z**2
-        coefficients = np.linalg.lstsq(basis * row[:, None], row / z, rcond=None)[0]
-        residual = z - 1 / (basis @ coefficients)
-        # on exact data the median is 0: a micrometre counts as exact
-        u = residual / (BISQUARE * max(1.4826 * float(np.median(np.abs(residual))), 1e-6))
-        weight = np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
-    return coefficients, weight > 0
-
-
 # ---------------------------------------------------------------- one analysis for both
-
-
-def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray) -> float:
-    """Standard deviation over frames, rms over the pixels of ``where``."""
-    return float(np.sqrt(z_m[:, where].var(axis=0, ddof=1).mean()))
 
 
 def sigma_bins(
@@ -208,69 +173,6 @@ def sigma_bins(
             measured, simulated = (temporal_sigma_m(z, part) for z in (wall.z_m, simulated_m))
             bins.append(SigmaBin(float((b + 0.5) * width), int(part.sum()), measured, simulated))
     return bins
-
-
-def deviations(z_m: np.ndarray, where: np.ndarray, keep_jitter: bool) -> np.ndarray:
-    """(n, h, w) deviations from each pixel's mean; without what a frame's pixels have in common unless kept."""
-    d = np.where(where, z_m - z_m.mean(axis=0), 0.0)
-    return d if keep_jitter else np.where(where, d - d[:, where].mean(axis=1)[:, None, None], 0.0)
-
-
-def covariance(d: np.ndarray, where: np.ndarray, lag: int, axis: int) -> tuple[float, float]:
-    """(mean product of pixels ``lag`` apart along x (0) or y (1), their mean square) over pairs inside ``where``."""
-    if axis == 1:
-        d, where = d.swapaxes(-1, -2), where.T
-    last = where.shape[1] - lag
-    both = where[:, lag:] & where[:, :last]
-    a, b = d[..., lag:][:, both], d[..., :last][:, both]
-    return float((a * b).mean()), float(((a**2).mean() + (b**2).mean()) / 2)
-
-
-def correlation(d: np.ndarray, where: np.ndarray, lags: int = LAGS) -> np.ndarray:
-    """(x and y, lags 1 to ``lags``) correlation of the temporal noise."""
-    pairs = [[covariance(d, where, lag, axis) for lag in range(1, lags + 1)] for axis in (0, 1)]
-    return np.array([[product / square for product, square in row] for row in pairs])
-
-
-def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: int = 20) -> FixedPattern:
-    """The fixed pattern of a wall: average, minus a robust surface of degree 5 in 1/z, minus left temporal noise."""
-    average = z_m.mean(axis=0)[where]
-    middle, half = slopes[where].mean(axis=0), np.ptp(slopes[where], axis=0) / 2
-    x, y = ((slopes[where] - middle) / half).T
-    basis = np.polynomial.legendre.legvander2d(x, y, (SURFACE_DEGREE, SURFACE_DEGREE))
-    i, j = np.divmod(np.arange(basis.shape[1]), SURFACE_DEGREE + 1)
-    basis = basis[:, i + j <= SURFACE_DEGREE]
-    coefficients, counts = robust_inverse_fit(basis, average)
-    good = np.zeros_like(where)
-    good[where] = counts
-    residual = np.zeros(where.shape)
-    residual[where] = average - 1 / (basis @ coefficients)
-    residual[good] -= residual[good].mean()
-    noise = deviations(z_m, good, keep_jitter=False)
-    # Deviations from a mean of n frames have (n - 1)/n of the variance, the mean 1/n: together 1/(n - 1).
-    left = np.array(
-        [
-            [
-                covariance(residual[None], good, k, a)[0] - covariance(noise, good, k, a)[0] / (len(z_m) - 1)
-                for a in (0, 1)
-            ]
-            for k in range(lags + 1)
-        ]
-    ).mean(axis=1)
-    return FixedPattern(float(np.sqrt(max(left[0], 0))), _gaussian_length(left[:13]), _pixel_part(left), left)
-
-
-def _gaussian_length(c: np.ndarray) -> float:
-    k = np.arange(c.size)
-    found = optimize.least_squares(lambda p: p[0] * np.exp(-(k**2) / (2 * p[1] ** 2)) - c / c[0], [1.0, 5.0])
-    return float(abs(found.x[1]))
-
-
-def _pixel_part(c: np.ndarray) -> float:
-    """c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest."""
-    k = np.arange(1.0, 6.0)
-    white, *_ = np.linalg.lstsq(np.column_stack([k / 5, k**2, k**4]), c[0] - c[1:6], rcond=None)[0]
-    return float(np.sign(white) * np.sqrt(abs(white)))
 
 
 def needed_albedo(wall: Wall, camera: AmcwCamera, start: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -60,6 +60,7 @@ class UnwrapTable:
         )
 
 
+@lru_cache(maxsize=64)
 def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
     """The table for one to three frequencies. Raises UserError where they are no small multiples of a common one."""
     lattice, base_hz = _integer_ratios(frequencies_hz)

@@ -1,0 +1,99 @@
+"""``python -m harness.validate``: the simulated cameras beside published figures, or beside a real capture."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+HERE = Path(__file__).parent / "scorecard"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
+    Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.validate " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.validate",
+        description="Measure the simulated cameras as one measures real ones, and set each published figure beside "
+        "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
+        "planes and edges in it.",
+        epilog="Exit code 1: a figure that passes in the committed baseline fails now.",
+    )
+    add = parser.add_argument
+    add("--camera", action="append", default=[], metavar="NAME", help="this camera only; may be repeated")
+    add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
+    add("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
+    add("--quick", action="store_true", help="fewer conditions and frames: a look, no judgement to keep")
+    add("--figures", type=Path, default=HERE / "figures.yaml", metavar="FILE", help="other published figures")
+    add("--baseline", type=Path, default=HERE / "baseline.json", metavar="FILE", help="another baseline")
+    add("--update-baseline", action="store_true", help="write down which figures pass now")
+    capture = parser.add_argument_group("a real capture")
+    put = capture.add_argument
+    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
+    put("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    put("--intrinsics", metavar="FILE|CAMERA", help="the lens of the depth pixels: a file, or a camera's nominal lens")
+    put("--frames", type=_positive, metavar="N", help="use the first N frames only")
+    put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
+    put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default 0.8, a light wall)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 4096:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
+    return int(text)
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    if options.capture:
+        return _run_capture(options, command)
+    for name in ("unit", "intrinsics", "frames", "mask"):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
+    from harness.scorecard.program import ScorecardOptions, run_scorecard
+
+    return run_scorecard(
+        ScorecardOptions(
+            cameras=tuple(options.camera),
+            out=options.out,
+            figures=options.figures,
+            baseline=options.baseline,
+            quick=options.quick,
+            update_baseline=options.update_baseline,
+            jobs=options.jobs,
+            command=command,
+        )
+    )
+
+
+def _run_capture(options: argparse.Namespace, command: str) -> int:
+    from harness.scorecard.capture_program import CaptureOptions, run_capture
+
+    if len(options.camera) > 1:
+        raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
+    return run_capture(
+        CaptureOptions(
+            paths=tuple(options.capture),
+            camera=options.camera[0] if options.camera else None,
+            out=options.out,
+            unit=options.unit,
+            intrinsics=options.intrinsics,
+            frames=options.frames,
+            mask=options.mask,
+            albedo=options.albedo,
+            command=command,
+        )
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
