@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,8 @@ class Tables:
     runs: pd.DataFrame
     probes: pd.DataFrame
     variants: pd.DataFrame
+    noise: pd.DataFrame
+    axes: pd.DataFrame
 
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
@@ -56,8 +58,21 @@ def tables(world: World | None = None, frames: tuple[int, ...] = FRAMES, variant
     """The four tables of one variant."""
     world = world or World()
     rng = np.random.default_rng(world.seed)
-    variants = pd.DataFrame([{"variant": variant, "reason": "as declared", "settings": json.dumps({"seed": 1})}])
+    variants = pd.DataFrame(
+        [
+            {
+                "variant": variant,
+                "reason": "as declared",
+                "settings": json.dumps({"seed": 1}),
+                "is_variation": variant != "main",
+                "reference": "main",
+                "switches": "",
+            }
+        ]
+    )
     return Tables(
+        noise=pd.concat([_noise(world, variant, n) for n in frames], ignore_index=True),
+        axes=pd.DataFrame(columns=["path", "name", "unit"]),
         holes=pd.concat([_holes(world, rng, variant, n) for n in frames], ignore_index=True),
         runs=pd.concat([_runs(world, rng, variant, n) for n in frames], ignore_index=True),
         probes=_probes(world, rng, variant, frames),
@@ -67,10 +82,53 @@ def tables(world: World | None = None, frames: tuple[int, ...] = FRAMES, variant
 
 def joined(*parts: Tables) -> Tables:
     """Several variants in one set of tables."""
-    return Tables(
+    names = ("holes", "runs", "probes", "variants", "noise")
+    together = {name: pd.concat([getattr(part, name) for part in parts], ignore_index=True) for name in names}
+    return Tables(**together, axes=parts[0].axes)
+
+
+CAMERAS = ("azure_kinect_nfov", "kinect_v2", "realsense_l515")
+CAMERA_AXES = pd.DataFrame(
+    [
+        {"path": "source.camera.name", "name": "camera", "unit": ""},
+        {"path": "source.target.distance_m", "name": "distance", "unit": "m"},
+    ]
+)
+
+
+def placed(part: Tables, camera: str, distance_m: float, of: str = "") -> Tables:
+    """One variant's tables as a set-up of the camera comparison, or as a variation of the set-up called ``of``."""
+    place = {"source.camera.name": camera, "source.target.distance_m": distance_m}
+    name = set_up_name(camera, distance_m)
+    part = replace(part, axes=CAMERA_AXES, variants=part.variants.assign(is_variation=bool(of), reference=of or name))
+    names = ("holes", "runs", "probes", "variants", "noise")
+    return replace(part, **{name: getattr(part, name).assign(**place) for name in names})
+
+
+def set_up_name(camera: str, distance_m: float) -> str:
+    """What the experiment calls this set-up."""
+    return f"camera={camera}, distance={distance_m:g} m"
+
+
+def cameras(
+    smallest: Mapping[str, Sequence[int]], distances_m: Sequence[float] = (0.5, 1.0), world: World | None = None
+) -> Tables:
+    """A comparison in which a camera finds, at each distance in turn, its ``smallest`` hole and all larger ones in
+    every repeat, with one frame one hole fewer."""
+    world = world or World(repeats=12)
+    return joined(
         *(
-            pd.concat([getattr(part, name) for part in parts], ignore_index=True)
-            for name in ("holes", "runs", "probes", "variants")
+            placed(
+                tables(
+                    world.changed(rate=lambda hole, frames, first=first: float(hole >= first + (frames == 1))),
+                    (1, 50),
+                    set_up_name(camera, distance),
+                ),
+                camera,
+                distance,
+            )
+            for camera in CAMERAS
+            for distance, first in zip(distances_m, smallest[camera], strict=True)
         )
     )
 
@@ -99,7 +157,9 @@ def example(frames: int = 50, shape: str = "bowl", variant: str = "main", noise_
     points = np.stack([(u - width / 2) / 500 * z, (v - height / 2) / 500 * z, z], axis=-1) * 1e-3
     rgb = np.broadcast_to(np.array([205, 170, 120], np.uint8), (height, width, 3)).copy()
     rgb[:, 100:106] = (200, 30, 30)
-    return ExampleCloud(frames, variant, points, rgb, residual, detected, inside, tuple(truth), z_truth)
+    turn = np.linspace(0, 2 * np.pi, 33)[:, None]
+    rims = tuple([h.u_px, h.v_px] + h.radius_px * np.hstack([np.cos(turn), np.sin(turn)]) for h in truth)
+    return ExampleCloud(frames, variant, points, rgb, residual, detected, inside, tuple(truth), z_truth, rims)
 
 
 def provenance() -> dict[str, object]:
@@ -198,6 +258,22 @@ def _runs(world: World, rng: np.random.Generator, variant: str, frames: int) -> 
             )
         )
     return pd.concat(parts, ignore_index=True)
+
+
+def _noise(world: World, variant: str, frames: int) -> pd.DataFrame:
+    grain = {f"correlation_{way}{lag}": 1 - (0.2 if way == "u" else 0.3) * lag for way in "uv" for lag in (1, 2, 3)}
+    return pd.DataFrame(
+        {
+            "variant": variant,
+            "frames": frames,
+            "repeat": np.arange(world.repeats),
+            "valid_share": 0.97,
+            "pitch_u_mm": 1.5,
+            "pitch_v_mm": 1.4,
+            "single_frame_mm": world.temporal_mm(1),
+            **grain,
+        }
+    )
 
 
 def _probes(world: World, rng: np.random.Generator, variant: str, frames: tuple[int, ...]) -> pd.DataFrame:

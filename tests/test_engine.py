@@ -82,6 +82,7 @@ def test_a_sweep_leaves_all_its_files(finished):
     assert names == {
         "experiment.yaml",
         "journal",
+        "noise.parquet",
         "probes.parquet",
         "provenance.json",
         "report.html",

@@ -95,10 +95,10 @@ def by_values(experiment: Experiment) -> dict[str, Point]:
 def test_points_are_the_product_of_the_axes_in_order_then_the_variations(folder: Path) -> None:
     experiment = loaded(folder, BASE + SWEEP + STUDY)
     assert [(point.variant, point.label) for point in experiment.points] == [
-        (MAIN, "capture.frames=1, source.target.hole_kind=through"),
-        (MAIN, "capture.frames=1, source.target.hole_kind=blind"),
-        (MAIN, "capture.frames=5, source.target.hole_kind=through"),
-        (MAIN, "capture.frames=5, source.target.hole_kind=blind"),
+        ("hole kind=through", "capture.frames=1, source.target.hole_kind=through"),
+        ("hole kind=blind", "capture.frames=1, source.target.hole_kind=blind"),
+        ("hole kind=through", "capture.frames=5, source.target.hole_kind=through"),
+        ("hole kind=blind", "capture.frames=5, source.target.hole_kind=blind"),
         ("source.target.distance_m=0.5", "source.target.distance_m=0.5, capture.frames=1"),
         ("source.target.distance_m=0.5", "source.target.distance_m=0.5, capture.frames=5"),
         ("source.target.distance_m=0.9", "source.target.distance_m=0.9, capture.frames=1"),

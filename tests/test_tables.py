@@ -23,8 +23,8 @@ def probe(repeat: int, errors: list[int | None]) -> dict[str, object]:
 def test_order_of_records_does_not_matter_and_none_is_nan():
     experiment = load_experiment(ROOT / "experiments" / "smoke.yaml")
     records = [
-        {"holes": [hole(1, "1", None)], "runs": [], "probes": [probe(1, [1000, None])]},
-        {"holes": [hole(0, "1", 2.0)], "runs": [], "probes": [probe(0, [3000, 10])]},
+        {"holes": [hole(1, "1", None)], "runs": [], "probes": [probe(1, [1000, None])], "noise": []},
+        {"holes": [hole(0, "1", 2.0)], "runs": [], "probes": [probe(0, [3000, 10])], "noise": []},
     ]
     tables = tables_of(records, experiment)
     again = tables_of(records[::-1], experiment)
@@ -43,3 +43,23 @@ def test_every_variant_has_the_reason_that_stands_beside_it():
     assert (table.drop("main") != "").all()
     assert table["the script as it stands, k = 1.2"].startswith("the main script has 1.2")
     assert table["source.target.distance_m=0.5"].startswith("not stated; the ends")
+
+
+def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
+    several = load_experiment(ROOT / "experiments" / "cameras.yaml")
+    variant = "camera=kinect_v2, distance=0.75 m"
+    record = {"holes": [hole(0, "1", 2.0) | {"variant": variant}], "runs": [], "probes": [], "noise": []}
+    tables = tables_of([record], several)
+    assert list(tables.axes.path) == ["source.camera.name", "source.target.distance_m"]
+    assert list(tables.axes.unit) == ["", "m"]
+    row = tables.holes.iloc[0]
+    assert (row["source.camera.name"], row["source.target.distance_m"]) == ("kinect_v2", 0.75)
+    variants = tables.variants.set_index("variant")
+    assert list(variants.reference[variants.is_variation]) == [
+        "camera=kinect_v2, distance=0.505 m",
+        *2 * ["camera=realsense_l515, distance=0.75 m"],
+    ]
+
+    alone = tables_of([record], load_experiment(ROOT / "experiments" / "averaging.yaml"))
+    assert alone.axes.empty
+    assert set(alone.holes.columns) == {"variant", "frames", "repeat", "true_diameter_mm", "hole", "score"}

@@ -16,6 +16,7 @@ from harness.report.example import ExampleCloud
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM
+from scenes.target.truth import Damage
 
 
 def examples_of(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
@@ -65,7 +66,22 @@ def _example(set_up: SetUp, cloud: Cloud, point: Point, threshold: float) -> Exa
         inside=np.isfinite(evidence.score),
         truth=_marks(set_up),
         z_truth_mm=set_up.seen_z_m / MM,
+        outlines_px=tuple(_outline_px(set_up, damage) for damage in set_up.truth),
     )
+
+
+def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
+    """(64, 2) columns and rows of a damage's rim on the cloud's grid, through the lens with its distortion.
+
+    The rim is taken as a circle in the face's tangent plane at the damage's centre: exact on a flat face.
+    """
+    region, lens = set_up.damaged.region, set_up.damaged.camera.nominal_lens
+    across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    along = np.cross(damage.axis_camera, across)
+    turn = np.linspace(0, 2 * np.pi, 64)[:, None]
+    rim = damage.centre_camera_m + damage.diameter_m / 2 * (np.cos(turn) * across + np.sin(turn) * along)
+    return np.asarray(lens.project(rim) - [region.col0, region.row0])
 
 
 def _marks(set_up: SetUp) -> tuple[HoleInView, ...]:

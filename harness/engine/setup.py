@@ -26,6 +26,7 @@ from scenes.view import NoiseFreeView
 
 INTACT_MARGIN_PX = 8
 """Pixels nearer than this to damage or to the board's rim do not count as undamaged: twice the engine's window."""
+FEWEST_PROBES = 100
 PROBES = 500
 """Pixels on which temporal noise and systematic error are followed over repeats: known to 0.5 % with 50 repeats."""
 
@@ -89,14 +90,42 @@ class SetUp:
         """(h, w) bool: undamaged face well away from damage and rim."""
         whole = np.isfinite(self.board_xy_m[..., 0])
         whole.ravel()[np.concatenate(list(self.outlines.values()))] = False
-        square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, bool)
-        return np.asarray(ndimage.binary_erosion(whole, square, border_value=0))
+        return _eroded(whole)
+
+    @cached_property
+    def on_board(self) -> np.ndarray:
+        """(h, w) bool: pixels whose central ray meets the face or a hole in it."""
+        return np.isfinite(self.board_xy_m[..., 0])
+
+    @cached_property
+    def bare(self) -> np.ndarray:
+        """(h, w) bool: face well away from the rim, damaged or not: what a hole-free board shows undamaged."""
+        return _eroded(self.on_board)
+
+    @cached_property
+    def pitch_mm(self) -> tuple[float, float]:
+        """Median distance on the face between neighbouring columns and between neighbouring rows of pixels."""
+        xy = self.board_xy_m
+        steps = (np.linalg.norm(np.diff(xy, axis=axis), axis=-1) for axis in (1, 0))
+        u, v = (float(np.nanmedian(step)) / MM for step in steps)
+        return u, v
 
     @cached_property
     def probes(self) -> np.ndarray:
-        """(p,) flat indices of evenly spread undamaged pixels."""
+        """(p,) flat indices of evenly spread undamaged pixels.
+
+        Where the camera is so far that damage leaves too few, pixels over damage count too: probes are read on the
+        hole-free board only.
+        """
         intact = np.flatnonzero(self.intact)
+        intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
+
+
+def _eroded(mask: np.ndarray) -> np.ndarray:
+    """A mask less a rim of `INTACT_MARGIN_PX`."""
+    square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, bool)
+    return np.asarray(ndimage.binary_erosion(mask, square, border_value=0))
 
 
 def _z_m(unit: SimulatedUnit) -> np.ndarray:
@@ -105,7 +134,7 @@ def _z_m(unit: SimulatedUnit) -> np.ndarray:
     return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def load_set_up(ref: SetUpRef) -> SetUp:
     """The set-up behind a reference, kept for the worker's next trials."""
     camera = camera_of(ref.camera)

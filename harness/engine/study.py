@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
+import numpy as np
 
 from harness.engine.console import progress_display
 from harness.engine.journal import Journal
@@ -18,12 +18,13 @@ from harness.engine.plan import Plan, plan_of
 from harness.engine.run import Outcome, pending_counts, run_plan
 from harness.engine.tables import Tables, tables_of
 from harness.experiment.load import resolved_yaml
-from harness.experiment.points import MAIN, Experiment
+from harness.experiment.points import Experiment
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, write_text
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
 from scenes.render.cache import read_view
+from scenes.view import NoiseFreeView
 
 RESULTS_VERSION = 1
 """Stands in every result folder; raised when the tables' meaning changes."""
@@ -78,21 +79,15 @@ def _provenance(
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
     runs = [row for record in outcome.records.values() for row in record["runs"]]
-    main = next((g for g in plan.groups if any(p.variant == MAIN for p in g.points)), plan.groups[0])
-    view = read_view(main.damaged.path)
-    noise = {}
-    if view is not None:
-        for index, name in enumerate(view.surface_names):
-            here = view.surface == index
-            if here.any():
-                noise[name] = round(float(pd.Series(view.indirect_noise_m[here]).median()) / MM, 4)
+    views = _views_of_set_ups(plan)
+    noise = _indirect_noise_mm(views)
     return {
         "results_version": RESULTS_VERSION,
         **record(command),
         "experiment": experiment.config.name,
         "digest": experiment.digest,
         "seed": experiment.config.seed,
-        "mitsuba_variant": view.variant if view is not None else None,
+        "mitsuba_variant": views[0].variant if views else None,
         "started": started,
         "seconds": {
             "this run in all": round(seconds, 1),
@@ -107,6 +102,25 @@ def _provenance(
     }
 
 
+def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
+    """The damaged views of all set-ups, variations left out."""
+    set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
+    views = (read_view(group.damaged.path) for group in set_ups or plan.groups[:1])
+    return [view for view in views if view is not None]
+
+
+def _indirect_noise_mm(views: list[NoiseFreeView]) -> dict[str, float]:
+    """What the render leaves of Monte Carlo noise: the median over each surface's pixels, the worst over set-ups."""
+    noise: dict[str, float] = {}
+    for view in views:
+        for index, name in enumerate(view.surface_names):
+            here = view.surface == index
+            if here.any():
+                median_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
+                noise[name] = max(noise.get(name, 0.0), median_mm)
+    return noise
+
+
 def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> None:
     """Parquet with the provenance in its schema, the summary as CSV, the provenance as JSON."""
     import pyarrow as pa
@@ -116,13 +130,14 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> N
 
     numbers = {k: provenance[k] for k in ("results_version", "experiment", "digest", "seed", "commit", "dirty")}
     note = json.dumps({**numbers, "versions": provenance["versions"]}, sort_keys=True)
-    for name, table in (("trials", tables.holes), ("runs", tables.runs), ("probes", tables.probes)):
+    stored_tables = {"trials": tables.holes, "runs": tables.runs, "probes": tables.probes, "noise": tables.noise}
+    for name, table in stored_tables.items():
         stored = pa.Table.from_pandas(table, preserve_index=False)
         stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
         with atomic_path(folder / f"{name}.parquet") as path:
             pq.write_table(stored, path)
     buffer = io.StringIO()
-    summarise_holes(tables.holes).to_csv(buffer, index=False, float_format="%.6g")
+    summarise_holes(tables.holes, list(tables.axes["path"])).to_csv(buffer, index=False, float_format="%.6g")
     write_text(folder / "summary.csv", buffer.getvalue())
     write_text(folder / "provenance.json", json.dumps(provenance, indent=2) + "\n")
 
@@ -138,16 +153,22 @@ def _write_report(
 
 def _conclude(folder: Path, tables: Tables, outcome: Outcome) -> None:
     """The final table, the failures, and where to look."""
+    from harness.evaluation.set_ups import compare_set_ups, set_ups_of
     from harness.evaluation.summary import summarise_holes
-    from harness.report.terminal import terminal_table, terminal_text
+    from harness.report import terminal
+    from harness.report.set_ups_rows import Layout
 
-    summary = summarise_holes(tables.holes)
+    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
+    several = len(set_ups_of(tables)) > 1
+    if several:
+        compared = compare_set_ups(tables, summary, set_ups_of(tables))
+        layout = Layout.of(tables, compared)
     if sys.stdout.isatty():
         from rich.console import Console
 
-        Console().print(terminal_table(summary))
+        Console().print(terminal.set_ups_table(compared, layout) if several else terminal.terminal_table(summary))
     else:
-        print(terminal_text(summary))
+        print(terminal.set_ups_text(compared, layout) if several else terminal.terminal_text(summary))
     if outcome.failures:
         print(f"{len(outcome.failures)} trials failed: {_reasons(outcome)}", file=sys.stderr)
     print(f"report: {folder / 'report.html'}")

@@ -12,10 +12,15 @@ import pandas as pd
 
 from harness.experiment.points import MAIN, Experiment, Point
 from harness.experiment.schema import LabelledVariation
+from harness.experiment.set_ups import FRAMES
+from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.units import MM
 
-HOLE_ORDER = ["variant", "frames", "repeat", "true_diameter_mm", "hole"]
-RUN_ORDER = ["variant", "role", "frames", "repeat"]
+ORDERS = {
+    "holes": ["variant", "frames", "repeat", "true_diameter_mm", "hole"],
+    "runs": ["variant", "role", "frames", "repeat"],
+    "noise": ["variant", "frames", "repeat"],
+}
 
 
 @dataclass(frozen=True)
@@ -23,27 +28,49 @@ class Tables:
     """All results of an experiment as pandas frames; the columns are those of `harness.engine.trial`'s rows.
 
     ``holes``: one row per variant, frames, repeat and hole. ``runs``: per variant, frames, repeat and role.
-    ``probes``: per variant, frames and probe pixel, over repeats. ``variants``: label, reason, settings.
+    ``probes``: per variant, frames and probe pixel, over repeats. ``noise``: per variant, frames and hole-free repeat
+    (columns of `harness.engine.board_noise`). All four carry a column per axis other than the number of frames, named
+    by its path, where there are any. ``variants``: one row per set-up, then per variation: variant, reason, settings,
+    is_variation, reference (the set-up to compare with, or empty), switches (JSON, or empty), and the axes.
+    ``axes``: path, name, unit of each of those axes, in their order.
     """
 
     holes: pd.DataFrame
     runs: pd.DataFrame
     probes: pd.DataFrame
     variants: pd.DataFrame
+    noise: pd.DataFrame
+    axes: pd.DataFrame
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> Tables:
     """Collect records, in any order, into tables in a fixed order."""
-    rows: dict[str, list[dict[str, Any]]] = {"holes": [], "runs": [], "probes": []}
+    rows: dict[str, list[dict[str, Any]]] = {"holes": [], "runs": [], "probes": [], "noise": []}
     for record in records:
         for name, collected in rows.items():
             collected.extend(record[name])
-    holes, runs = pd.DataFrame(rows["holes"]), pd.DataFrame(rows["runs"])
-    if not holes.empty:
-        holes = holes.sort_values(HOLE_ORDER, kind="stable", ignore_index=True)
-    if not runs.empty:
-        runs = runs.sort_values(RUN_ORDER, kind="stable", ignore_index=True)
-    return Tables(_numbers(holes), _numbers(runs), _probes(rows["probes"]), _variants(experiment))
+    axes, variants = _axes(experiment), _variants(experiment)
+    placed = variants.set_index("variant")[list(axes["path"])]
+
+    def with_axes(table: pd.DataFrame) -> pd.DataFrame:
+        return table if table.empty or axes.empty else table.join(placed, on="variant")
+
+    holes, runs, noise = (_ordered(rows[name], order) for name, order in ORDERS.items())
+    probes = _probes(rows["probes"])
+    return Tables(with_axes(holes), with_axes(runs), with_axes(probes), variants, noise=with_axes(noise), axes=axes)
+
+
+def _ordered(rows: list[dict[str, Any]], order: list[str]) -> pd.DataFrame:
+    table = pd.DataFrame(rows)
+    return _numbers(table if table.empty else table.sort_values(order, kind="stable", ignore_index=True))
+
+
+def _axes(experiment: Experiment) -> pd.DataFrame:
+    """The axes that tell set-ups apart; switches first, then in the file's order."""
+    paths = list(experiment.points[0].axes)
+    names = names_of(paths)
+    rows = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
+    return pd.DataFrame(rows, columns=["path", "name", "unit"])
 
 
 def _numbers(table: pd.DataFrame) -> pd.DataFrame:
@@ -81,22 +108,42 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """What each variant changes, and why it is plausible."""
-    seen: dict[str, dict[str, str]] = {}
+    """What each set-up and variation changes, why it is plausible, and where it lies on the axes."""
+    paths = list(experiment.points[0].axes)
+    seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:
-        values = {k: v for k, v in point.values.items() if k != "capture.frames"}
-        settings = "" if point.variant == MAIN else json.dumps(values, sort_keys=True)
-        row = {"variant": point.variant, "reason": _reason(experiment, point), "settings": settings}
-        seen.setdefault(point.variant, row)
-    return pd.DataFrame(list(seen.values()), columns=["variant", "reason", "settings"])
+        if point.variant in seen:
+            continue
+        values = {k: v for k, v in point.values.items() if k != FRAMES}
+        switches = values.get(experiment.config.switches or "")
+        seen[point.variant] = {
+            "variant": point.variant,
+            "reason": _reason(experiment, point),
+            "settings": "" if point.variant == MAIN else json.dumps(values, sort_keys=True),
+            "is_variation": point.is_variation,
+            "reference": point.reference,
+            "switches": json.dumps(switches) if switches and not point.is_variation else "",
+            **point.axes,
+        }
+    columns = ["variant", "reason", "settings", "is_variation", "reference", "switches", *paths]
+    table = pd.DataFrame(list(seen.values()), columns=columns)
+    for path in paths:
+        numbers = table[path].map(lambda v: isinstance(v, int | float) and not isinstance(v, bool))
+        # a column of Parquet has one type
+        table[path] = table[path].astype(float) if numbers.all() else table[path].map(_text)
+    return table
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def _reason(experiment: Experiment, point: Point) -> str:
-    """The reason that the experiment's file gives for a variation; empty for the main points."""
+    """The reason that the experiment's file gives for a variation; empty for its set-ups."""
     study = experiment.config.sensitivity
-    if study is None or point.variant == MAIN:
+    if study is None or not point.is_variation:
         return ""
-    changed = set(point.values) - {"capture.frames"}
+    changed = set(point.values) - {FRAMES}
     for variation in study.vary:
         if isinstance(variation, LabelledVariation):
             named = variation.label == point.variant

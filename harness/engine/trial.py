@@ -13,6 +13,7 @@ import numpy as np
 from detectors import load_detector
 from detectors.average import AverageConfig, prefix_averages
 from detectors.interface import Detector, Evidence, Measurement
+from harness.engine.board_noise import board_noise_rows
 from harness.engine.setup import SetUp, SetUpRef, load_set_up
 from harness.evaluation.match import match
 from harness.vocabulary.capture import Cloud
@@ -55,9 +56,9 @@ class TrialTask:
 
 
 def run_trial(task: TrialTask) -> Record:
-    """Run one trial; rows for the tables "runs", "holes" and "probes" (columns: `harness.engine.tables`)."""
+    """Run one trial; rows for the tables "runs", "holes", "probes" and "noise" (columns: `harness.engine.tables`)."""
     set_up = load_set_up(task.set_up)
-    record: Record = {"runs": [], "holes": [], "probes": []}
+    record: Record = {"runs": [], "holes": [], "probes": [], "noise": []}
     for config, points in _by_average(task.points):
         began = time.perf_counter()
         unit = set_up.damaged if task.role == "damaged" else set_up.hole_free
@@ -67,6 +68,9 @@ def run_trial(task: TrialTask) -> Record:
         seconds_frames = time.perf_counter() - began
         if task.role == "hole_free":
             record["probes"] += list(_probe_rows(set_up, clouds, task.repeat, points))
+            variants = {(point.variant, point.frames) for point in points}
+            pair = unit.capture(2, task.seed, task.role, task.repeat)
+            record["noise"] += list(board_noise_rows(set_up, clouds, pair, task.repeat, variants))
         for point in points:
             began = time.perf_counter()
             run, holes = _judge(set_up, clouds[point.frames], point, task.role)
@@ -101,7 +105,7 @@ def _judge(set_up: SetUp, cloud: Cloud, point: PointTask, role: Role) -> tuple[d
         "threshold": point.threshold if point.threshold is not None else np.nan,
         "quiet_threshold": detector.quiet_threshold(cloud, evidence) if role == "hole_free" else np.nan,
         "scale_mm": evidence.scale_m / MM,
-        "surface_noise_mm": _robust_std(evidence.residual_m[set_up.intact]) / MM,
+        "surface_noise_mm": _robust_std(evidence.residual_m[_undamaged(set_up, role)]) / MM,
         "frames_used": cloud.n_frames,
         "left_out": len(cloud.left_out),
         "detections": 0,
@@ -125,6 +129,12 @@ def _judge(set_up: SetUp, cloud: Cloud, point: PointTask, role: Role) -> tuple[d
         for i, damage in enumerate(set_up.truth)
     ]
     return run, holes
+
+
+def _undamaged(set_up: SetUp, role: Role) -> np.ndarray:
+    """(h, w) bool: pixels that show undamaged face; where the camera is so far that none is left beside the damage, of
+    a hole-free board all but the rim's."""
+    return set_up.bare if role == "hole_free" and not set_up.intact.any() else set_up.intact
 
 
 def _on_board(set_up: SetUp, measured: Sequence[Measurement]) -> np.ndarray:

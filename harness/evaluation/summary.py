@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -46,7 +47,9 @@ class ResultTables(Protocol):
     ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
     quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
     ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, repeats; pixels in sensor order.
-    ``variants``: variant, reason, settings (JSON text).
+    ``variants``: variant, reason, settings (JSON text), is_variation, reference, switches (JSON text).
+    ``noise``: variant, frames, repeat, valid_share, pitch_u_mm, pitch_v_mm, single_frame_mm, correlation_u1 ... _v3.
+    ``axes``: path, name, unit of what tells set-ups apart; every other table has a column for each path.
     """
 
     @property
@@ -57,6 +60,10 @@ class ResultTables(Protocol):
     def probes(self) -> pd.DataFrame: ...
     @property
     def variants(self) -> pd.DataFrame: ...
+    @property
+    def noise(self) -> pd.DataFrame: ...
+    @property
+    def axes(self) -> pd.DataFrame: ...
 
 
 def by_hole(names: pd.Series) -> pd.Series:
@@ -64,8 +71,10 @@ def by_hole(names: pd.Series) -> pd.Series:
     return names.map(lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name)))
 
 
-def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
+def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
     """One row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval.
+
+    ``axes``: columns that are the same for all rows of a variant, to be carried along.
 
     Columns beside the group and the truth: ``n`` trials, ``detected`` of them, ``rate`` with Wilson's interval
     ``rate_low``/``rate_high`` and ``status`` by `FOUND_RULE`; for the thesis' measure (``extent_``) and the model's
@@ -81,7 +90,7 @@ def summarise_holes(holes: pd.DataFrame) -> pd.DataFrame:
 
     holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
-    out = groups[TRUTH].first()
+    out = groups[[*axes, *TRUTH]].first()
     out["n"] = groups.size()
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]

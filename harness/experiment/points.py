@@ -7,7 +7,7 @@ other points are. So adding a value to an axis leaves every other point, its see
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from harness.vocabulary.seeds import digest
 from scenes.sensor.camera import camera_digest, camera_of
 
 MAIN = "main"
-"""The variant of every point that is not a variation of the sensitivity study."""
+"""The one set-up of an experiment whose only axis, if any, is the number of frames."""
 
-NO_NUMBERS = ("name", "title", "repeats", "sweep", "sensitivity")
+NO_NUMBERS = ("name", "title", "repeats", "sweep", "switches", "sensitivity")
 """Keys that decide which trials are run, not what a trial gives."""
 
 
@@ -28,7 +28,10 @@ NO_NUMBERS = ("name", "title", "repeats", "sweep", "sensitivity")
 class Point:
     """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
 
-    ``variant`` is "main" or the label of a variation; ``label`` tells points apart in tables. ``digest`` names the
+    ``variant`` is the label of its set-up ("main" where there is one only) or of a variation; ``label`` tells points
+    apart in tables. ``axes``: resolved value of every axis but the number of frames, which is what tells set-ups apart.
+    ``is_variation``: whether it belongs to the sensitivity study; ``reference`` is then the set-up to compare it with,
+    the one with the same ``axes`` (empty where none has them), else the point's own set-up. ``digest`` names the
     point's numbers, ``frames_key`` those of its frames (source and seed), ``render_key`` those of its render.
     """
 
@@ -39,6 +42,9 @@ class Point:
     digest: str
     render_key: str
     frames_key: str
+    axes: Mapping[str, Any] = field(default_factory=dict)
+    is_variation: bool = False
+    reference: str = MAIN
 
 
 @dataclass(frozen=True)

@@ -130,4 +130,7 @@ class ExperimentConfig(Config):
     matching: MatchingConfig = MatchingConfig()
     repeats: Repeats = 1
     sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
+    switches: DottedPath | None = Field(
+        None, description="a mapping of switches: a set-up with none on, with each alone, with all but each, with all"
+    )
     sensitivity: SensitivityConfig | None = None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
@@ -14,28 +13,28 @@ from harness.experiment.declared import declared_of, detector_version, splices_o
 from harness.experiment.dotted import PathError, key_path, path_problem, set_path
 from harness.experiment.points import MAIN, Point, point_of
 from harness.experiment.schema import ExperimentConfig
+from harness.experiment.set_ups import (
+    FRAMES,
+    SWITCHES,
+    Setting,
+    sameness,
+    set_up_label,
+    switch_axis,
+    switch_problems,
+    with_references,
+)
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import validated
 from harness.vocabulary.declaration.problems import Place, Problem
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source
-from harness.vocabulary.seeds import canonical_json
+from harness.vocabulary.path_names import on_one_line
 
-FRAMES = "capture.frames"
 MAX_POINTS = 10_000
 """More than a machine works through in a week; beyond it an axis was mistyped."""
 MAX_SHOWN = 20
 """Problems of combinations are found one point at a time and look alike."""
-FIXED = ("name", "title", "repeats", "sweep", "sensitivity")
+FIXED = ("name", "title", "repeats", "sweep", SWITCHES, "sensitivity")
 """Keys that are the same for all points."""
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One path set to one value, and where in the source that value is written."""
-
-    path: str
-    value: Any
-    written_at: KeyPath
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,7 @@ class Draft:
     label: str
     variant: str
     settings: tuple[Setting, ...]
+    is_variation: bool = False
     repeats: int | None = None
     calibration_repeats: int | None = None
 
@@ -57,13 +57,17 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
     axes = _written_axes(source.data)
     variations = list(_written_variations(source.data))
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
-    singles = [Draft(_label([one]), MAIN, (one,)) for axis in axes for one in axis]
+    problems += switch_problems(config, source) if config is not None else ()
+    singles = [Draft(_label([one]), "", (one,)) for axis in axes for one in axis]
     for draft in (*singles, *variations):
         if not any(True for one in draft.settings for _ in _path_problems(one.path, _NOWHERE, source, FIXED)):
             problems += _value_problems(draft, source, config is not None)
     if problems or config is None:
         return (), problems
-    return _points(list(_drafts(axes, variations, config)), source)
+    switches = switch_axis(config)
+    axes = [switches, *axes] if switches else axes
+    points, problems = _points(list(_drafts(axes, variations, config)), source)
+    return tuple(with_references(points, [axis[0].path for axis in axes if len(axis) > 1])), problems
 
 
 _NOWHERE = Place("", 0, 1, "")
@@ -89,9 +93,10 @@ def _written_variations(data: Any) -> Iterator[Draft]:
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
                 setting = Setting(path, value, (*at, "values", number))
-                yield Draft(_label([setting]), _label([setting]), (setting,))
+                yield Draft(_label([setting]), _label([setting]), (setting,), is_variation=True)
         elif isinstance(label, str) and isinstance(together, dict):
-            yield Draft(label, label, tuple(Setting(key, value, (*at, "set", key)) for key, value in together.items()))
+            settings = tuple(Setting(key, value, (*at, "set", key)) for key, value in together.items())
+            yield Draft(label, label, settings, is_variation=True)
 
 
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -152,10 +157,10 @@ def _path_problems(path: str, place: Place, source: Source, fixed: Iterable[str]
 def _repeated_values(axis: list[Setting], source: Source) -> Iterator[Problem]:
     first: dict[str, Setting] = {}
     for one in axis:
-        twin = first.setdefault(_sameness(one.value), one)
+        twin = first.setdefault(sameness(one.value), one)
         if twin is not one:
             yield Problem(
-                f"{_flow(one.value)} is in this list twice",
+                f"{on_one_line(one.value)} is in this list twice",
                 source.place_of(one.written_at),
                 other=source.place_of(twin.written_at),
                 other_says="first at",
@@ -187,20 +192,21 @@ def _places_within(source: Source, path: KeyPath) -> Iterator[Place]:
 
 def _drafts(axes: list[list[Setting]], variations: list[Draft], config: ExperimentConfig) -> Iterator[Draft]:
     """The product of the axes, the last one fastest; then every variation at every number of frames of the study."""
+    several = prod(len(axis) for axis in axes if axis[0].path != FRAMES) > 1
     for settings in product(*axes):
-        yield Draft(_label(settings), MAIN, settings)
+        yield Draft(_label(settings), set_up_label(settings) if several else MAIN, settings)
     study = config.sensitivity
     for variation in variations if study else ():
         for index, frames in enumerate(study.frames if study else ()):
             settings = (Setting(FRAMES, frames, ("sensitivity", "frames", index)), *variation.settings)
             label = f"{variation.label}, {FRAMES}={frames}"
             repeats = (study.repeats, study.calibration_repeats) if study else (None, None)
-            yield Draft(label, variation.label, settings, *repeats)
+            yield Draft(label, variation.label, settings, True, *repeats)
 
 
-def _points(drafts: list[Draft], source: Source) -> tuple[tuple[Point, ...], list[Problem]]:
+def _points(drafts: list[Draft], source: Source) -> tuple[list[Point], list[Problem]]:
     points: list[Point] = []
-    problems: list[Problem] = []
+    problems: list[Problem] = list(_named_alike(drafts, source))
     first: dict[str, Draft] = {}
     for draft in drafts:
         config, found = _resolved(_located(draft, source))
@@ -211,12 +217,25 @@ def _points(drafts: list[Draft], source: Source) -> tuple[tuple[Point, ...], lis
             continue
         values = {one.path: one.value for one in draft.settings}
         point = point_of(draft.label, draft.variant, values, _with_repeats(config, draft), detector_version(config))
-        twin = first.setdefault(point.digest, draft) if draft.variant == MAIN else draft
+        point = replace(point, is_variation=draft.is_variation)
+        twin = draft if draft.is_variation else first.setdefault(point.digest, draft)
         if twin is not draft:
             place = source.place_of(_named_at(draft))
             problems.append(Problem(f"the points {draft.label} and {twin.label} are the same experiment", place))
         points.append(point)
-    return tuple(points), problems
+    return points, problems
+
+
+def _named_alike(drafts: list[Draft], source: Source) -> Iterator[Problem]:
+    """A set-up and a variation, or two set-ups whose long values are shortened alike, could not be told apart."""
+    first: dict[str, Draft] = {}
+    for draft in drafts:
+        others = tuple(sameness(one.value) for one in draft.settings if one.path != FRAMES)
+        twin = first.setdefault(draft.variant, draft)
+        if others != tuple(sameness(one.value) for one in twin.settings if one.path != FRAMES):
+            place = source.place_of(_named_at(draft))
+            yield Problem(f"two different set-ups are called `{draft.variant}`", place, fix="give one another label")
+            return
 
 
 def _located(draft: Draft, source: Source) -> Source:
@@ -256,19 +275,5 @@ def _named_at(draft: Draft) -> KeyPath:
 
 
 def _label(settings: Iterable[Setting]) -> str:
-    return ", ".join(f"{one.path}={_flow(one.value)}" for one in settings) or "the experiment as it stands"
-
-
-def _flow(value: Any) -> str:
-    """A value on one line, short."""
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else text[:59] + "…"
-
-
-def _sameness(value: Any) -> str:
-    """Equal for values that YAML writes in two ways, such as 1 and 1.0; true is not 1."""
-    if isinstance(value, Mapping):
-        return canonical_json({key: _sameness(inner) for key, inner in value.items()})
-    if isinstance(value, list):
-        return canonical_json([_sameness(inner) for inner in value])
-    return repr(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
+    said = (one.name or f"{one.path}={on_one_line(one.value)}" for one in settings)
+    return ", ".join(said) or "the experiment as it stands"

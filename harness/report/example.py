@@ -18,7 +18,8 @@ class ExampleCloud:
     ``points_m`` (h, w, 3) float: camera frame, NaN where invalid. ``rgb`` (h, w, 3) uint8. ``residual_mm`` (h, w):
     distance behind (+) or before (-) the fitted surface, NaN where there is none. ``detected`` (h, w) bool: pixels of
     the detector's clusters. ``inside`` (h, w) bool: pixels of the crop that was searched. ``truth``: the holes on it.
-    ``z_truth_mm`` (h, w): true z along each pixel's central ray, NaN where it meets nothing.
+    ``z_truth_mm`` (h, w): true z along each pixel's central ray, NaN where it meets nothing. ``outlines_px``: of each
+    of ``truth`` the rim as (k, 2) columns and rows on the grid.
     """
 
     frames: int
@@ -30,3 +31,4 @@ class ExampleCloud:
     inside: np.ndarray
     truth: tuple[HoleInView, ...]
     z_truth_mm: np.ndarray
+    outlines_px: tuple[np.ndarray, ...] = ()

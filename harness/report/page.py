@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +11,11 @@ import numpy as np
 from harness.evaluation.claims import RULES, Verdict, hole_list, score_claims, verdicts_by_variant
 from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.profile import RINGS, hole_shapes
+from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.summary import (
     FOUND_RULE,
     MAIN,
-    STATES,
     ResultTables,
-    bounded,
     false_calls,
     found_holes,
     summarise_holes,
@@ -26,15 +24,12 @@ from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_
 from harness.report.example import ExampleCloud
 from harness.report.measures import inches, positions_figure, sizes_figure
 from harness.report.noise import noise_figure
+from harness.report.page_parts import MARKS, call_row, closing, mm, rate_cell, template
+from harness.report.set_ups_page import set_ups_html
 from harness.vocabulary.files import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
-
-MARKS = {"borne out": "✓", "not borne out": "✗", "undecided": "?"}
-CLASSES = {"borne out": "yes", "not borne out": "no", "undecided": "open"}
-SHOWN_APART = ("command", "seconds", "failures")
-"""Keys of the provenance with a section of their own."""
 
 
 def write_report(
@@ -45,14 +40,15 @@ def write_report(
     experiment_yaml_text: str,
     title: str,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path.
+    """Write ``folder/report.html`` and return its path: the page of one set-up, or that of several side by side.
 
     ``provenance`` may hold: ``command``, ``commit``, ``dirty``, ``versions``, ``mitsuba_variant``, ``seed``,
     ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``renders``, ``failures`` (texts, or
     mappings with their parts); whatever else it holds is shown as it is, and a missing one as not recorded. The same
     input gives the same bytes. Raises UserError where the folder cannot be written.
     """
-    page = report_html(tables, examples, provenance, experiment_yaml_text, title)
+    several = len(set_ups_of(tables)) > 1
+    page = (set_ups_html if several else report_html)(tables, examples, provenance, experiment_yaml_text, title)
     path = Path(folder) / "report.html"
     write_text(path, page)
     return path
@@ -65,23 +61,14 @@ def report_html(
     experiment_yaml_text: str,
     title: str,
 ) -> str:
-    """The page as text; see `write_report`."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
+    """The page of an experiment with one set-up as text; see `write_report`."""
     summary = summarise_holes(tables.holes)
     main = summary[summary["variant"] == MAIN]
     noise = noise_against_frames(tables.probes[tables.probes["variant"] == MAIN])
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
     verdicts = score_claims(tables, MAIN, examples, summary)
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template("report.html").render(
+    calls = false_calls(tables.runs)
+    return template("report.html").render(
         title=title,
         answer=answer_sentence(main, verdicts),
         found_rule=FOUND_RULE,
@@ -94,18 +81,11 @@ def report_html(
         shapes=_shape_rows(clouds),
         rings=[f"{ring:g} R" for ring in RINGS],
         verdicts=verdicts,
-        marks=MARKS,
-        classes=CLASSES,
         claims=list(RULES),
         variants=_variant_rows(verdicts_by_variant(tables, examples, summary)),
         noise=noise.to_dict("records"),
-        calls=_call_rows(false_calls(tables.runs)),
-        failures=[_failure(failure) for failure in provenance.get("failures", ())],
-        left_out=_left_out(tables.runs),
-        seconds=_seconds(provenance),
-        provenance=_provenance_rows(provenance),
-        command=provenance.get("command", "not recorded"),
-        experiment=experiment_yaml_text,
+        calls=[call_row(row) for _, row in calls[calls["variant"] == MAIN].iterrows()],
+        **closing(tables, provenance, experiment_yaml_text),
     )
 
 
@@ -173,26 +153,10 @@ def _hole_rows(main: pd.DataFrame) -> list[dict[str, Any]]:
                 "drill": inches(float(first["true_diameter_mm"])),
                 "diameter": f"{first['true_diameter_mm']:.2f}",
                 "kind": first["kind"],
-                "cells": {int(row["frames"]): _cell(row) for _, row in part.iterrows()},
+                "cells": {int(row["frames"]): rate_cell(row) for _, row in part.iterrows()},
             }
         )
     return out
-
-
-def _cell(row: pd.Series) -> dict[str, str]:
-    rate = float(row["rate"])
-    interval = bounded(rate, row["rate_low"], row["rate_high"])
-    states = {state: float(row[f"share_{state.replace(' ', '_')}"]) for state in STATES}
-    seen = ", ".join(f"{state} {100 * share:.0f} %" for state, share in states.items() if share > 0)
-    weight = 0.06 + 0.94 * rate
-    shade = [round(255 + (channel - 255) * weight) for channel in (0, 94, 156)]
-    return {
-        "count": f"{row['detected']}/{row['n']}",
-        "interval": f"{row['rate_low']:.2f}–{row['rate_high']:.2f}",
-        "status": str(row["status"]),
-        "style": f"background:rgb({shade[0]},{shade[1]},{shade[2]});color:{'#fff' if rate > 0.72 else '#1d2530'}",
-        "title": f"{row['status']}: rate {interval}, 95 % Wilson interval. The hole's pixels: {seen or 'unknown'}",
-    }
 
 
 def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
@@ -202,12 +166,12 @@ def _shape_rows(clouds: Sequence[ExampleCloud]) -> list[dict[str, Any]]:
         {
             "hole": shape.hole,
             "pixels": str(shape.pixels),
-            "depth": _mm(shape.true_depth_mm, 1),
-            "seen": _mm(shape.seen_rms_mm),
-            "bowl": _mm(shape.bowl_rms_mm),
-            "cylinder": _mm(shape.cylinder_rms_mm),
-            "true_bowl": _mm(shape.true_bowl_rms_mm),
-            "true_cylinder": _mm(shape.true_cylinder_rms_mm),
+            "depth": mm(shape.true_depth_mm, 1),
+            "seen": mm(shape.seen_rms_mm),
+            "bowl": mm(shape.bowl_rms_mm),
+            "cylinder": mm(shape.cylinder_rms_mm),
+            "true_bowl": mm(shape.true_bowl_rms_mm),
+            "true_cylinder": mm(shape.true_cylinder_rms_mm),
             "reached": [f"{100 * share:.0f} %" if np.isfinite(share) else "–" for share in shape.reached],
             "looks": LOOKS[shape.looks],
         }
@@ -223,18 +187,18 @@ def _measure_rows(main: pd.DataFrame) -> list[dict[str, str]]:
     return [
         {
             "hole": str(row["hole"]),
-            "truth": _mm(row["true_diameter_mm"], 2),
+            "truth": mm(row["true_diameter_mm"], 2),
             "extent": _spread(row["extent_diameter_mean_mm"], row["extent_diameter_std_mm"]),
             "model": _spread(row["model_diameter_mean_mm"], row["model_diameter_std_mm"]),
-            "model_se": _mm(row["model_diameter_se_mean_mm"], 2),
+            "model_se": mm(row["model_diameter_se_mean_mm"], 2),
             "covered": "–"
             if row["model_diameter_covered"] != row["model_diameter_covered"]
             else f"{100 * row['model_diameter_covered']:.0f} %",
-            "seen": _mm(row["seen_depth_mm"], 1),
+            "seen": mm(row["seen_depth_mm"], 1),
             "depth": _spread(row["model_depth_mean_mm"], row["model_depth_std_mm"]),
-            "depth_se": _mm(row["model_depth_se_mean_mm"], 2),
-            "extent_centre": _mm(row["extent_error_mean_mm"], 2),
-            "model_centre": _mm(row["model_error_mean_mm"], 2),
+            "depth_se": mm(row["model_depth_se_mean_mm"], 2),
+            "extent_centre": mm(row["extent_error_mean_mm"], 2),
+            "model_centre": mm(row["model_error_mean_mm"], 2),
         }
         for _, row in rows.iterrows()
     ]
@@ -266,75 +230,3 @@ def _variant_rows(variants: pd.DataFrame) -> list[dict[str, Any]]:
         compared = [*RULES, "found_1", "found_50"]
         row["changed"] = {key for key in compared if main is not None and row[key] != main[key]}
     return rows
-
-
-def _call_rows(calls: pd.DataFrame) -> list[dict[str, str]]:
-    return [
-        {
-            "frames": str(row["frames"]),
-            "role": "damaged board" if row["role"] == "damaged" else "hole-free board",
-            "count": f"{row['false_calls']} in {row['runs']}",
-            "rate": bounded(row["per_run"], row["per_run_low"], row["per_run_high"], 3),
-            "threshold": f"{row['threshold']:.2f}",
-            "threshold_mm": _mm(row["threshold_mm"]),
-            "quiet": f"{_mm(row['quiet_highest'])} ({row['quiet_runs']:.0f} runs)" if row["quiet_runs"] > 0 else "–",
-            "noise": _mm(row["surface_noise_mm"], 3),
-        }
-        for _, row in calls[calls["variant"] == MAIN].iterrows()
-    ]
-
-
-def _failure(failure: Any) -> str:
-    """A failure as text; a mapping with ``what`` and ``why`` as one sentence."""
-    if isinstance(failure, Mapping) and set(failure) == {"what", "why"}:
-        return f"{failure['what']}: {failure['why']}"
-    return _plain(failure)
-
-
-def _left_out(runs: pd.DataFrame) -> str:
-    """How many frames averaging left out as disturbed, over all runs."""
-    out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
-    return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
-
-
-def _seconds(provenance: Mapping[str, Any]) -> list[tuple[str, str, float]]:
-    """(stage, seconds as text, share of the longest in per cent)."""
-    seconds = {stage: float(value) for stage, value in dict(provenance.get("seconds", {})).items()}
-    longest = max(seconds.values(), default=0.0) or 1.0
-    return [(stage, f"{value:.1f}", round(100 * value / longest, 1)) for stage, value in seconds.items()]
-
-
-def _provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
-    expected = (
-        "commit",
-        "dirty",
-        "seed",
-        "started",
-        "machine",
-        "mitsuba_variant",
-        "indirect_noise_mm",
-        "renders",
-        "versions",
-    )
-    others = [key for key in provenance if key not in expected and key not in SHOWN_APART]
-    return [
-        (key.replace("_mm", " (mm)").replace("_", " "), _plain(provenance.get(key, "not recorded")))
-        for key in (*expected, *others)
-    ]
-
-
-def _plain(value: Any) -> str:
-    """A recorded value as text: yes and no, ``name: value`` pairs, lists; never Python's own notation."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key}: {_plain(part)}" for key, part in value.items())
-    if isinstance(value, (list, tuple)):
-        return ", ".join(_plain(part) for part in value) or "none"
-    if value is None:
-        return "not recorded"
-    return value if isinstance(value, str) else json.dumps(value, default=str)
-
-
-def _mm(value: float, digits: int = 2) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"

@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.evaluation.summary import MAIN
 from harness.report.measures import inches
+from harness.report.set_ups_rows import Layout, count_text, found_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,9 +40,55 @@ def terminal_table(summary: pd.DataFrame, variant: str = MAIN) -> Table:
 def terminal_text(summary: pd.DataFrame, variant: str = MAIN) -> str:
     """`terminal_table` as plain lines without colour or boxes, columns aligned."""
     frames, rows = _cells(summary, variant)
-    lines = [_heads(frames), *([text for text, _ in row] for row in rows)]
+    return _aligned([_heads(frames), *([text for text, _ in row] for row in rows)], ">")
+
+
+def _aligned(lines: list[list[str]], side: str) -> str:
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join("  ".join(f"{text:>{width}}" for text, width in zip(line, widths, strict=True)) for line in lines)
+    return "\n".join(
+        "  ".join(f"{text:{side}{width}}" for text, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )
+
+
+def set_ups_table(compared: pd.DataFrame, layout: Layout) -> Table:
+    """Of several set-ups: holes found and the smallest of them, for the least and the greatest number of frames.
+
+    ``compared``: of `harness.evaluation.set_ups.compare_set_ups`.
+    """
+    from rich.table import Table
+
+    lines = _set_up_lines(compared, layout)
+    title = "holes found, and the smallest diameter from which on all are (mm), by number of averaged frames (N)"
+    table = Table(title=title, box=None, pad_edge=False, collapse_padding=True)
+    for head in lines[0]:
+        table.add_column(head, no_wrap=True)
+    for line in lines[1:]:
+        table.add_row(*line)
+    return table
+
+
+def set_ups_text(compared: pd.DataFrame, layout: Layout) -> str:
+    """`set_ups_table` as plain lines."""
+    return _aligned(_set_up_lines(compared, layout), "<")
+
+
+def _set_up_lines(compared: pd.DataFrame, layout: Layout) -> list[list[str]]:
+    table = {(row["variant"], row["frames"]): row for _, row in compared.iterrows()}
+    frames = layout.shown_frames
+    heads = ["set-up", *([layout.column_name] if layout.columns else [])]
+    lines = [[*heads, *(f"N={n}{part}" for n in frames for part in ("", " from mm"))]]
+    for title, variants in layout.rows.items():
+        for place, variant in enumerate(variants):
+            line = [title, *([layout.columns[place]] if layout.columns else [])]
+            for n in frames:
+                row = table.get((variant, n))
+                line += ["–", "–"] if row is None else [f"{count_text(row)} {found_text(row)}".strip(), _limit(row)]
+            lines.append(line)
+    return lines
+
+
+def _limit(row: pd.Series) -> str:
+    return f"{row['limit_mm']:.2f}" if np.isfinite(row["limit_mm"]) else "–"
 
 
 def _heads(frames: list[int]) -> list[str]:

@@ -1,0 +1,44 @@
+"""Dotted paths and their values in the words of tables: ``source.target.distance_m`` is "distance", in m."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
+"""Endings of keys that name a unit, longer ones first."""
+LONGEST = 60
+"""Characters of a value that a table can show."""
+
+
+def names_of(paths: Iterable[str]) -> dict[str, str]:
+    """A name for each path, without its unit: the last key (of ``camera.name`` the one before); the whole path where
+    that would be the same for two."""
+    short = {path: _split(path)[0] for path in paths}
+    return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
+
+
+def unit_of(path: str) -> str:
+    """The unit that the last key's ending names, or empty."""
+    return _split(path)[1]
+
+
+def value_text(path: str, value: Any) -> str:
+    """A value on one line, short, with its unit where it is a number."""
+    text = on_one_line(value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return f"{value:g} {unit_of(path)}" if number and unit_of(path) else text
+
+
+def on_one_line(value: Any) -> str:
+    """A value as text of at most `LONGEST` characters."""
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def _split(path: str) -> tuple[str, str]:
+    keys = path.split(".")
+    key = keys[-2] if keys[-1] == "name" and len(keys) > 1 else keys[-1]
+    ending = next((one for one in UNITS if key.endswith(one) and len(key) > len(one)), "")
+    return key.removesuffix(ending).replace("_", " "), UNITS.get(ending, "")

@@ -1,0 +1,168 @@
+"""The page and the final table of several set-ups: complete, self-contained, honest about what failed."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_tables import CAMERAS, World, cameras, example, joined, placed, provenance, set_up_name, tables
+from test_limits import switched
+
+from harness.engine.board_noise import pair_noise
+from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.summary import summarise_holes
+from harness.report.page import write_report
+from harness.report.set_ups_page import set_ups_html
+from harness.report.set_ups_rows import Layout, matrix_rows
+from harness.report.terminal import set_ups_text
+
+AXES = ["source.camera.name", "source.target.distance_m"]
+SMALLEST = {"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)}
+YAML = "name: cameras # <few> & many\n"
+
+
+def clouds(distances=(0.5, 1.0)):
+    return [
+        replace(example(frames), variant=set_up_name(camera, distance))
+        for camera in CAMERAS
+        for distance in distances
+        for frames in (1, 50)
+    ]
+
+
+@pytest.fixture(scope="module")
+def varied():
+    beam = tables(
+        World(repeats=12, rate=lambda hole, frames: float(hole >= 3)), (1, 50), "L515 at 0.5 m, beam of 0.7 mrad"
+    )
+    return joined(cameras(SMALLEST), placed(beam, "realsense_l515", 0.5, of=set_up_name("realsense_l515", 0.5)))
+
+
+@pytest.fixture(scope="module")
+def page(varied):
+    return set_ups_html(varied, clouds(), provenance(), YAML, "Three cameras")
+
+
+def headings(page: str) -> list[str]:
+    return re.findall(r"<h2>(.*?)</h2>", page)
+
+
+def test_every_section_is_there_and_nothing_comes_from_outside(page):
+    assert headings(page) == [
+        "Holes found",
+        "Detections by hole",
+        "The same hole, as each sees it",
+        "Sizes and positions",
+        "What each camera gives",
+        "The thesis' claim",
+        "If facts were otherwise",
+        "Thresholds and false calls",
+        "Failures",
+        "Cost",
+        "Provenance",
+    ]
+    for name in ("limits", "sights", "one_hole", "grain"):
+        assert f'<figure id="{name}">' in page
+    assert "No data for this figure" not in page
+    assert "<script" not in page
+    assert not re.findall(r'(?:src|href)="(?:https?:)?//(?!www\.w3\.org)', page)
+    assert "&lt;few&gt; &amp; many" in page
+    assert "None" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+    assert ">nan" not in page
+
+
+def test_the_same_input_gives_the_same_bytes(varied, page):
+    assert set_ups_html(varied, clouds(), provenance(), YAML, "Three cameras") == page
+
+
+def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
+    answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
+    assert "Found of 11 holes at 0.5 m, 1 m with 50 averaged frames: azure_kinect_nfov 9, 8; kinect_v2 8, 7" in answer
+    assert "is borne out" in answer
+
+
+def test_a_variation_is_shown_beside_its_set_up_and_with_its_verdict(page):
+    row = page[page.index("L515 at 0.5 m, beam of 0.7 mrad</th>") :]
+    row = row[: row.index("</tr>")]
+    assert set_up_name("realsense_l515", 0.5) in row
+    assert "≠ 9 of 11<br>3–11" in row
+    assert "7 of 11<br>5–11" in row  # the set-up's own, with one frame
+    # with the beam L515 finds hole 3 as well, so that it is level with Azure everywhere
+    assert "≠ not borne out" in row
+
+
+def test_matrix_has_the_counts_of_both_numbers_of_frames():
+    found = cameras(SMALLEST)
+    compared = compare_set_ups(found, summarise_holes(found.holes, AXES), set_ups_of(found))
+    layout = Layout.of(found, compared)
+    assert list(layout.rows) == list(CAMERAS)
+    assert (layout.columns, layout.column_name, layout.column_values) == (("0.5 m", "1 m"), "distance (m)", (0.5, 1.0))
+    rows = matrix_rows(compared, layout)
+    assert [[cell["count"] for cell in both] for both in rows[1]["cells"]] == [
+        ["7 of 11", "8 of 11"],
+        ["6 of 11", "7 of 11"],
+    ]
+    assert rows[0]["cells"][0][1]["found"] == "3–11"
+    assert rows[0]["cells"][0][1]["limit"] == "4.76 mm"
+    text = set_ups_text(compared, layout).splitlines()
+    assert len(text) == 1 + 6
+    assert re.match(r"kinect_v2 +1 m +6 of 11 6–11 +9.52 +7 of 11 5–11 +7.94$", text[4])
+
+
+def test_failures_and_missing_set_ups_are_told():
+    found = cameras(SMALLEST)
+    gone = set_up_name("kinect_v2", 1.0)
+    parts = ("holes", "runs", "probes", "noise")
+    found = replace(found, **{name: getattr(found, name)[getattr(found, name)["variant"] != gone] for name in parts})
+    said = provenance() | {"failures": [{"what": "damaged-00001", "why": "ValueError: empty crop"}]}
+    kept = [cloud for cloud in clouds() if cloud.variant != gone]
+    page = set_ups_html(found, kept, said, YAML, "Three cameras")
+    assert "damaged-00001: ValueError: empty crop" in page
+    assert "not finished" in page
+    assert '<figure id="sights">' not in page
+    assert ">nan" not in page
+
+
+def test_effects_have_a_figure_and_a_table():
+    names = ("noise", "fixed_pattern")
+    found = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
+    cloud = [replace(example(50), variant="noise+fixed_pattern")]
+    page = set_ups_html(found, cloud, provenance(), YAML, "Anatomy")
+    assert "What each effect costs" in headings(page)
+    assert '<figure id="effects">' in page
+    assert '<figure id="board">' in page
+    assert page.count("+3.18 mm (+3.18 to +3.18)") == 4  # noise, alone and last, with 1 and 50 frames: 2/16 in
+    assert "all effects together move the 50 % size by +4.76 mm" in page
+
+
+def test_the_page_of_several_set_ups_is_chosen_by_the_tables(tmp_path):
+    several = write_report(tmp_path / "a", cameras(SMALLEST), [], provenance(), YAML, "T").read_text()
+    assert "Holes found" in headings(several)
+    one = write_report(tmp_path / "b", tables(), [], provenance(), YAML, "T").read_text()
+    assert "Holes against frames" in headings(one)
+
+
+def test_pair_noise_finds_the_grain_of_a_known_filter():
+    rng = np.random.default_rng(5)
+
+    def frame(shift_m: float) -> np.ndarray:
+        white = rng.normal(0, 1e-3, (2, 204, 302))[0]
+        return (white[:, :-2] + white[:, 1:-1] + white[:, 2:]) / np.sqrt(3) + 0.7 + shift_m
+
+    everywhere = np.ones((204, 300), bool)
+    first, second = frame(0.0), frame(0.017)  # the second is displaced as a whole
+    first[:3] = np.nan
+    found = pair_noise(first, second, everywhere)
+    # three of 60,000 pixels' worth of averages: 1 mm, 2/3, 1/3 and 0 to four standard errors of about 0.01
+    assert found["single_frame_mm"] == pytest.approx(1.0, abs=0.02)
+    assert found["correlation_u1"] == pytest.approx(2 / 3, abs=0.02)
+    assert found["correlation_u2"] == pytest.approx(1 / 3, abs=0.03)
+    assert found["correlation_u3"] == pytest.approx(0.0, abs=0.03)
+    assert found["correlation_v1"] == pytest.approx(0.0, abs=0.03)
+    nowhere = pair_noise(first, second, np.zeros_like(everywhere))
+    assert all(np.isnan(value) for value in nowhere.values())
+    assert set(nowhere) == set(found)
+    assert json.dumps({key: value for key, value in found.items()})  # plain numbers, for the journal
