@@ -295,6 +295,7 @@ def _probes(world: World, rng: np.random.Generator, variant: str, frames: tuple[
                     + rng.normal(0, sigma / np.sqrt(world.repeats), pixels),
                     "temporal_std_mm": (np.nan if world.repeats < 2 else sigma)
                     * np.sqrt(rng.chisquare(freedom, pixels) / freedom),
+                    "displacement_std_mm": 0.25 / np.sqrt(n),
                     "repeats": world.repeats,
                 }
             )

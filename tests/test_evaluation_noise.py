@@ -40,6 +40,7 @@ def test_three_pixels_by_hand() -> None:
             "pixel": [0, 1, 2, 3],
             "mean_error_mm": [1.0, 2.0, 3.0, np.nan],
             "temporal_std_mm": [0.5, 0.5, 0.5, 0.5],
+            "displacement_std_mm": [0.1, 0.1, 0.1, 0.1],
             "repeats": 5,
         }
     )

@@ -23,8 +23,8 @@ def probe(repeat: int, errors: list[int | None]) -> dict[str, object]:
 def test_order_of_records_does_not_matter_and_none_is_nan():
     experiment = load_experiment(ROOT / "experiments" / "smoke.yaml")
     records = [
-        {"holes": [hole(1, "1", None)], "runs": [], "probes": [probe(1, [1000, None])], "noise": []},
-        {"holes": [hole(0, "1", 2.0)], "runs": [], "probes": [probe(0, [3000, 10])], "noise": []},
+        {"holes": [hole(1, "1", None)], "runs": [], "probes": [probe(1, [1000, None, 2000, 1500])], "noise": []},
+        {"holes": [hole(0, "1", 2.0)], "runs": [], "probes": [probe(0, [3000, 10, 2000, 2500])], "noise": []},
     ]
     tables = tables_of(records, experiment)
     again = tables_of(records[::-1], experiment)
@@ -32,8 +32,12 @@ def test_order_of_records_does_not_matter_and_none_is_nan():
     assert np.isnan(tables.holes.score[1])
     assert tables.holes.equals(again.holes)
     assert tables.probes.equals(again.probes)
-    assert abs(tables.probes.mean_error_mm[0] - 0.2) < 1e-12  # mean of 3000 and 1000 tenths of a micrometre
-    assert abs(tables.probes.temporal_std_mm[0] - 0.1 * np.sqrt(2)) < 1e-12
+    # tenths of a micrometre: the repeats' medians are 2250 and 1500, so the clouds lie 375 to either side of the middle
+    probes = tables.probes
+    assert abs(probes.mean_error_mm[0] - 0.2) < 1e-12  # mean of 3000 - 375 and 1000 + 375
+    assert abs(probes.temporal_std_mm[0] - 0.0625 * np.sqrt(2)) < 1e-12
+    assert np.allclose(probes.displacement_std_mm, 0.0375 * np.sqrt(2))
+    assert np.isnan(probes.mean_error_mm[1])
 
 
 def test_every_variant_has_the_reason_that_stands_beside_it():
@@ -56,7 +60,7 @@ def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
     assert (row["source.camera.name"], row["source.target.distance_m"]) == ("kinect_v2", 0.75)
     variants = tables.variants.set_index("variant")
     assert list(variants.reference[variants.is_variation]) == [
-        "camera=kinect_v2, distance=0.505 m",
+        "camera=kinect_v2, distance=0.5 m",
         *2 * ["camera=realsense_l515, distance=0.75 m"],
     ]
 

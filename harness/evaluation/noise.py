@@ -54,6 +54,7 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     pixels of the mean error. ``pattern_mm``: standard deviation over pixels of the mean error, less the temporal
     variance that the finite number of repeats leaves in it (temporal^2 / repeats; 0 where that is the greater).
     ``systematic_mm``: offset and pattern together. ``total_rms_mm``: temporal and systematic together.
+    ``displacement_mm``: standard deviation over repeats of how the whole cloud is displaced; in no other column.
     ``guide_mm``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value
     are left out, and with them rows that have no pixel (a single repeat has no scatter).
     """
@@ -77,11 +78,12 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
                 "offset_mm": offset,
                 "pattern_mm": np.sqrt(pattern2),
                 "systematic_mm": np.sqrt(systematic2),
+                "displacement_mm": float(part["displacement_std_mm"].median()),
                 "total_rms_mm": np.sqrt(mean[0] + systematic2),
             }
         )
     columns = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
-    table = pd.DataFrame(rows, columns=[*columns, "systematic_mm", "total_rms_mm"])
+    table = pd.DataFrame(rows, columns=[*columns, "systematic_mm", "displacement_mm", "total_rms_mm"])
     table = table.sort_values("frames", kind="stable").sort_values("variant", kind="stable", ignore_index=True)
     first = table.groupby("variant")[["frames", "temporal_rms_mm"]].transform("first")
     table["guide_mm"] = first["temporal_rms_mm"] * np.sqrt(first["frames"] / table["frames"])

@@ -46,7 +46,7 @@ class ResultTables(Protocol):
     ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
     ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
     quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
-    ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, repeats; pixels in sensor order.
+    ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, displacement_std_mm, repeats; in sensor order.
     ``variants``: variant, reason, settings (JSON text), is_variation, reference, switches (JSON text).
     ``noise``: variant, frames, repeat, valid_share, pitch_u_mm, pitch_v_mm, single_frame_mm, correlation_u1 ... _v3.
     ``axes``: path, name, unit of what tells set-ups apart; every other table has a column for each path.
