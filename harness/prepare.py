@@ -16,15 +16,18 @@ def main() -> int:
 
 
 def _prepare() -> int:
-    """Drive every compiled loop through one small capture: exposure, engine, averages, fits, clusters, hole model."""
+    """Drive every compiled loop through small captures: each camera's, then averages, fits, clusters, hole model."""
     from detectors import load_detector
     from detectors.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
-    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.camera import CameraConfig, camera_names, load_camera
     from scenes.sensor.source import SimulatedUnit
 
     began = time.perf_counter()
+    for name in camera_names():
+        view = plane_view(load_camera(name), Region(200, 240, 200, 260), 0.7, 0.6, 0.05, 0.02)
+        list(SimulatedUnit(load_camera(name), CameraConfig(name=name), view).capture(1, 1).frames())
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
     view.phasor[:, 18:24, 28:34] *= 1j

@@ -13,8 +13,8 @@ from harness.vocabulary.geometry import Region
 class NoiseFreeView:
     """Noise-free light of one view on a region of the sensor.
 
-    ``phasor`` (f, h, w) complex128: per modulation frequency the light of all paths,
-    sum over paths of a * exp(+i 2 pi f L / c), L the full path length; amplitudes in units of an
+    ``phasor`` (f, h, w) complex64 (its rounding turns 200 MHz by 10 nm): per modulation frequency the light of all
+    paths, sum over paths of a * exp(+i 2 pi f L / c), L the full path length; amplitudes in units of an
     unoccluded albedo-1 Lambertian plane facing emitter and camera at 1 m on the axis (=1).
     ``phasor_direct`` (f, h, w): the part without interreflection. ``intensity`` (h, w): the same sum at frequency 0.
     ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves in a pixel.

@@ -12,14 +12,17 @@ import trimesh
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
-from scenes.render import direct, variant
+from scenes.render import variant
 from scenes.render.cache import cached_view, read_view, render_key
-from scenes.render.direct import cast, direct_light
-from scenes.render.indirect import gather_at_points, gather_in_pixels
+from scenes.render.direct import OffFace, cast, direct_light
+from scenes.render.face import face_triangles
+from scenes.render.footprint import Quadrilaterals, footprint_of
+from scenes.render.indirect import Work, gather_at_points, gather_in_pixels, range_change_m
+from scenes.render.phasors import phasor_sums
 from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
-from scenes.render.view import render_view, target_region
+from scenes.render.view import indirect_light, render_view, target_region
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import load_camera
 from scenes.target.declaration import TargetConfig, ThesisTargetConfig
@@ -40,6 +43,17 @@ def quad(corners: list[list[float]], name: str = "plane", albedo: float = 0.5) -
 
 def frontal(z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo: float = 0.5) -> Part:
     return quad([[x0, -2, z], [x1, -2, z], [x1, 2, z], [x0, 2, z]], name, albedo)
+
+
+def light_on(lit, lens, region, footprint=CAMERA.optics.footprint, frequencies_hz=CAMERA.frequencies_hz):
+    return direct_light(lit, lens.region_slopes(region), footprint_of(lens, region, footprint), frequencies_hz)
+
+
+def whole_pixels(lens, region, rows, cols):
+    """All sub-rays of pixels, for a path tracer that knows no face."""
+    slopes = Quadrilaterals(lens, region).coarse(rows, cols)
+    count = np.full(len(rows), slopes.shape[1])
+    return OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
 
 
 def scene_of(*parts: Part, camera=CAMERA):
@@ -85,13 +99,10 @@ def test_step_edge_mixes_phasors_by_area():
     region = Region(330, 336, 316, 328)
     edge_x = 0.7 * lens.slopes(np.array(321.8), np.array(333.0))[0]
     lit = scene_of(frontal(0.7, -2, float(edge_x), "near"), frontal(0.75, -2, 2, "far"))
-    light = direct_light(lit, lens, region, CAMERA.frequencies_hz)
+    light = light_on(lit, lens, region)
     column = 322 - region.col0
     assert light.fine[:, column].all()
-    near, far = (
-        direct_light(scene_of(frontal(z)), lens, region, CAMERA.frequencies_hz).phasor[:, :, column]
-        for z in (0.7, 0.75)
-    )
+    near, far = (light_on(scene_of(frontal(z)), lens, region).phasor[:, :, column] for z in (0.7, 0.75))
     # the edge stands 0.3 px right of the pixel's left border; the lens sees a little of the far plane shadowed by the
     # plate (emitter 14 mm to the left: 1 mm wide, 0.7 px), so between 0.3 and 1.0 px nothing comes back
     assert light.coverage[:, column] == pytest.approx(1 - 0.3, abs=1 / 16)
@@ -139,7 +150,7 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
     floor = quad([[-1, 0.3, 0.2], [1, 0.3, 0.2], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "floor", 0.6)
     lit = scene_of(wall, floor)
     point = np.array([0.05, 0.2, 1.0])
-    light = gather_at_points(lit, point[None], np.array([[0.0, 0, -1]]), CAMERA.frequencies_hz, 65536, 0, seed=3)
+    light = gather_at_points(lit, point[None], np.array([[0.0, 0, -1]]), Work(CAMERA.frequencies_hz, 0, seed=3), 65536)
     xs, zs = np.linspace(-1, 1, 1601), np.linspace(0.2, 1.0, 1601)
     xs, zs = (xs[1:] + xs[:-1]) / 2, (zs[1:] + zs[:-1]) / 2
     q = np.stack(np.broadcast_arrays(xs[None, :], 0.3, zs[:, None]), axis=-1)
@@ -155,9 +166,8 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
         expected = (kernel * np.exp(1j * wave * (leg + d))).sum()
         assert abs(light.mean[f, 0] - expected) < 0.004 * abs(expected)
     slope = point[:2] / point[2]
-    width = 0.5 / 504
-    corners = slope + np.array([[-width, -width], [width, -width], [-width, width], [width, width]])
-    pixel = gather_in_pixels(lit, corners[None], CAMERA.frequencies_hz, 8192, 4, seed=3)
+    rays = OffFace(np.zeros(1, int), np.ones(1, int), np.ones(1), slope[None].astype(np.float32))
+    pixel = gather_in_pixels(lit, rays, Work(CAMERA.frequencies_hz, 4, seed=3), 8192)
     hit = cast(lit, slope[None])
     direct = hit.amplitude * np.exp(1j * WAVE * hit.path_m)
     assert (np.angle((direct + pixel.mean[:3, 0]) / direct) > 0).all()
@@ -210,18 +220,23 @@ def test_renders_repeat_exactly(thesis_view):
 
 
 def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
-    """Eight renders with other seeds: the spread of their ranges is what each reports, within 35 %, inside the holes
+    """Eight gatherings with other seeds: the spread of the ranges is what each reports, within 35 %, inside the holes
     where noise is white from pixel to pixel."""
+    target, optics, slopes = build_target(SMALL), CAMERA.optics, thesis_view.slopes
+    lit = lit_scene(load_mitsuba(), target.parts, optics, face_triangles(target))
+    footprint = footprint_of(optics.lens, thesis_view.region, optics.footprint)
+    direct = direct_light(lit, slopes, footprint, optics.frequencies_hz)
+    inside = np.ones(thesis_view.range_m.shape, bool)
     config = QUICK.model_copy(update={"face_samples": 64})
-    views = [render_view(build_target(SMALL), CAMERA.optics, config.model_copy(update={"seed": s})) for s in range(8)]
-    backing = views[0].surface == views[0].surface_names.index("backing")
-    lit = backing & (np.abs(views[0].phasor_direct[0]) > 0.1)
-    f = np.array(CAMERA.frequencies_hz)[:, None, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turned = [np.angle(v.phasor / v.phasor_direct) for v in views]
-    shifts = [(SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * angle).sum(axis=0)[lit] for angle in turned]
+    gathered = [
+        indirect_light(lit, target, optics, slopes, direct, inside, config.model_copy(update={"seed": seed}))
+        for seed in range(8)
+    ]
+    backing = direct.surface == lit.names.index("backing")
+    seen = backing & (np.abs(direct.phasor[0]) > 0.1)
+    shifts = [range_change_m(light[:-1, seen], direct.phasor[:, seen], optics.frequencies_hz) for light, _ in gathered]
     spread = np.sqrt(np.var(shifts, axis=0, ddof=1).mean())
-    reported = np.sqrt(np.mean([v.indirect_noise_m[lit] ** 2 for v in views]))
+    reported = np.sqrt(np.mean([noise_m[seen] ** 2 for _, noise_m in gathered]))
     assert spread / reported == pytest.approx(1, abs=0.35)
 
 
@@ -233,9 +248,8 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
     lit = scene_of(*target.parts)
     lens = CAMERA.nominal_lens
     rows, cols = (a.ravel() for a in np.meshgrid([22, 70], np.arange(30, 400, 4), indexing="ij"))
-    u, v = cols + thesis_view.region.col0, rows + thesis_view.region.row0
-    corners = np.stack([lens.slopes(u + a, v + b) for b in (-0.5, 0.5) for a in (-0.5, 0.5)], axis=1)
-    traced = gather_in_pixels(lit, corners, CAMERA.frequencies_hz, 2048, QUICK.bounces, seed=9)
+    work = Work(CAMERA.frequencies_hz, QUICK.bounces, seed=9)
+    traced = gather_in_pixels(lit, whole_pixels(lens, thesis_view.region, rows, cols), work, 2048)
     direct = thesis_view.phasor_direct[:, rows, cols]
     indirect = thesis_view.phasor[:, rows, cols] - direct
     f = np.array(CAMERA.frequencies_hz)[:, None]
@@ -305,7 +319,9 @@ def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
     f = np.array(CAMERA.frequencies_hz)[:, None]
     for top in (15, 30, 72):
         rows, cols = (a.ravel() for a in np.meshgrid(np.arange(top, top + 4), np.arange(20, 400), indexing="ij"))
-        fine, _ = direct._sums(cast(lit, direct._strata(lens, region, rows, cols, 32)), 32**2, CAMERA.frequencies_hz)
+        hits = cast(lit, Quadrilaterals(lens, region).strata(rows, cols, 32).reshape(-1, 2))
+        sub = (hits.amplitude.reshape(-1, 32**2), hits.path_m.reshape(-1, 32**2))
+        fine = phasor_sums(*sub, CAMERA.frequencies_hz)
         turned = np.angle(thesis_view.phasor_direct[:, rows, cols] / fine)
         error_m = (SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turned).sum(axis=0)
         away = np.abs(thesis_view.range_m[rows, cols] - np.median(thesis_view.range_m[rows, cols])) < 0.2

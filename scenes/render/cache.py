@@ -30,7 +30,7 @@ CODE = (
     "scenes/view.py",
     "harness/vocabulary",
 )
-PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numpy", "scipy")
+PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
 """What decides a render's numbers beside its declaration. The variant (GPU or processor) is left out: it changes them
 by 1e-6."""
 

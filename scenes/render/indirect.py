@@ -1,9 +1,7 @@
-"""The indirect part of a view: light that met at least two surfaces, by path tracing, with its noise measured.
+"""Gathering indirect light, light that met at least two surfaces, with its noise measured.
 
-Two estimates share one path tracer. On the board's undamaged face indirect light is smooth, so it is gathered at the
-nodes of a coarse grid on the face and interpolated. Everywhere else (holes, rims, what lies around the board) each
-pixel gathers its own. Low-discrepancy points (Sobol, scrambled anew for each batch) make both converge faster than
-random ones; the spread between batches gives the noise that is left.
+Low-discrepancy points (Sobol, scrambled anew for each batch) make the mean converge faster than random ones would; the
+spread between batches gives the noise that is left.
 """
 
 from __future__ import annotations
@@ -12,20 +10,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import interpolate
 from scipy.stats import qmc
 
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
-from scenes.render.scene import LitScene, facing
+from scenes.render.direct import OffFace
+from scenes.render.scene import LIFT_M, LitScene
+from scenes.render.walk import PER_VERTEX, START_DIMENSIONS, Lanes, Points, Starts, walk
 
 BATCHES = 8
-LANES = 1 << 22
-"""Paths traced at once: 4 million lanes take 0.6 GB."""
+PATHS_A_LANE = 64
+"""Enough that lanes end together although paths differ in length, few enough that a small job fills the machine."""
+
+NOISE_LINES = 4
+"""Of a comb of many, these tell what noise does to range: paths are the same for all lines."""
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """Indirect light at n places: ``sums`` (BATCHES, f + 1, n) complex, per batch; frequency 0 (intensity) last.
+    """Indirect light at n places: ``sums`` (BATCHES, f + 1, n) complex64, per batch; frequency 0 (intensity) last.
 
     Phase counts from the place of gathering on. Units as in `scenes.view.NoiseFreeView`, without the place's albedo
     where the start was a surface point, with it where the start was the lens.
@@ -36,62 +38,67 @@ class Gathered:
     @property
     def mean(self) -> np.ndarray:
         """(f + 1, n) mean over batches."""
-        return np.asarray(self.sums.mean(axis=0))
+        return np.asarray(self.sums.mean(axis=0, dtype=complex))
 
 
-def gather_at_points(
-    lit: LitScene,
-    points_m: np.ndarray,
-    normals: np.ndarray,
-    frequencies_hz: tuple[float, ...],
-    samples: int,
-    bounces: int,
-    seed: int,
-) -> Gathered:
-    """Indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit albedo."""
+@dataclass(frozen=True)
+class Work:
+    """How paths are walked: at which frequencies, with how many reflections beyond the first, and from which seed."""
 
-    mi = lit.mi
-    position, normal = _Table(mi, points_m), _Table(mi, normals)
-
-    def start(place: Any, u1: Any, u2: Any) -> Any:
-        frame = mi.Frame3f(mi.Normal3f(*(normal(place, k) for k in range(3))))
-        direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
-        return mi.Ray3f(mi.Point3f(*(position(place, k) for k in range(3))), direction)
-
-    return _trace(
-        lit, len(points_m), start, frequencies_hz, samples, bounces, seed, first_counts=True, decorrelate=False
-    )
+    frequencies_hz: tuple[float, ...]
+    bounces: int
+    seed: int
 
 
-def gather_in_pixels(
-    lit: LitScene,
-    corners: np.ndarray,
-    frequencies_hz: tuple[float, ...],
-    samples: int,
-    bounces: int,
-    seed: int,
-) -> Gathered:
-    """Indirect light of n pixels, each with the slopes of its four corners (n, 4, 2) in the order 00 01 10 11."""
+def gather_at_points(lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: Work, samples: int) -> Gathered:
+    """Indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit albedo.
 
-    mi = lit.mi
-    table = _Table(mi, corners.reshape(len(corners), 8))
-
-    def start(place: Any, u1: Any, u2: Any) -> Any:
-        import drjit as dr
-
-        x, y = (
-            (1 - u2) * ((1 - u1) * table(place, k) + u1 * table(place, 2 + k))
-            + u2 * ((1 - u1) * table(place, 4 + k) + u1 * table(place, 6 + k))
-            for k in range(2)
-        )
-        return mi.Ray3f(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
-
-    return _trace(
-        lit, len(corners), start, frequencies_hz, samples, bounces, seed, first_counts=False, decorrelate=True
-    )
+    All points share their low-discrepancy numbers, so that what noise is left is smooth from point to point.
+    """
+    starts = _SurfaceStarts(lit.mi, points_m, normals)
+    return _gather(lit, starts, np.full(len(points_m), samples), work, own_rotation=False)
 
 
-class _Table:
+def gather_in_pixels(lit: LitScene, rays: OffFace, work: Work, samples: int | np.ndarray) -> Gathered:
+    """Indirect light (mean over the listed sub-rays of each pixel) with ``samples`` paths each, one number or (p,).
+
+    The share of the footprint is left out.
+    """
+    starts = _LensStarts(lit.mi, rays)
+    counts = np.broadcast_to(np.asarray(samples), rays.pixel.shape)
+    return _gather(lit, starts, counts, work, own_rotation=True)
+
+
+def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """One standard deviation of range, (n,), from phasors of B independent batches added to light ``total`` (f, n).
+
+    ``batches`` (B, l, n): at the frequencies of `noise_lines`. Linear: see `range_change_m`. The mean over B batches
+    has their deviation over sqrt(B).
+    """
+    few = noise_lines(frequencies_hz)
+    chosen = tuple(frequencies_hz[k] for k in few)
+    per_batch = range_change_m(batches - batches.mean(axis=0), total[few], chosen)
+    return np.asarray(per_batch.std(axis=0, ddof=1) / np.sqrt(len(batches)))
+
+
+def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """What a small change (..., f, n) of phasors ``total`` (f, n) does to range, (..., n); 0 where there is no light.
+
+    A change dH turns the phase by Im(dH / H); frequencies are fused with the least-squares weights
+    c f_k / (4 pi sum f^2).
+    """
+    f = np.array(frequencies_hz)[:, None]
+    turn = np.imag(np.divide(change, total, out=np.zeros(change.shape, complex), where=np.abs(total) > 0))
+    return np.asarray((SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turn).sum(axis=-2))
+
+
+def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
+    """The frequencies from which noise is told: all, or NOISE_LINES spread over the list where there are more."""
+    count = len(frequencies_hz)
+    return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
+
+
+class _Rows:
     """Rows of numbers on the device, looked up by row and column."""
 
     def __init__(self, mi: Any, rows: np.ndarray) -> None:
@@ -105,111 +112,61 @@ class _Table:
         return dr.gather(self._mi.Float, self._flat, row * self._columns + column)
 
 
-def _trace(
-    lit: LitScene,
-    places: int,
-    start: Any,
-    frequencies_hz: tuple[float, ...],
-    samples: int,
-    bounces: int,
-    seed: int,
-    *,
-    first_counts: bool,
-    decorrelate: bool,
-) -> Gathered:
-    """Trace ``samples`` paths a place in BATCHES batches. ``first_counts``: whether light that reaches the first hit
-    directly counts (it does for a start on a surface, and is the direct part for a start at the lens)."""
-    per_batch = max(samples // BATCHES, 1)
-    sums = np.empty((BATCHES, len(frequencies_hz) + 1, places), complex)
-    rng = np.random.default_rng([seed, 0x1D1EC7])
-    dimensions = 2 * (bounces + 1)
-    at_once = max(LANES // per_batch, 1)
-    for batch in range(BATCHES):
-        points = qmc.Sobol(dimensions, seed=rng).random(per_batch).astype(np.float32)
-        shift = rng.random((places if decorrelate else 1, dimensions), dtype=np.float32)
-        for begin in range(0, places, at_once):
-            chunk = np.arange(begin, min(begin + at_once, places))
-            rotation = shift[chunk] if decorrelate else np.repeat(shift, len(chunk), axis=0)
-            sums[batch][:, chunk] = _trace_chunk(
-                lit, chunk, start, frequencies_hz, points, rotation, bounces, first_counts
-            )
-    return Gathered(sums)
+class _SurfaceStarts:
+    """Paths that begin at surface points, in cosine-weighted directions."""
+
+    first_counts = True
+
+    def __init__(self, mi: Any, points_m: np.ndarray, normals: np.ndarray) -> None:
+        self._mi, self._position, self._normal = mi, _Rows(mi, points_m), _Rows(mi, normals)
+
+    def ray(self, place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+        mi = self._mi
+        point = mi.Point3f(*(self._position(place, k) for k in range(3)))
+        normal = mi.Normal3f(*(self._normal(place, k) for k in range(3)))
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        return point, point + LIFT_M * normal, direction
 
 
-def _trace_chunk(
-    lit: LitScene,
-    chunk: np.ndarray,
-    start: Any,
-    frequencies_hz: tuple[float, ...],
-    points: np.ndarray,
-    rotation: np.ndarray,
-    bounces: int,
-    first_counts: bool,
-) -> np.ndarray:
-    """Mean phasors (f + 1, len(chunk)) over the given low-discrepancy points, rotated for each place."""
-    import drjit as dr
+class _LensStarts:
+    """Paths that begin at the lens, along one of a pixel's listed sub-rays."""
 
-    mi = lit.mi
-    count, per_place = len(chunk), len(points)
-    lane = dr.arange(mi.UInt32, count * per_place)
-    which, sample = lane // per_place, lane % per_place
-    point_table = mi.Float(points.ravel())
-    shift_table = mi.Float(rotation.ravel().astype(np.float32))
-    dimensions = points.shape[1]
+    first_counts = False
 
-    def uniform(dimension: Any) -> Any:
-        u = dr.gather(mi.Float, point_table, sample * dimensions + dimension)
-        u += dr.gather(mi.Float, shift_table, which * dimensions + dimension)
-        return u - dr.floor(u)
+    def __init__(self, mi: Any, rays: OffFace) -> None:
+        self._mi, self._slopes = mi, _Rows(mi, rays.slopes)
+        self._first = mi.UInt32((np.cumsum(rays.count) - rays.count).astype(np.uint32))
+        self._count = mi.UInt32(rays.count.astype(np.uint32))
 
-    ray = start(which + int(chunk[0]), uniform(0), uniform(1))
-    wave = [2 * np.pi * f / SPEED_OF_LIGHT_AIR for f in frequencies_hz]
-    totals = _walk(lit, ray, uniform, wave, bounces, first_counts)
-    dr.eval(*totals)
-    means = [dr.block_sum(total, per_place).numpy().astype(float) / per_place for total in totals]
-    phasors = [means[2 * k] + 1j * means[2 * k + 1] for k in range(len(wave))]
-    return np.stack([*phasors, means[-1].astype(complex)])
+    def ray(self, place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+        import drjit as dr
+
+        mi = self._mi
+        first, count = (dr.gather(mi.UInt32, a, place) for a in (self._first, self._count))
+        which = first + dr.minimum(mi.UInt32(u1 * mi.Float(count)), count - 1)
+        direction = dr.normalize(mi.Vector3f(self._slopes(which, 0), self._slopes(which, 1), 1.0))
+        return mi.Point3f(0.0), mi.Point3f(0.0), direction
 
 
-def _walk(lit: LitScene, ray: Any, uniform: Any, wave: list[float], bounces: int, first_counts: bool) -> list[Any]:
-    """Follow the paths; at each vertex add the emitter's light there. Returns re and im per wave, and the sum.
-
-    Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce multiplies by its albedo only.
-    """
-    import drjit as dr
-
-    mi = lit.mi
-    lanes = dr.width(ray)
-    totals = [dr.zeros(mi.Float, lanes) for _ in range(2 * len(wave) + 1)]
-    path = dr.zeros(mi.Float, lanes)
-    throughput = dr.ones(mi.Float, lanes)
-    active = dr.full(mi.Bool, True, lanes)
-    for vertex in range(bounces + 1):
-        hit = lit.scene.ray_intersect(ray, active)
-        active = active & hit.is_valid()
-        path = path + dr.select(active, hit.t, 0)
-        throughput = throughput * dr.select(active, hit.bsdf().eval_diffuse_reflectance(hit, active)[0], 0)
-        if vertex > 0 or first_counts:
-            arriving, leg = lit.arriving(hit, active)
-            light = throughput * arriving
-            for k, number in enumerate(wave):
-                sine, cosine = dr.sincos(number * (path + leg))
-                totals[2 * k] += light * cosine
-                totals[2 * k + 1] += light * sine
-            totals[-1] += light
-        if vertex < bounces:
-            sample = mi.Point2f(uniform(2 * vertex + 2), uniform(2 * vertex + 3))
-            ray = hit.spawn_ray(mi.Frame3f(facing(hit)).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
-    return totals
+def _gather(lit: LitScene, starts: Starts, samples: np.ndarray, work: Work, *, own_rotation: bool) -> Gathered:
+    """Walk ``samples`` (n,) paths from each place, in BATCHES batches."""
+    per_batch = np.maximum(samples // BATCHES, 1)
+    rng = np.random.default_rng([work.seed, 0x1D1EC7])
+    dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
+    longest = int(per_batch.max())
+    table = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
+    lanes, begins = _lanes(per_batch)
+    sums = walk(lit, starts, lanes, Points(table, work.seed, own_rotation), work.frequencies_hz, work.bounces)
+    by_batch = np.add.reduceat(sums, begins, axis=1).reshape(len(sums), len(samples), BATCHES) / per_batch[:, None]
+    return Gathered(np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64))
 
 
-def between_nodes(
-    nodes_x: np.ndarray, nodes_y: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray
-) -> np.ndarray:
-    """Bilinear interpolation of values (m, len(nodes_y), len(nodes_x)), complex, at n places: (m, n).
-
-    Light that left its last surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 4e-4 at 40 mm and
-    0.7 m, of a part that is itself some per cent of the whole.
-    """
-    grid = interpolate.RegularGridInterpolator((nodes_y, nodes_x), np.moveaxis(values, 0, -1), method="linear")
-    return np.asarray(grid(np.column_stack([y, x])).T)
+def _lanes(per_batch: np.ndarray) -> tuple[Lanes, np.ndarray]:
+    """Lanes for so many paths a batch at each place (n,), and where those of each place and batch begin."""
+    groups = -(-per_batch // PATHS_A_LANE)
+    per_pair = np.repeat(groups, BATCHES)
+    begins = np.cumsum(per_pair) - per_pair
+    pair = np.repeat(np.arange(len(per_pair)), per_pair)
+    place, batch = np.divmod(pair, BATCHES)
+    first = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
+    return Lanes(place, batch, first, np.minimum(per_batch[place] - first, PATHS_A_LANE)), begins

@@ -1,0 +1,238 @@
+"""What is left of the light transport's error, and what it costs: ``python tests/validation/transport.py``.
+
+The thesis target at 0.7 m before the Azure Kinect, in a room with floor and back wall. Each view is rendered as an
+experiment would, and compared in range (frequencies fused by least squares) with a reference that knows neither nodes
+on the face nor a budget: paths of up to 24 reflections through 32 x 32 sub-rays of every compared pixel. Then
+mitransient's ``transient_path`` renders the hole-free board at a number of paths that it can afford; its variance is
+extrapolated by 1/n to our error. Prints Markdown tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
+
+from harness.vocabulary.lens import Lens
+from harness.vocabulary.units import MM
+from scenes.optics import Optics
+from scenes.render.direct import OffFace, cast
+from scenes.render.footprint import Quadrilaterals
+from scenes.render.indirect import Work, gather_in_pixels, range_change_m, range_noise_m
+from scenes.render.phasors import phasor_sums
+from scenes.render.scene import LitScene, lit_scene
+from scenes.render.settings import RenderConfig
+from scenes.render.variant import load_mitsuba
+from scenes.render.view import render_view
+from scenes.sensor.camera import load_camera
+from scenes.target.declaration import ThesisTargetConfig
+from scenes.target.mesh import Target, build_target
+from scenes.view import NoiseFreeView
+
+SIDE = 32
+"""Sub-rays per side of a pixel in the reference."""
+LONGEST = 24
+"""Reflections of the reference's paths; those of experiments have RenderConfig's."""
+FACE_TIMES = 8
+"""Paths of the reference on the face for one in a hole: they leave the scene soon, and the error is small."""
+AMPLITUDE_GATE = 0.03
+"""Of a plane of albedo 1 at 1 m: 32 electrons of the Azure Kinect's 1066, above the noise of one frame."""
+FILTER_PIXELS = 25
+"""Pixels under the camera's 5 x 5 window, if its weights were all equal: more than mitransient can be credited with."""
+
+
+@dataclass(frozen=True)
+class Error:
+    """Error of range over some pixels against the reference, mm: root mean square with the reference's own noise taken
+    off, mean with its standard error, and what the render itself told of its noise."""
+
+    title: str
+    pixels: int
+    rms_mm: float
+    mean_mm: float
+    mean_error_mm: float
+    reported_mm: float
+    reference_mm: float
+
+    def row(self) -> str:
+        mean = f"{self.mean_mm:+.4f} +- {self.mean_error_mm:.4f}"
+        return (
+            f"| {self.title} | {self.pixels} | **{self.rms_mm:.4f}** | {mean} | {self.reported_mm:.4f} | "
+            f"{self.reference_mm:.4f} |"
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A target that was rendered, and the seconds that it took: wall, and of all cores together."""
+
+    target: Target
+    optics: Optics
+    lit: LitScene
+    view: NoiseFreeView
+    wall_s: float
+    cpu_s: float
+
+
+def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
+    """The thesis target rendered twice; the second, with warm kernels, counts."""
+    declared = ThesisTargetConfig.from_data({"name": "thesis", **facts}).declare()
+    target = build_target(declared if holes else declared.hole_free())
+    optics, config = load_camera("azure_kinect_nfov").optics, RenderConfig()
+    render_view(target, optics, config)
+    (view, cpu_s), wall_s = _timed(lambda: _cpu(lambda: render_view(target, optics, config)))
+    return Scene(target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, wall_s, cpu_s)
+
+
+def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) -> Error:
+    """The render against the reference over (at most so many, evenly picked) pixels of a mask (h, w)."""
+    rows, cols = np.nonzero(here)
+    picked = slice(None, None, max(len(rows) // most, 1))
+    rows, cols = rows[picked], cols[picked]
+    frequencies = scene.optics.frequencies_hz
+    slopes = Quadrilaterals(scene.optics.lens, scene.view.region).strata(rows, cols, SIDE)
+    hits = cast(scene.lit, slopes.reshape(-1, 2))
+    direct = phasor_sums(hits.amplitude.reshape(-1, SIDE**2), hits.path_m.reshape(-1, SIDE**2), frequencies)
+    count = np.full(len(rows), SIDE**2)
+    rays = OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
+    light = gather_in_pixels(scene.lit, rays, Work(frequencies, LONGEST, seed=777), paths)
+    total = direct + light.mean[:-1]
+    reference_m = range_noise_m(light.sums[:, :-1], total, frequencies)
+    error_m = range_change_m(scene.view.phasor[:, rows, cols].astype(complex) - total, total, frequencies)
+    rms_m = np.sqrt(max((error_m**2).mean() - (reference_m**2).mean(), 0.0))
+    return Error(
+        title=title,
+        pixels=len(rows),
+        rms_mm=rms_m / MM,
+        mean_mm=error_m.mean() / MM,
+        mean_error_mm=error_m.std() / np.sqrt(len(rows)) / MM,
+        reported_mm=float(np.sqrt((scene.view.indirect_noise_m[rows, cols] ** 2).mean())) / MM,
+        reference_mm=float(np.sqrt((reference_m**2).mean())) / MM,
+    )
+
+
+def in_holes(scene: Scene) -> np.ndarray:
+    """(h, w): pixels whose central ray goes through a hole's mouth."""
+    rays = np.concatenate([scene.view.slopes, np.ones((*scene.view.slopes.shape[:2], 1))], axis=-1)
+    normal, middle = scene.target.T_camera_board[:3, 2], scene.target.T_camera_board[:3, 3]
+    on_plane = rays * ((middle @ normal) / (rays @ normal))[..., None]
+    apart = [np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1) for hole in scene.target.truth]
+    return np.any([far < hole.diameter_m / 2 for far, hole in zip(apart, scene.target.truth, strict=True)], axis=0)
+
+
+def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape, pixels on its rim."""
+    names = scene.view.surface_names
+    board = np.isin(scene.view.surface, [k for k, name in enumerate(names) if name == "board" or "tape" in name])
+    whole = scene.view.coverage == 1
+    inner = ndimage.binary_erosion(board, np.ones((3, 3), bool), iterations=2)
+    return board & whole & inner, board & ~whole & inner, board & ~inner
+
+
+@dataclass(frozen=True)
+class Rival:
+    """mitransient on the same board: noise of range of a pixel at ``paths`` each, and what that took."""
+
+    paths: int
+    noise_mm: float
+    cpu_s: float
+    wall_s: float
+
+
+def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
+    """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as the region."""
+    from transport_oracle import oracle
+
+    view, lens = scene.view, scene.optics.lens
+    h, w = view.range_m.shape
+    narrow = Lens(w, h, lens.fx, lens.fx, (w - 1) / 2, (h - 1) / 2)
+    optics = replace(scene.optics, lens=narrow)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = oracle(scene.lit, optics, optics.frequencies_hz)
+        bounces = RenderConfig().bounces
+        other.phasors(paths, 0, bounces)
+        seeds = range(1, runs + 1)
+        (phasors, cpu_s), wall_s = _timed(
+            lambda: _cpu(lambda: np.stack([other.phasors(paths, s, bounces) for s in seeds]))
+        )
+    middle = phasors[:, :, h // 4 : -h // 4, w // 8 : -w // 8].reshape(runs, len(optics.frequencies_hz), -1)
+    mean = middle.mean(axis=0)
+    spread_m = range_change_m(middle - mean, mean, optics.frequencies_hz)
+    return Rival(paths, float(np.sqrt((spread_m**2).sum(axis=0).mean() / (runs - 1))) / MM, cpu_s / runs, wall_s / runs)
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    began = time.perf_counter()
+    return work(), time.perf_counter() - began
+
+
+def _cpu(work: Callable[[], Any]) -> tuple[Any, float]:
+    began = time.process_time()
+    return work(), time.process_time() - began
+
+
+def errors(free: Scene, holed: dict[str, Scene], paths: int, most: int) -> list[Error]:
+    """The table of errors: parts of the hole-free face, then the holes of each kind."""
+    titles = ("face, whole pixels", "face, edges of tape", "face, outermost pixels")
+    many = FACE_TIMES * paths
+    rows = [compared(free, title, here, many, most) for title, here in zip(titles, face_parts(free), strict=True)]
+    for title, scene in holed.items():
+        inside = in_holes(scene)
+        lit = inside & (np.abs(scene.view.phasor).mean(axis=0) > AMPLITUDE_GATE)
+        rows.append(compared(scene, f"holes, {title}", inside, paths, most))
+        if lit.sum() < inside.sum():
+            rows.append(compared(scene, f"holes, {title}, above the gate", lit, paths, most))
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--paths",
+        type=int,
+        default=1 << 16,
+        help="of each pixel in holes in the reference, an eighth of those on the face",
+    )
+    parser.add_argument("--pixels", type=int, default=300, help="compared of each kind at most")
+    parser.add_argument("--rival-paths", type=int, default=64, help="of each pixel by mitransient")
+    options = parser.parse_args(arguments)
+    load_mitsuba()
+    free = rendered({}, holes=False)
+    holed = {
+        "blind": rendered({"hole_kind": "blind"}),
+        "backing at 20 mm": rendered({}),
+        "backing at 50 mm": rendered({"backing_distance_mm": 50.0}),
+    }
+    print("| where | pixels | error, mm rms | mean error, mm | reported noise, mm | reference's noise, mm |")
+    print("|---|---|---|---|---|---|")
+    table = errors(free, holed, options.paths, options.pixels)
+    print("\n".join(row.row() for row in table))
+    print("\n| view | seconds | processor seconds |\n|---|---|---|")
+    for title, scene in {"hole-free": free, **holed}.items():
+        print(f"| {title} | {scene.wall_s:.2f} | {scene.cpu_s:.2f} |")
+    other, ours_mm = rival(free, options.rival_paths), table[0].rms_mm
+    needed = other.paths * (other.noise_mm / ours_mm) ** 2
+    cpu_s = other.cpu_s * needed / other.paths
+    print(f"\nmitransient: {other.paths} paths a pixel leave {other.noise_mm:.3f} mm in {other.cpu_s:.2f} processor s")
+    print(
+        f"({other.wall_s:.2f} s); our {ours_mm:.4f} mm would take {needed:.3g} paths, {cpu_s:.3g} processor s by 1/n:"
+    )
+    print(f"{cpu_s / free.cpu_s:.0f} times ours, {cpu_s / free.cpu_s / FILTER_PIXELS:.0f} with the filter credited.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Light transport by mitransient (Royo, Crespo and Garcia-Sierra: transient rendering for Mitsuba 3), as an oracle.
+
+Its ``transient_path`` walks the same meshes with its own path tracer, its own emitters and its own film. What is ours
+here is a list of frequencies in place of the film's contiguous ones, and the way from the lens to the near clip plane,
+on which a perspective camera's rays start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from scenes.optics import Optics
+from scenes.render.scene import LitScene
+
+NEAR_CLIP_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """mitransient's view of a scene by a lens without distortion and with its centre in the middle.
+
+    The emitter is isotropic where the optics' cone is all directions, else a spot whose edge falls linearly in the
+    angle (ours: in its cosine).
+    """
+
+    mi: Any
+    optics: Optics
+    _scene: Any
+    _frequencies: tuple[float, ...]
+
+    def phasors(self, paths: int, seed: int, bounces: int) -> np.ndarray:
+        """(f, h, w) phasors of all light, in the units and with the sign of `scenes.view`, from ``paths`` a pixel."""
+        import drjit as dr
+
+        integrator = self.mi.load_dict(
+            {
+                "type": "transient_path",
+                "max_depth": bounces + 2,
+                "rr_depth": 1000,
+                "temporal_filter": "box",
+                "gaussian_stddev": 0.0,
+            }
+        )
+        _, raw = integrator.render(self._scene, seed=seed, spp=paths)
+        dr.eval(raw)
+        pairs = np.array(raw)
+        values = pairs[..., 0] - 1j * pairs[..., 1]  # its film turns the other way
+        slopes = self.optics.lens.region_slopes(self.optics.lens.whole)
+        clipped_m = NEAR_CLIP_M * np.sqrt(1 + (slopes**2).sum(axis=-1))
+        wave = 2 * np.pi * np.array(self._frequencies) / SPEED_OF_LIGHT_AIR
+        return np.moveaxis(values, -1, 0) * np.exp(1j * wave[:, None, None] * clipped_m)
+
+
+def oracle(lit: LitScene, optics: Optics, frequencies_hz: tuple[float, ...]) -> Oracle:
+    """An oracle for a scene that stands in Mitsuba already. Raises ImportError where mitransient is not installed."""
+    import mitransient  # type: ignore[import-untyped]  # registers its plugins
+    from mitransient.utils import ArrayXf  # type: ignore[import-untyped]
+
+    mi, lens = lit.mi, optics.lens
+    assert mitransient.__name__
+    assert not any(lens.distortion)
+    assert (lens.cx, lens.cy) == ((lens.width - 1) / 2, (lens.height - 1) / 2)
+    assert lens.fx == lens.fy
+    film = mi.load_dict(
+        {
+            "type": "phasor_hdr_film",
+            "width": lens.width,
+            "height": lens.height,
+            "temporal_bins": 64,
+            "bin_width_opl": 0.5,
+            "start_opl": 0.0,
+            "rfilter": {"type": "box"},
+        }
+    )
+    film.frequencies = ArrayXf([mi.Float(f / SPEED_OF_LIGHT_AIR) for f in frequencies_hz])
+    upright = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
+    sensor = {
+        "type": "perspective",
+        "fov": float(np.rad2deg(2 * np.arctan(lens.width / 2 / lens.fx))),
+        "fov_axis": "x",
+        "near_clip": NEAR_CLIP_M,
+        "far_clip": 100.0,
+        "to_world": upright,
+        "film": film,
+        "sampler": {"type": "independent"},
+    }
+    shapes = {f"shape_{k}": shape for k, shape in enumerate(lit.scene.shapes())}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes})
+    return Oracle(mi, optics, scene, frequencies_hz)
+
+
+def _emitter(mi: Any, optics: Optics) -> dict[str, Any]:
+    """An intensity of pi: an albedo of 1 then returns 1 from a plane at 1 m."""
+    intensity = {"type": "uniform", "value": float(np.pi)}
+    where = optics.emitter_m
+    if optics.full_half_angle_deg >= 179:
+        return {"type": "point", "position": where.tolist(), "intensity": intensity}
+    x, y, z = where.tolist()
+    ahead = mi.ScalarTransform4f().look_at(origin=[x, y, z], target=[x, y, z + 1], up=[0, -1, 0])
+    return {
+        "type": "spot",
+        "to_world": ahead,
+        "intensity": intensity,
+        "beam_width": optics.full_half_angle_deg,
+        "cutoff_angle": optics.cutoff_half_angle_deg,
+    }
