@@ -27,6 +27,7 @@ CAMERA = load_camera("azure_kinect_nfov")
 FREQUENCIES = CAMERA.frequencies_hz
 BOUNCES = 6
 RUNS = 8
+BOTH = pytest.mark.parametrize("histogram", [False, True], ids=["phasors", "histogram"])
 
 
 def optics_of(width: int, height: int, focal_px: float) -> Optics:
@@ -35,14 +36,14 @@ def optics_of(width: int, height: int, focal_px: float) -> Optics:
     return replace(CAMERA.optics, lens=lens, full_half_angle_deg=179.5, cutoff_half_angle_deg=180.0, margin_px=0)
 
 
-def its_phasors(lit, optics, paths):
-    """(RUNS, f, h, w) from as many seeds."""
+def its_phasors(lit, optics, paths, histogram):
+    """(RUNS, f, h, w) from as many seeds, summed as phasors or from a time histogram."""
     pytest.importorskip("mitransient", exc_type=ImportError)
     from validation.transport_oracle import oracle
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        other = oracle(lit, optics, FREQUENCIES)
+        other = oracle(lit, optics, FREQUENCIES, histogram=histogram)
         return np.stack([other.phasors(paths, seed, BOUNCES) for seed in range(RUNS)])
 
 
@@ -58,7 +59,8 @@ def assert_agree(ours, theirs, here, largest_error):
     assert (np.abs(turned.mean(axis=0)) < 5.4 * error + 2e-5).all()
 
 
-def test_a_corner():
+@BOTH
+def test_a_corner(histogram):
     def quad(name, corners, albedo):
         mesh = trimesh.Trimesh(np.array(corners, float), [[0, 1, 2], [0, 2, 3]], process=False)
         return Part(name, mesh, None, albedo, None, np.full(3, 0.5), None)
@@ -67,7 +69,7 @@ def test_a_corner():
     floor = quad("floor", [[-1, 0.2, 0], [1, 0.2, 0], [1, 0.2, 1], [-1, 0.2, 1]], 0.6)
     optics = optics_of(48, 36, 60.0)
     lit = lit_scene(load_mitsuba(), (wall, floor), optics)
-    theirs = its_phasors(lit, optics, 128)
+    theirs = its_phasors(lit, optics, 128, histogram)
     region = optics.lens.whole
     slopes = optics.lens.region_slopes(region)
     direct = direct_light(lit, slopes, footprint_of(optics.lens, region, optics.footprint), FREQUENCIES)
@@ -81,7 +83,8 @@ def test_a_corner():
     assert_agree(ours, theirs, direct.surface == 1, 3e-3)
 
 
-def test_inside_a_blind_hole():
+@BOTH
+def test_inside_a_blind_hole(histogram):
     target = build_target(
         TargetConfig.from_data(
             {
@@ -96,7 +99,7 @@ def test_inside_a_blind_hole():
     )
     optics = optics_of(56, 56, 420.0)
     view = render_view(target, optics, RenderConfig(bounces=BOUNCES, hole_noise_mm=0.02, hole_samples=1024))
-    theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 160)
+    theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 160, histogram)
     theirs = theirs[:, :, view.region.row0 : view.region.row1, view.region.col0 : view.region.col1]
     inside = (view.range_m > 0.515) & (view.surface == 0)
     assert inside.sum() > 60
@@ -104,7 +107,8 @@ def test_inside_a_blind_hole():
     assert_agree(view.phasor.astype(complex), theirs, inside, 1e-3)
 
 
-def test_the_thesis_scene():
+@BOTH
+def test_the_thesis_scene(histogram):
     """The board in its room, through-holes before a backing 50 mm behind: the face, and what is seen in the holes.
 
     Without grain: at this resolution a pixel holds six texels across, of which our sub-rays meet four."""
@@ -113,7 +117,7 @@ def test_the_thesis_scene():
     optics = optics_of(192, 60, 190.0)
     config = RenderConfig(bounces=BOUNCES, face_samples=1 << 16, hole_noise_mm=0.03, hole_samples=1 << 14)
     view = render_view(target, optics, config)
-    theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 64)
+    theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 64, histogram)
     theirs = theirs[:, :, view.region.row0 : view.region.row1, view.region.col0 : view.region.col1]
     names = list(view.surface_names)
     face = (view.surface == names.index("board")) & (view.coverage == 1)
