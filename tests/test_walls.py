@@ -123,11 +123,11 @@ def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
 
 
 def test_real_frames_jitter_as_a_whole(checks):
-    """The reason for the test above: 0.2 to 0.3 mm against 0.03 mm for independent pixels."""
+    """The camera's file has 0.25 mm from these frames; 22 simulated ones tell it to 15 % (one deviation)."""
     for check in checks:
         measured, simulated = check.jitter_m
         assert 0.15e-3 < measured < 0.35e-3
-        assert simulated < 0.05e-3
+        assert 0.25e-3 * (1 - 3 * 0.15) < simulated < 0.25e-3 * (1 + 3 * 0.15)
 
 
 def test_the_files_fixed_pattern_is_that_of_the_walls(checks):

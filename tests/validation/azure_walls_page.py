@@ -272,8 +272,8 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
 {_markdown(CORRELATION_HEAD, rows)}
 
 The real frames jitter as a whole: a wall's mean over all its pixels varies from frame to frame by {real}; simulated
-{ours}, what independent pixels give. The jitter lifts the correlation at all lags alike; with each frame's mean taken
-off, measured and simulated differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
+{ours} (its size in the camera's file is from these very frames, so that is no test; independent pixels would give 0.03
+mm). The jitter lifts the correlation at all lags alike; with each frame's mean taken off, measured and simulated differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
 
 
 def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
@@ -314,8 +314,8 @@ def _why(checks: Sequence[WallCheck]) -> str:
 {_polygon(checks)}- **Correlation slightly low at lags 1 to 3.** Rounding to whole millimetres adds 0.29 mm
   of white noise; where the simulated deviation is smaller than the real one, that share is larger and the correlation
   lower.
-- **Correlation beyond the window.** Simulated noise is uncorrelated at 5 px, the real one is not quite: the frames'
-  common jitter (laser power or temperature, neither modelled) and a rest that varies within a frame.
+- **Correlation beyond the window.** Simulated noise within a frame is uncorrelated at 5 px, the real one is not
+  quite: beside the frames' common jitter, which is modelled, something varies smoothly within a frame, which is not.
 - **Fixed pattern: measured by simulated {times}.** The camera file's two sizes were set from these very frames, so
   this agreement is no test. The measured one contains the plaster's own relief and texture and
   light between walls and ceiling, so it is an upper bound of the camera's. Its covariance falls faster than a Gaussian
