@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sweep test lint smoke benchmarks lock clean
+.PHONY: sweep test lint smoke validate benchmarks lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
@@ -17,6 +17,9 @@ lint: .venv/.ready
 
 smoke: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/smoke.yaml
+
+validate: .venv/.ready
+	$(BIN)/python -m harness.validate
 
 benchmarks: .venv/.ready
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only -o python_files='bench_*.py' -o addopts=''
