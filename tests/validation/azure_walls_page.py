@@ -273,7 +273,8 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
 
 The real frames jitter as a whole: a wall's mean over all its pixels varies from frame to frame by {real}; simulated
 {ours} (its size in the camera's file is from these very frames, so that is no test; independent pixels would give 0.03
-mm). The jitter lifts the correlation at all lags alike; with each frame's mean taken off, measured and simulated differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
+mm). The jitter lifts the correlation at all lags alike; with each frame's mean taken off, measured and simulated
+differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
 
 
 def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
