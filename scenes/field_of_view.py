@@ -8,7 +8,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, transform_points
 from scenes.optics import Optics
 from scenes.target.custom import TargetConfig
-from scenes.target.face import outline_board_m
+from scenes.target.face import face_points_board_m, outline_board_m
 from scenes.target.pose import T_camera_board_of
 
 NEAREST_M = 0.05
@@ -22,7 +22,8 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """
     outline = transform_points(T_camera_board_of(config.pose), outline_board_m(config.board))
     seen_region(outline, optics)
-    range_m = np.linalg.norm(outline, axis=-1)
+    face = transform_points(T_camera_board_of(config.pose), face_points_board_m(config.board))
+    range_m = face[:, 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(
             f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",

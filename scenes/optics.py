@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from harness.vocabulary.lens import Lens
+
+FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
+"""Full width at half maximum of a Gaussian by its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class Optics:
     reciprocity), so it is described as an imager whose pixels are beams and whose emitter is the receiver.
     ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond a region whose light reaches it through
     the camera's own filter. ``wavelength_nm``: at which surfaces need an albedo. The camera gives no range below
-    ``nearest_m`` or beyond ``farthest_m``, whatever the light; they change no render.
+    ``nearest_m`` or beyond ``farthest_m``, counted along its rays or its axis, whatever the light; they change no
+    render.
     """
 
     title: str
@@ -46,6 +50,7 @@ class Optics:
     margin_px: int
     nearest_m: float = 0.0
     farthest_m: float = float("inf")
+    limits_along: Literal["ray", "axis"] = "ray"
 
     def content(self) -> dict[str, Any]:
         """Plain data of everything here that can change a render; equal for cameras that share renders."""

@@ -101,8 +101,20 @@ def test_noise_free_range_is_exact(changes, distance_m, tmp_path):
     assert np.abs(frame.z_m - truth).max() < 0.5e-3 + (0.05e-3 if distance_m < 6 else 0.2e-3)
 
 
+def test_no_wrap_counts_is_no_range_though_the_camera_has_no_gate_on_the_lattice(tmp_path):
+    """At the end of what two frequencies tell apart, noise carries phases beyond it."""
+    camera = read(fourth_camera(**TWO, engine__lattice_residual_turns=None, engine__max_range_mm=20_000.0), tmp_path)
+    reach_m = 299_702_547 / (2 * 20e6)
+    unit = SimulatedUnit(camera, quiet(noise=True), plane_view(camera, MIDDLE, reach_m - 0.02, 0.6))
+    frame = next(iter(unit.capture(1, 1).frames()))
+    assert (frame.reason == Reason.UNWRAP).mean() > 0.1
+    # noise that carries both phases beyond the reach makes a short range, as in a real camera; nothing lies between
+    valid = frame.z_m[frame.reason == Reason.VALID]
+    assert ((valid > 0.5) & (valid < reach_m - 0.2)).mean() < 0.002
+
+
 def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
-    """sigma_z = c / 4 pi f sqrt(2/N) sqrt(Ns + 2 s^2) / (C Ns), by 3 for the box of 3x3; 200 frames: 2 %."""
+    """sigma_z = c / 4 pi f sqrt(2/N) sqrt(Ns + 2 s^2) / (C Ns), by 3 for the box of 3x3; 60 frames: 3 %."""
     for phases in (3, 4, 7):
         camera = read(fourth_camera(modulation__phases=phases, engine__concentration=0.0), tmp_path)
         unit = SimulatedUnit(camera, quiet(noise=True), plane_view(camera, MIDDLE, 1.0, 0.6, 0.05, 0.02))
@@ -120,6 +132,8 @@ def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
         ({"modulation__frequencies_hz": [1e6, 2e6, 3e6, 4e6]}, "4 frequencies_hz"),
         ({"modulation__contrast": [0.5, 0.5]}, "contrast needs one value for each of the 1 frequencies_hz"),
         ({"modulation__phases": 2}, "3 or more"),
+        ({"emitter__full_half_angle_deg": 80.0}, "cutoff_half_angle_deg must be above full_half_angle_deg"),
+        (TWO | {"modulation__frequencies_hz": [100e6, 161.80339887e6]}, "share no base frequency"),
         ({"engine__amplitude_gains": [1.0, 1.0]}, "engine.amplitude_gains needs one value"),
         ({"engine__window_px": 4}, "an odd number"),
         ({"engine__fusion": "median"}, "fusion"),

@@ -105,6 +105,13 @@ def test_albedos_near_850_nm_hold_and_others_must_be_declared():
         at_wavelength(thesis(other_wavelengths=[partial]), 940.0)
 
 
+def test_the_nearest_declared_albedo_counts():
+    entry = {"wavelength_nm": 860.0, "board": 0.2, "tape": 0.4, "backing": 0.3, "floor": 0.2, "back_wall": 0.1}
+    target = thesis(other_wavelengths=[entry])
+    assert at_wavelength(target, 860.0).material.albedo_850 == 0.2
+    assert at_wavelength(target, 850.0).material.albedo_850 == 0.6
+
+
 def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
     optics = load_camera("azure_kinect_nfov").optics
     check_in_view(thesis(), optics)
@@ -112,6 +119,9 @@ def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
         check_in_view(thesis(distance_m=0.35), optics)
     partly = type(optics)(**{**optics.__dict__, "nearest_m": 0.72})
     check_in_view(thesis(), partly)
+    # all of the face nearer than 0.5 m along the axis, though not along the rays
+    with pytest.raises(UserError, match=r"to 0\.4\d+ m from the camera"):
+        check_in_view(thesis(distance_m=0.46), load_camera("kinect_v2").optics)
     near = type(optics)(**{**optics.__dict__, "nearest_m": 0.9})
     with pytest.raises(UserError, match=r"lies 0.\d+ to 0.\d+ m from the camera"):
         check_in_view(thesis(), near)
@@ -123,6 +133,7 @@ def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
         ("source.target.distance_m=0.35", "smoke.yaml:9:11: the target covers columns"),
         ("source.camera.numbers={lens.fx_px: 0.0}", "lens.fx_px"),
         ("source.camera.numbers={wavelength_nm: 940.0}", "the target has no albedo at 940 nm"),
+        ("source.render.seed=5000000", "less than or equal to 1000000"),
         ("source.camera.name=azure_kinect_nfv", "did you mean: azure_kinect_nfov"),
         ("source.camera.effects.wigling=true", "did you mean: source.camera.effects.wiggling"),
     ],

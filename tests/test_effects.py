@@ -17,6 +17,7 @@ from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import CameraConfig, camera_of, load_camera
 from scenes.sensor.effects import NONE, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
+from scenes.sensor.unit import frame_errors_m, smooth_field
 
 AZURE, V2 = "azure_kinect_nfov", "kinect_v2"
 NEAR_AXIS = Region(180, 230, 220, 290)
@@ -266,3 +267,61 @@ def test_multipath_off_sees_the_direct_light_only():
     own = unit_of(config(noise=True, multipath=True)).exposure.sigma
     assert dim == pytest.approx(own, rel=1e-5)
     assert (bright**2 / dim**2).mean() == pytest.approx(1.1, abs=0.01)
+
+
+def test_the_scanner_is_rid_of_all_indirect_light_too():
+    """Twice the light by multipath: with the effect off, noise and saturation are those of the direct part alone."""
+    settings = config("realsense_l515", fine=False, noise=True)
+    plain = unit_of(settings)
+    lit = unit_of(settings, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity)
+    assert np.allclose(lit.exposure.noise, plain.exposure.noise, rtol=1e-6)
+    on = config("realsense_l515", fine=False, noise=True, multipath=True)
+    assert (
+        unit_of(on, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity).exposure.noise
+        > 1.1 * plain.exposure.noise
+    ).all()
+
+
+def test_saturated_neighbours_do_not_count():
+    """Beside a saturated half of the picture at the same distance a pixel keeps its range and its amplitude."""
+    settings = config(saturation=True, multipath=True)
+    plain = unit_of(settings)
+    bright = np.where(np.arange(plain.view.intensity.shape[1]) < 30, 1.0, 2000.0)
+    unit = unit_of(settings, phasor=plain.view.phasor * bright, intensity=plain.view.intensity * bright)
+    one, other = (next(iter(u.capture(1, 1).frames())) for u in (unit, plain))
+    dark = slice(0, 30 - (unit.region.col0 - unit.view.region.col0))
+    assert (one.reason[:, dark.stop :] == Reason.SATURATED).all()
+    assert (one.reason[:, dark] == Reason.VALID).all()
+    # the plane is tilted: half a window has its middle a pixel aside, 0.1 mm in z
+    assert np.allclose(one.z_m[:, dark], other.z_m[:, dark], atol=2e-4)
+    assert np.allclose(one.amplitude[:, dark], other.amplitude[:, dark], rtol=0.01)
+
+
+def test_ambient_light_of_a_mixed_pixel_is_that_of_its_nearest_surface():
+    """A rim at 0.7 m whose central ray passes to 2.5 m has half its neighbours' ambient light, not (2.5/0.7)^2 / 2."""
+    settings = config(ambient=True)
+    plain = unit_of(settings, distance_m=0.7)
+    range_m, coverage = plain.view.range_m.copy(), plain.view.coverage.copy()
+    intensity = plain.view.intensity.copy()
+    range_m[20, 30], coverage[20, 30], intensity[20, 30] = 2.5, 0.5, intensity[20, 30] / 2
+    unit = unit_of(settings, distance_m=0.7, range_m=range_m, coverage=coverage, intensity=intensity)
+    light = ambient_electrons(unit.camera, settings, unit.view, unit.model.gathered)
+    assert light[20, 30] == pytest.approx(light[20, 31] / 2, rel=0.02)
+
+
+def test_the_drift_goes_on_during_a_capture():
+    """exp(-t / tau): 30 frames a second, so 900 frames are half a minute."""
+    settings = config(numbers={"unit.drift_mm": 100.0, "unit.drift_ramp": 0.0}, warm_up_drift=True)
+    facts = camera_of(settings).unit
+    errors = frame_errors_m(facts, settings.effects, 5.0, np.random.default_rng(1))
+    first, *_, last = (next(errors) for _ in range(901))
+    wanted = 0.1 * (np.exp(-5.5 / facts.drift_min.value) - np.exp(-5.0 / facts.drift_min.value))
+    assert first == 0.0
+    assert last == pytest.approx(wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("length_px", [0.4, 2.0, 12.0])
+def test_smooth_fields_have_unit_variance_at_any_length(length_px):
+    field = smooth_field(np.random.default_rng(3).standard_normal((600, 600)), length_px)
+    # 360,000 pixels hold 360,000 / (4 pi (l^2 / 2)) independent ones: 400 at 12 px, whose deviation is known to 3.5 %
+    assert field.std() == pytest.approx(1.0, abs=3 * max(0.002, np.sqrt(2 * np.pi * length_px**2 / 720_000)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidar_footprint import hole_depth_seen_m, share_in_disc
 from lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, changed, mixed, z_of
 from scipy import stats
 
@@ -18,7 +19,6 @@ from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.effects import NONE, EffectsConfig
 from scenes.sensor.lidar.calibration import ONLY_NOISE
-from scenes.sensor.lidar.footprint import hole_depth_seen_m, share_in_disc
 from scenes.sensor.lidar.scanner import LidarScanner, overlap_taps, smear_weights
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
@@ -51,7 +51,7 @@ def test_the_stronger_of_two_returns_wins_and_equal_ones_flip():
 
 def test_shot_noise_is_that_of_all_light_in_the_beam():
     """Of both returns, though their phasors partly cancel: sqrt(F S + a^2)."""
-    unit, _ = two_returns(0.5, ONLY_NOISE.effects.model_copy(update={"ambient": False}))
+    unit, _ = two_returns(0.5, ONLY_NOISE.effects.model_copy(update={"ambient": False, "multipath": True}))
     photons = CAMERA.photons
     light = unit.model.gathered * unit.view.intensity
     expected = np.sqrt(photons.excess_noise_factor.value * light + photons.amplifier_electrons.value**2)
@@ -259,7 +259,7 @@ def test_the_closed_form_hole_is_the_one_of_a_sampled_view():
         ({"code.integration_ns": 200.0}, "at most three times scan.point_ns"),
         ({"code.band_floor": 1.0}, "code.band_floor must be above 0 and below 1"),
         ({"code.period_ns": 2.0}, "code.period_ns must be longer"),
-        ({"receiver.cutoff_half_angle_deg": 30.0}, "must not be below receiver.full_half_angle_deg"),
+        ({"receiver.cutoff_half_angle_deg": 30.0}, "must be above receiver.full_half_angle_deg"),
         ({"engine.min_range_mm": 2e4}, "engine.min_range_mm must lie within"),
         ({"beam.fwhm_mrad": 0.0}, "must be above 0"),
         ({"beam.fwhm": 1.0}, "did you mean 'beam.fwhm_mrad'"),

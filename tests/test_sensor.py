@@ -137,7 +137,7 @@ def test_a_saturated_pixel_has_no_phasor():
     means = np.array([[[900.0, 1100.0], [0, 0], [0, 0]], [[100.0, 100.0], [0, 0], [0, 0]]], f4)
     unit, amplitude, saturated = expose(means, np.zeros(2, f4), np.zeros((2, 3, 2), f4), 128, 1000.0, (1.0, 2.0))
     assert saturated.tolist() == [0, 1]
-    assert (unit[:, :, 1] == 0).all() and (amplitude[:, 1] == 0).all()
+    assert (unit[:, :, 1] == 0).all() and (amplitude[:, 1] == kernels.OUTSIDE).all()
     # steps of 4 between 512 and 1023; the second frequency's gain is 2
     assert amplitude[:, 0] == pytest.approx([900 * 2 / 3, 2 * 100 * 2 / 3])
 

@@ -6,6 +6,8 @@ MM = 1e-3
 """Metres in a millimetre."""
 INCH = 25.4e-3
 """Metres in an inch (exact by definition)."""
+UW_CM2 = 1e-2
+"""Watts per square metre in a microwatt per square centimetre."""
 SPEED_OF_LIGHT_VACUUM = 299_792_458.0
 """m/s, exact by definition."""
 REFRACTIVE_INDEX_AIR = 1.00027

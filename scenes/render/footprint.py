@@ -9,7 +9,7 @@ from scipy.special import ndtri
 
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
-from scenes.optics import BeamFootprint, PixelFootprint
+from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, PixelFootprint
 
 COARSE = 4
 """Sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm."""
@@ -20,7 +20,6 @@ FINEST = 2048
 BEAM_REACH = 3.0
 """Standard deviations of a beam within which an edge is looked for: 1 % of the light lies beyond."""
 GOLDEN = (np.sqrt(5) - 1) / 2
-FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
 
 
 class Footprint(Protocol):

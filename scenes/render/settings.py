@@ -18,4 +18,4 @@ class RenderConfig(Config):
     )
     hole_samples: int = Field(8192, ge=8, description="paths for each of those pixels at most")
     rest_samples: int = Field(32, ge=8, description="paths for each pixel around the board")
-    seed: int = Field(1, ge=0)
+    seed: int = Field(1, ge=0, le=1_000_000)

@@ -106,7 +106,8 @@ class SimulatedCapture:
         """Yield the frames; each call repeats the same noise."""
         rng = random_stream(self.seed, "frames", *self.labels)
         camera, effects = self.unit.camera, self.unit.config.effects
-        errors_m = frame_errors_m(camera.unit, effects, random_stream(self.seed, "frame errors", *self.labels))
+        stream = random_stream(self.seed, "frame errors", *self.labels)
+        errors_m = frame_errors_m(camera.unit, effects, self.unit.config.minutes_since_power_on, stream)
         cut = self.unit.cut
         for number in range(self.n_frames):
             decoded = self.unit.model.frame(self.unit.exposure, rng, next(errors_m))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
 
 import numpy as np
 from scipy import ndimage
@@ -16,11 +17,19 @@ from scenes.sensor.facts import UnitFacts
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     """White noise (h, w) of unit variance made smooth: unit variance, autocorrelation exp(-k^2 / 2 length^2), periodic.
 
-    Through a Gaussian of s it has autocorrelation exp(-k^2 / 4 s^2), so s = length / sqrt 2, and its variance falls to
-    1 / (4 pi s^2).
+    Through a Gaussian of s it has autocorrelation exp(-k^2 / 4 s^2), so s = length / sqrt 2; its variance falls to the
+    kernel's sum of squares, 1 / (4 pi s^2) where s is some pixels and far less than the field.
     """
     s = length_px / np.sqrt(2)
-    return np.asarray(ndimage.gaussian_filter(white, s, mode="wrap") * (2 * np.sqrt(np.pi) * s))
+    smooth = ndimage.gaussian_filter(white, s, mode="wrap")
+    return np.asarray(smooth / np.sqrt(np.prod([_power(n, s) for n in white.shape])))
+
+
+def _power(size: int, s: float) -> float:
+    """Sum of squares of the periodic Gaussian kernel along an axis of ``size`` pixels."""
+    impulse = np.zeros(size)
+    impulse[0] = 1.0
+    return float((ndimage.gaussian_filter1d(impulse, s, mode="wrap") ** 2).sum())
 
 
 def static_error_m(facts: UnitFacts, effects: EffectsConfig, camera: str, unit_seed: int) -> float:
@@ -38,9 +47,19 @@ def drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: n
     return np.asarray(decayed * (1 + facts.drift_ramp.value * slope_x))
 
 
-def frame_errors_m(facts: UnitFacts, effects: EffectsConfig, rng: np.random.Generator) -> Iterator[float]:
-    """Endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few; 0 where off."""
-    while True:
+def frame_errors_m(
+    facts: UnitFacts, effects: EffectsConfig, minutes: float, rng: np.random.Generator
+) -> Iterator[float]:
+    """Endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few; 0 where off.
+
+    To them comes what the drift, on the axis, has changed since the first frame, ``minutes`` after power-on.
+    """
+    axis = np.zeros(1)
+    first = drift_m(facts, effects, minutes, axis)[0]
+    for frame in count():
+        now = minutes + frame / facts.frames_per_second.value / 60
+        drifted = float(drift_m(facts, effects, now, axis)[0] - first)
         jitter, sign, chance = rng.standard_normal(), rng.choice([-1.0, 1.0]), rng.random()
         jump = sign * facts.jump_mm.value if chance < facts.jump_rate.value else 0.0
-        yield float(jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
+        moved = float(jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
+        yield moved + drifted

@@ -140,3 +140,10 @@ def outline_board_m(board: BoardConfig) -> np.ndarray:
     end = np.ones(OUTLINE_STEPS)
     x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
     return face_of(board).point(half_x * x, half_y * y)
+
+
+def face_points_board_m(board: BoardConfig) -> np.ndarray:
+    """(n, 3): a grid of points on the undamaged face, its rim included, board frame."""
+    steps = np.linspace(-0.5, 0.5, OUTLINE_STEPS + 1)
+    x, y = np.meshgrid(steps * board.width_mm * MM, steps * board.height_mm * MM)
+    return face_of(board).point(x.ravel(), y.ravel())

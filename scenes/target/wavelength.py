@@ -13,13 +13,14 @@ the near infrared (a guess), less than what the albedo itself is known to."""
 
 
 def at_wavelength(config: TargetConfig, wavelength_nm: float) -> TargetConfig:
-    """The declaration with the albedos of that wavelength as its ``albedo_850``, and no others.
+    """The declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
 
     Raises UserError where the declaration has none for it, or lacks one of its surfaces.
     """
-    if abs(wavelength_nm - 850.0) <= NEAR_NM:
-        return config.model_copy(update={"other_wavelengths": ()})
     near = [one for one in config.other_wavelengths if abs(one.wavelength_nm - wavelength_nm) <= NEAR_NM]
+    at_850 = abs(wavelength_nm - 850.0)
+    if at_850 <= NEAR_NM and all(at_850 <= abs(one.wavelength_nm - wavelength_nm) for one in near):
+        return config.model_copy(update={"other_wavelengths": ()})
     if not near:
         known = sorted({850.0, *(one.wavelength_nm for one in config.other_wavelengths)})
         raise UserError(

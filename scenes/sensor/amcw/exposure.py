@@ -12,17 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.units import SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.light import light_of
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
 
-UW_CM2 = 1e-2
-"""A microwatt per square centimetre in watts per square metre."""
 HIGHEST_HARMONIC = 31
 """Harmonics above change the phase by less than 0.1 mrad in all."""
 
@@ -69,17 +69,6 @@ def exposure_of(
     )
 
 
-def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Phasors (f, h, w) and intensity (h, w) of all light, or of direct light only where multipath is off.
-
-    The intensity of the direct part is taken as its longest phasor over the frequencies: exact where one surface fills
-    the pixel, too small where the phasors of two surfaces cancel at every frequency.
-    """
-    if effects.multipath:
-        return view.phasor, view.intensity
-    return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
-
-
 def sampled(signal: np.ndarray, phases: int) -> np.ndarray:
     """(f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of a demodulated signal S (f, h, w) at N phases."""
     steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
@@ -111,14 +100,18 @@ def ambient_electrons(
     """(h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
 
     As many as the emitter's own, times the ratio of irradiances within the filter's band, for light that falls on the
-    surface as the camera's own does: a bright sky behind the camera. Rays that meet nothing see none.
+    surface as the camera's own does: a bright sky behind the camera. A pixel that sees several surfaces is taken to get
+    its light from the nearest within a pixel, which sends the most of the emitter's; what farther ones add is left out.
+    Rays that meet nothing see none.
     """
     if not config.effects.ambient:
         return np.zeros(view.intensity.shape)
     irradiance = config.ambient_uw_cm2_nm * UW_CM2 * camera.photons.band_nm.value
     one_metre = camera.photons.signal_electrons.value * irradiance / camera.emitter.irradiance_w_m2.value
     _, intensity = light_of(view, config.effects)
-    return np.asarray(one_metre * gathered * intensity * np.nan_to_num(view.range_m) ** 2)
+    nearest_m = ndimage.minimum_filter(np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest")
+    range_m = np.where(view.coverage < 1, np.where(np.isfinite(nearest_m), nearest_m, 0.0), np.nan_to_num(view.range_m))
+    return np.asarray(one_metre * gathered * intensity * range_m**2)
 
 
 def _limit_units(camera: AmcwCamera, effects: EffectsConfig, both_wells: np.ndarray) -> np.ndarray:

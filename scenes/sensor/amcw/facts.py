@@ -9,9 +9,11 @@ import numpy as np
 from pydantic import model_validator
 
 from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.optics import Optics, PixelFootprint
+from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.facts import (
     Fact,
     HalfAngle,
@@ -49,6 +51,12 @@ class EmitterFacts(Config):
     irradiance_w_m2: Positive
     mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
 
+    @model_validator(mode="after")
+    def _rolls_off_outwards(self) -> EmitterFacts:
+        if self.cutoff_half_angle_deg.value <= self.full_half_angle_deg.value:
+            raise ValueError("cutoff_half_angle_deg must be above full_half_angle_deg")
+        return self
+
 
 class ModulationFacts(Config):
     """Continuous-wave modulation: one value per frequency but for ``phases``.
@@ -70,6 +78,10 @@ class ModulationFacts(Config):
         for key in ("contrast", "wiggling_residual"):
             if len(getattr(self, key).value) != count:
                 raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
+        try:
+            unwrap_table(self.frequencies_hz.value, "least_squares")
+        except UserError as mistake:
+            raise ValueError(f"frequencies_hz: {mistake.message}; legal: {mistake.legal}") from mistake
         return self
 
 
@@ -234,4 +246,5 @@ class AmcwCamera(Config):
             margin_px=self.margin_px,
             nearest_m=self.engine.min_range_mm.value * MM,
             farthest_m=self.engine.max_range_mm.value * MM,
+            limits_along=self.engine.limits_along.value,
         )

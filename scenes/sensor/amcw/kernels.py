@@ -13,6 +13,9 @@ import numpy as np
 
 from scenes.sensor.normals import FAST, bits_float, float_bits
 
+OUTSIDE = np.float32(-1)
+"""The amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped."""
+
 
 @numba.njit(**FAST)
 def expose(
@@ -74,16 +77,13 @@ def expose(
     for i in range(n):
         if saturated[i]:
             unit[:, :, i] = np.float32(0)
-            amplitude[:, i] = np.float32(0)
+            amplitude[:, i] = OUTSIDE
 
 
 STRIDE = 2128
 """Longest padded row; not a power of two, whose multiples share the cache's lines (a factor of 4 in time where memory
 lands badly). A compile-time constant: the compiler turns a loop into vector code only where it can see that
 the few arrays in it do not overlap, which it does for planes a constant apart."""
-
-OUTSIDE = np.float32(-1)
-"""The amplitude that stands beyond the border: below every floor, so that such neighbours are always dropped."""
 
 
 @numba.njit(**FAST)
@@ -194,5 +194,6 @@ def joint_bilateral(
             size = np.sqrt(a * a + b * b) if by_amplitude else total[2 * STRIDE + x]
             filtered[0, y, x] = a
             filtered[1, y, x] = b
-            filtered[2, y, x] = size / total[3 * STRIDE + x]
+            # nothing is kept where the whole window is saturated
+            filtered[2, y, x] = size / max(total[3 * STRIDE + x], np.float32(1e-30))
             edge[y, x] = np.float32(0.5) * total[4 * STRIDE + x]

@@ -191,7 +191,10 @@ def _gate(  # type: ignore[no-untyped-def]
         code = np.int32(VALID)
         code = np.int32(LOW_REFLECTIVITY) if sum_of_all * range_m * range_m < gates.reflectivity else code
         code = code if (limited >= gates.nearest_m) & (limited <= gates.farthest_m) else np.int32(OUT_OF_RANGE)
-        code = code if residual2[i - start] <= _residual_limit2(gates, greatest) else np.int32(UNWRAP)
+        # an infinite residual says that no wrap counts fit: no gate may let it through
+        known = residual2[i - start] < np.float32(np.inf)
+        fits = known & (residual2[i - start] <= _residual_limit2(gates, greatest))
+        code = code if fits else np.int32(UNWRAP)
         code = np.int32(AMPLITUDE_RATIO) if greatest - least > gates.ratio * greatest else code
         code = np.int32(EDGE) if steepest >= gates.edge else code
         code = np.int32(LOW_AMPLITUDE) if (least < gates.least) | (sum_of_all < gates.total) else code

@@ -10,8 +10,8 @@ from pydantic import model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.lens import Lens
-from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR
-from scenes.optics import BeamFootprint, Optics
+from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR, UW_CM2
+from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
 from scenes.sensor.facts import Fact, HalfAngle, LensFacts, NonNegative, Positive, Share, UnitFacts, Wavelength
 
 NS = 1e-9
@@ -20,9 +20,6 @@ MRAD = 1e-3
 """Radians in a milliradian."""
 MW = 1e-3
 """Watts in a milliwatt."""
-UW_CM2 = 1e-2
-"""W/m^2 in a microwatt per square centimetre."""
-FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
 SMOOTHING_PX = 1
 """Half width of the on-device smoothing's window."""
 
@@ -137,8 +134,8 @@ class ScannedLidar(Config):
             raise ValueError("code.band_floor must be above 0 and below 1")
         if self.integration_points > 3:
             raise ValueError("code.integration_ns may span at most three times scan.point_ns")
-        if self.receiver.cutoff_half_angle_deg.value < self.receiver.full_half_angle_deg.value:
-            raise ValueError("receiver.cutoff_half_angle_deg must not be below receiver.full_half_angle_deg")
+        if self.receiver.cutoff_half_angle_deg.value <= self.receiver.full_half_angle_deg.value:
+            raise ValueError("receiver.cutoff_half_angle_deg must be above receiver.full_half_angle_deg")
         if self.engine.min_range_mm.value * MM >= self.unambiguous_m:
             raise ValueError("engine.min_range_mm must lie within the range of one period of the code")
         if len(self.weights) < 3:

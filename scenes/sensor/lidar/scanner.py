@@ -28,6 +28,7 @@ from scenes.sensor.decoded import Decoded
 from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import ScannedLidar
+from scenes.sensor.light import light_of
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import drift_m, smooth_field, static_error_m
 from scenes.view import NoiseFreeView
@@ -109,9 +110,10 @@ class LidarScanner:
     def expose(self, view: NoiseFreeView) -> Returns:
         """The two strongest returns of each beam of a view that covers this scanner's region, and their noise."""
         camera, effects = self.camera, self.config.effects
-        electrons = self.gathered * self._along_sweeps(view.intensity)
+        phasor, intensity = light_of(view, effects)
+        electrons = self.gathered * self._along_sweeps(intensity)
         noise = self.noise_electrons(electrons)
-        height, half_m, deviation_m = self._peaks(view.phasor if effects.multipath else view.phasor_direct, noise)
+        height, half_m, deviation_m = self._peaks(phasor, noise)
         full = camera.photons.full_scale_electrons.value if effects.saturation else np.inf
         weak = height[0] < CERTAIN_DEVIATIONS * noise if effects.noise else np.zeros(noise.shape, bool)
         return Returns(

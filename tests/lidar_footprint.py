@@ -6,8 +6,9 @@ import numpy as np
 from scipy import stats
 
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from scenes.optics import FWHM_PER_DEVIATION
 from scenes.sensor.lidar.correlation import strongest_peaks
-from scenes.sensor.lidar.facts import FWHM_PER_DEVIATION, MRAD, ScannedLidar
+from scenes.sensor.lidar.facts import MRAD, ScannedLidar
 from scenes.sensor.lidar.scanner import smear_weights
 
 
