@@ -33,8 +33,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
     add("--quick", action="store_true", help="fewer conditions and frames: a look, no judgement to keep")
-    add("--figures", type=Path, default=HERE / "figures.yaml", metavar="FILE", help="other published figures")
-    add("--baseline", type=Path, default=HERE / "baseline.json", metavar="FILE", help="another baseline")
+    add("--figures", type=Path, metavar="FILE", help="other published figures")
+    add("--baseline", type=Path, metavar="FILE", help="another baseline; --quick is judged by one that is named only")
     add("--update-baseline", action="store_true", help="write down which figures pass now")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
@@ -55,18 +55,30 @@ def _positive(text: str) -> int:
 
 def _run(options: argparse.Namespace, command: str) -> int:
     if options.capture:
+        for name in ("quick", "update_baseline", "figures", "baseline"):
+            if getattr(options, name):
+                raise UserError(
+                    f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture", fix="leave it out"
+                )
         return _run_capture(options, command)
     for name in ("unit", "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
+    if options.figures and options.update_baseline and not options.baseline:
+        raise UserError(
+            "--figures and --update-baseline would write other figures into the committed baseline",
+            fix="name a --baseline of their own",
+        )
+    if options.baseline and not options.update_baseline and not options.baseline.is_file():
+        raise UserError(f"--baseline {options.baseline}: no such file", fix="write one with --update-baseline")
     from harness.scorecard.program import ScorecardOptions, run_scorecard
 
     return run_scorecard(
         ScorecardOptions(
             cameras=tuple(options.camera),
             out=options.out,
-            figures=options.figures,
-            baseline=options.baseline,
+            figures=options.figures or HERE / "figures.yaml",
+            baseline=options.baseline or (None if options.quick else HERE / "baseline.json"),
             quick=options.quick,
             update_baseline=options.update_baseline,
             jobs=options.jobs,

@@ -10,6 +10,7 @@ from harness.experiment.load import load_experiment
 from harness.sweep import main
 from harness.vocabulary.errors import UserError
 from scenes.field_of_view import check_in_view
+from scenes.sensor.calibration import _main as calibration_program
 from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, camera_of, load_camera, read_camera
 from scenes.sensor.facts import unfolded_slope
 from scenes.target.declaration import target_from_data
@@ -87,6 +88,9 @@ def test_an_experiment_replaces_numbers_of_a_camera():
         camera_of(CameraConfig(numbers={"lens.fx": 500.0}))
     with pytest.raises(UserError, match=r"lens.fx_px.*above 0"):
         camera_of(CameraConfig(numbers={"lens.fx_px": -1.0}))
+    with pytest.raises(UserError, match=r"  modulation.contrast: should be a valid tuple") as caught:
+        camera_of(CameraConfig(numbers={"modulation.contrast": 0.5}))
+    assert "Value error" not in str(caught.value)
 
 
 def test_albedos_near_850_nm_hold_and_others_must_be_declared():
@@ -155,6 +159,16 @@ def test_a_recordings_own_lens_takes_the_nominal_ones_place(shared_data):
     assert abs(lens.fx - nominal.fx) < 1 and abs(lens.cx - nominal.cx) < 20
     with pytest.raises(UserError, match=r"512 x 424"):
         lens_numbers(recording, ["kinect_v2"])
+
+
+def test_calibrating_an_unknown_camera_is_one_message(capsys):
+    assert calibration_program(["nope"]) == 2
+    assert "there is no camera 'nope'" in capsys.readouterr().err
+
+
+def test_one_value_on_an_axis_tells_no_set_ups_apart():
+    several = load_experiment("experiments/cameras.yaml", ["sweep.source.target.distance_m=[0.75]", "sensitivity=null"])
+    assert {point.variant for point in several.points} == {f"camera={name}" for name in camera_names()}
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path, capsys):

@@ -262,6 +262,8 @@ def test_the_closed_form_hole_is_the_one_of_a_sampled_view():
         ({"receiver.cutoff_half_angle_deg": 30.0}, "must be above receiver.full_half_angle_deg"),
         ({"engine.min_range_mm": 2e4}, "engine.min_range_mm must lie within"),
         ({"beam.fwhm_mrad": 0.0}, "must be above 0"),
+        ({"beam.fwhm_mrad": 300.0}, "at most 20 milliradians"),
+        ({"photons.excess_noise_factor": 0.1}, "1 or more"),
         ({"beam.fwhm": 1.0}, "did you mean 'beam.fwhm_mrad'"),
     ],
 )

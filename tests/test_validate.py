@@ -272,10 +272,10 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     """Two figures, quick: files written, exit 0; a baseline that the simulation falls behind: exit 1, naming it."""
     figures, baseline, out = written(tmp_path), tmp_path / "baseline.json", tmp_path / "out"
     options = ["--quick", "--jobs", "1", "--camera", "azure_kinect_nfov"]
-    options += ["--figures", str(figures), "--baseline", str(baseline), "--out", str(out)]
+    options += ["--figures", str(figures), "--out", str(out)]
     assert main(options) == 0
     told = capsys.readouterr()
-    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "not in the baseline: wall, neighbours" in told.err
+    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "A quick look" in told.out and not told.err
     page = (out / "scorecard.html").read_text()
     assert page.count("<svg") == 6 and "http" not in page.replace("http://www.w3.org", "")
     scores = list(csv.DictReader((out / "scorecard.csv").open()))
@@ -287,11 +287,17 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
 
     first = (out / "curves.csv").read_bytes()
     baseline.write_text('{"figures": {"wall": {"passes": true}, "neighbours": {"passes": true}}}')
+    options += ["--baseline", str(baseline)]
     figures.write_text(GOOD.replace("{value: 0.89, tolerance: 0.06}", "{value: 2.0, tolerance: 0.06}"))
     assert main(options) == 1
     told = capsys.readouterr()
     assert "passed in the baseline and fails now: wall" in told.err and "neighbours (" not in told.err
     assert (out / "curves.csv").read_bytes() == first
+
+    baseline.write_text('{"figures": {"gone": {"passes": true}, "missed": {"passes": false}}}')
+    assert main(options) == 1
+    told = capsys.readouterr()
+    assert "passed in the baseline and is no longer among the figures: gone" in told.err and "missed" not in told.err
 
 
 @pytest.mark.parametrize(
@@ -301,6 +307,9 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
         (["--quick", "--update-baseline"], "a baseline needs the whole effort"),
         (["--figures", "absent.yaml"], "absent.yaml"),
         (["--mask", "m.png"], "--mask belongs to a capture"),
+        (["--capture", "x", "--quick"], "--quick belongs to the scorecard"),
+        (["--baseline", "absent.json"], "--baseline absent.json: no such file"),
+        (["--figures", "own.yaml", "--update-baseline"], "name a --baseline of their own"),
         (["--capture", "absent"], "absent: no such file or folder"),
         (["--capture", "x", "--camera", "a", "--camera", "b"], "one camera took it"),
         (["--capture", "x", "--albedo", "0"], "--albedo 0"),

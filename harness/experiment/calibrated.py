@@ -34,10 +34,14 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
 def _lens_of(recording: Path) -> Lens:
     from detectors.recordings import open_capture  # brings the readers of every format
 
-    lens = open_capture([recording]).lens
+    lens = None
+    if recording.is_dir() or recording.suffix.lower() == ".mkv":
+        lens = open_capture([recording]).lens
+    elif not recording.is_file():
+        raise UserError(f"--calibration {recording}: no such file or folder")
     if lens is None:
         raise UserError(
-            f"{recording}: holds no calibration of a lens",
+            f"--calibration {recording}: holds no calibration of a lens",
             legal="an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them",
         )
     return lens

@@ -192,9 +192,10 @@ def _places_within(source: Source, path: KeyPath) -> Iterator[Place]:
 
 def _drafts(axes: list[list[Setting]], variations: list[Draft], config: ExperimentConfig) -> Iterator[Draft]:
     """The product of the axes, the last one fastest; then every variation at every number of frames of the study."""
-    several = prod(len(axis) for axis in axes if axis[0].path != FRAMES) > 1
+    telling = {axis[0].path for axis in axes if len(axis) > 1} - {FRAMES}
     for settings in product(*axes):
-        yield Draft(_label(settings), set_up_label(settings) if several else MAIN, settings)
+        variant = set_up_label([one for one in settings if one.path in telling]) if telling else MAIN
+        yield Draft(_label(settings), variant, settings)
     study = config.sensitivity
     for variation in variations if study else ():
         for index, frames in enumerate(study.frames if study else ()):

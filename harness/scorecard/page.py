@@ -40,14 +40,18 @@ TITLES = {
 
 
 def scorecard_html(
-    cameras: Mapping[str, str], scores: Sequence[Score], figures: Mapping[str, str], provenance: Mapping[str, Any]
+    cameras: Mapping[str, str],
+    scores: Sequence[Score],
+    figures: Mapping[str, str],
+    provenance: Mapping[str, Any],
+    quick: bool = False,
 ) -> str:
     """The page as text; ``figures`` are SVG texts by name, ``cameras`` titles by name."""
     return (
         environment()
         .get_template("scorecard.html")
         .render(
-            answer=answer(scores),
+            answer=answer(scores, quick),
             heads=HEADS,
             groups=[(title, _rows(scores, camera)) for camera, title in cameras.items()],
             figures=[(TITLES[name], name, figures[name], CAPTIONS[name]) for name in TITLES if name in figures],
@@ -70,12 +74,13 @@ def environment() -> Any:
     )
 
 
-def answer(scores: Sequence[Score]) -> str:
+def answer(scores: Sequence[Score], quick: bool = False) -> str:
     """One sentence: how many figures pass, apart for those that test and those that calibrate."""
     tests = [score for score in scores if not score.figure.entry.calibration]
     calibration = [score for score in scores if score.figure.entry.calibration]
     regressed = [score.figure.name for score in scores if score.regressed]
-    text = f"{_passing(tests)} published figures that the models were not fitted to hold"
+    text = "A quick look, with too few frames for a judgement: " if quick else ""
+    text += f"{_passing(tests)} published figures that the models were not fitted to hold"
     if calibration:
         text += f", and {_passing(calibration)} that they were or may be fitted to"
     text += "."

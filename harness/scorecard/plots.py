@@ -250,6 +250,8 @@ def bias_figure(curves: Curves) -> str:
             axis.set_title(title)
             axis.set_xlabel("distance (m)")
             axis.set_ylabel("bias of z (mm)")
+        if not right.get_lines()[:-1]:
+            right.text(0.5, 0.6, "not measured", transform=right.transAxes, ha="center", color=canvas.GREY)
         _legend(figure, left, {"on": ("-", "multipath on"), "off": (":", "multipath off")})
 
     return canvas.svg("bias", (10.5, 4.3), "Bias against distance, and with multipath", draw)

@@ -26,12 +26,12 @@ from scenes.sensor.camera import camera_digest, camera_names, load_camera
 
 @dataclass(frozen=True)
 class ScorecardOptions:
-    """What the user asked for; ``cameras`` empty for all."""
+    """What the user asked for; ``cameras`` empty for all, ``baseline`` None for no judgement by one."""
 
     cameras: tuple[str, ...]
     out: Path
     figures: Path
-    baseline: Path
+    baseline: Path | None
     quick: bool
     update_baseline: bool
     jobs: int
@@ -44,24 +44,25 @@ def run_scorecard(options: ScorecardOptions) -> int:
     Raises UserError for an unknown camera, a faulty figures file or baseline, and a folder that cannot be written.
     """
     began = time.perf_counter()
+    options.out.mkdir(parents=True, exist_ok=True)
     if options.quick and options.update_baseline:
         raise UserError("--quick and --update-baseline: a baseline needs the whole effort", fix="leave one of them out")
     every, titles = read_figures(options.figures), _titles(options.cameras)
     figures = tuple(figure for figure in every if figure.entry.camera in titles)
-    baseline = read_baseline(options.baseline)
+    baseline = read_baseline(options.baseline) if options.baseline else {}
     points = tuple(curve_points(QUICK_GRIDS if options.quick else FULL_GRIDS))
     wanted = requests_of(tuple(titles), figures, points)
     found = measured(wanted, QUICK if options.quick else FULL, options.out / ".cache" / "renders", options.jobs)
     scores = _scores(figures, found, baseline)
     _write(options, titles, points, found, scores, time.perf_counter() - began)
     print_scorecard(scores)
-    print(answer(scores))
+    print(answer(scores, options.quick))
     print(f"wrote {options.out / 'scorecard.html'}")
-    if options.update_baseline:
+    if options.update_baseline and options.baseline:
         write_baseline(options.baseline, scores, [figure.name for figure in every])
         print(f"wrote {options.baseline}")
         return 0
-    return _said_what_fell_behind(scores, baseline, every)
+    return _said_what_fell_behind(scores, baseline, every) if options.baseline else 0
 
 
 def _titles(names: Sequence[str]) -> dict[str, str]:
@@ -99,17 +100,19 @@ def _write(
     write_text(options.out / "scorecard.csv", scores_csv(scores))
     write_text(options.out / "curves.csv", curves_csv(tuple(titles), points, found))
     write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
-    write_text(options.out / "scorecard.html", scorecard_html(titles, scores, pictures, provenance))
+    write_text(options.out / "scorecard.html", scorecard_html(titles, scores, pictures, provenance, options.quick))
 
 
 def _said_what_fell_behind(scores: Sequence[Score], baseline: Mapping[str, bool], every: Sequence[Figure]) -> int:
     """The exit code; names the figures that passed before and fail now, and what the baseline does not know."""
-    gone = sorted(set(baseline) - {figure.name for figure in every})
+    gone = sorted({name for name, passed in baseline.items() if passed} - {figure.name for figure in every})
     new = [score.figure.name for score in scores if score.passed_before is None]
     mended = [score.figure.name for score in scores if score.passed_before is False and score.passes]
-    for names, what in ((new, "not in the baseline"), (gone, "in the baseline only"), (mended, "pass now, not before")):
+    for names, what in ((new, "not in the baseline"), (mended, "pass now, not before")):
         if names:
             print(f"{what}: {', '.join(names)}; --update-baseline takes note", file=sys.stderr)
+    for name in gone:
+        print(f"passed in the baseline and is no longer among the figures: {name}", file=sys.stderr)
     fallen = [score for score in scores if score.regressed]
     for score in fallen:
         low, high = score.figure.entry.published.limits
@@ -118,4 +121,4 @@ def _said_what_fell_behind(scores: Sequence[Score], baseline: Mapping[str, bool]
             f"{score.simulated.value:.4g}, passes from {low:g} to {high:g}",
             file=sys.stderr,
         )
-    return 1 if fallen else 0
+    return 1 if fallen or gone else 0

@@ -53,9 +53,9 @@ def lagged(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tuple[fl
 
 
 def correlation(d: np.ndarray, where: np.ndarray, lags: int = LAGS) -> np.ndarray:
-    """(x and y, lags 1 to ``lags``) correlation of the temporal noise."""
+    """(x and y, lags 1 to ``lags``) correlation of the temporal noise; NaN where there is none."""
     pairs = [[covariance(d, where, lag, axis) for lag in range(1, lags + 1)] for axis in (0, 1)]
-    return np.array([[product / square for product, square in row] for row in pairs])
+    return np.array([[product / square if square > 0 else np.nan for product, square in row] for row in pairs])
 
 
 def correlation_at(z_m: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:

@@ -8,11 +8,13 @@ out, as whoever measures a deviation leaves them out. Ambient light is that of `
 
 from __future__ import annotations
 
+import argparse
 import sys
 
 import numpy as np
 from scipy import optimize
 
+from harness.vocabulary.errors import exit_code_of
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
@@ -71,7 +73,16 @@ def calibrated_signal_electrons(camera: AmcwCamera, frames: int = 200, seed: int
 
 
 def _main(arguments: list[str]) -> int:
-    camera = load_camera(arguments[0] if arguments else "azure_kinect_nfov")
+    parser = argparse.ArgumentParser(
+        prog="python -m scenes.sensor.calibration", description="Solve for the calibrated numbers of a camera's file."
+    )
+    parser.add_argument("camera", help="a file of scenes/cameras/ without its ending")
+    options = parser.parse_args(arguments)
+    return exit_code_of(lambda: _print_numbers(options.camera))
+
+
+def _print_numbers(name: str) -> int:
+    camera = load_camera(name)
     if isinstance(camera, ScannedLidar):
         for key, value in calibrated_numbers(camera).items():
             print(f"{camera.name}: {key} = {value:.4g}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
@@ -61,7 +62,7 @@ class CameraConfig(Config):
 
 def camera_names() -> tuple[str, ...]:
     """The cameras that come with tofpod."""
-    return tuple(sorted(path.stem for path in CAMERA_FOLDER.glob("*.yaml")))
+    return tuple(sorted(path.stem for path in CAMERA_FOLDER.glob("*.yaml") if not path.name.startswith(".")))
 
 
 @lru_cache
@@ -96,7 +97,8 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
         for key in path.split("."):
             at = at.get(key) if isinstance(at, dict) else None
         if not (isinstance(at, dict) and "value" in at):
-            near = difflib.get_close_matches(path, list(number_paths(data)), n=1)
+            known = number_paths(data)
+            near = [one for one in known if one.startswith(path)] or difflib.get_close_matches(path, known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}",
@@ -136,8 +138,15 @@ def _validated(data: Any, where: str) -> AnyCamera:
     try:
         return KINDS[data["kind"]].from_data(data)
     except ValidationError as error:
-        lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        lines = [f"  {_in_words(one)}" for one in error.errors()]
         raise UserError(f"{where} does not describe a camera:\n" + "\n".join(lines)) from error
+
+
+def _in_words(error: ErrorDetails) -> str:
+    """One of pydantic's errors with the number's path, as it is written in ``source.camera.numbers``."""
+    path = ".".join(map(str, error["loc"])).replace(".value", "")
+    what = str(error.get("ctx", {}).get("error", error["msg"])).replace("Input should be", "should be")
+    return f"{path}: {what}" if path else what
 
 
 def camera_digest(camera: AnyCamera) -> str:

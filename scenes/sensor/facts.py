@@ -15,6 +15,8 @@ T = TypeVar("T")
 
 TERMS = (0, 4, 5, 8)
 """How many distortion terms OpenCV's models have."""
+WORST_PX = 0.01
+"""How far a pixel may come back from its direction; good lenses do to 1e-6."""
 STEEPEST = 6.0
 """Slope from the axis up to which distortion is examined: 80 degrees."""
 
@@ -52,6 +54,7 @@ PositiveInt = Annotated[Fact[int], above_zero]
 Positive = Annotated[Fact[float], above_zero]
 NonNegative = Annotated[Fact[float], zero_or_more]
 Share = Annotated[Fact[float], share]
+LengthPx = Annotated[Fact[float], checked("above 0 and at most 1000 pixels", lambda value: 0 < value <= 1000)]
 HalfAngle = Annotated[Fact[float], half_angle]
 Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)]
 
@@ -81,6 +84,12 @@ class LensFacts(Config):
                 f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the corner "
                 f"of the sensor lies at {corner:.3g}"
             )
+        lens = self.lens()
+        u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)))
+        slopes = lens.slopes(u, v)
+        again = lens.project(np.concatenate([slopes, np.ones((u.size, 1))], axis=-1))
+        if not (np.abs(again - np.stack([u, v], axis=-1)) < WORST_PX).all():
+            raise ValueError("distortion folds the image: somewhere on the sensor no direction leads to a pixel")
         return self
 
     def _corner_slope(self) -> float:

@@ -17,6 +17,7 @@ from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.facts import (
     Fact,
     HalfAngle,
+    LengthPx,
     LensFacts,
     NonNegative,
     Positive,
@@ -30,11 +31,21 @@ from scenes.sensor.facts import (
 )
 
 PositiveEach = Annotated[Fact[tuple[float, ...]], above_zero]
+Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
 ShareEach = Annotated[Fact[tuple[float, ...]], share]
-Window = Annotated[Fact[int], checked("an odd number above 0", lambda value: value > 0 and value % 2 == 1)]
+Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
 Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
 WIDEST_PX = 2128
 """Longest row, the filter's window included: `kernels.STRIDE`, written again so that declarations compile nothing."""
+
+
+def _turns_one_way(corners: np.ndarray) -> bool:
+    """Whether corners (n, 2) go round a convex area counter-clockwise in axes x right, y down as the file has them."""
+    if len(corners) < 3:
+        return False
+    sides = np.roll(corners, -1, axis=0) - corners
+    after = np.roll(sides, -1, axis=0)
+    return bool((sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0] > 0).all())
 
 
 class EmitterFacts(Config):
@@ -55,6 +66,10 @@ class EmitterFacts(Config):
     def _rolls_off_outwards(self) -> EmitterFacts:
         if self.cutoff_half_angle_deg.value <= self.full_half_angle_deg.value:
             raise ValueError("cutoff_half_angle_deg must be above full_half_angle_deg")
+        if self.mask_slopes is not None and not _turns_one_way(np.array(self.mask_slopes.value)):
+            raise ValueError(
+                "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
+            )
         return self
 
 
@@ -67,7 +82,7 @@ class ModulationFacts(Config):
 
     frequencies_hz: PositiveEach
     phases: Phases
-    contrast: ShareEach
+    contrast: Contrasts
     wiggling_residual: ShareEach
 
     @model_validator(mode="after")
@@ -78,6 +93,8 @@ class ModulationFacts(Config):
         for key in ("contrast", "wiggling_residual"):
             if len(getattr(self, key).value) != count:
                 raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
+        if len(set(self.frequencies_hz.value)) != count:
+            raise ValueError("frequencies_hz names a frequency twice")
         try:
             unwrap_table(self.frequencies_hz.value, "least_squares")
         except UserError as mistake:
@@ -116,7 +133,7 @@ class FixedPatternFacts(Config):
     """What is the same in every frame of one unit: a smooth and a per-pixel error of range."""
 
     smooth_mm: NonNegative
-    smooth_length_px: Positive
+    smooth_length_px: LengthPx
     pixel_mm: NonNegative
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import model_validator
@@ -12,7 +12,18 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
-from scenes.sensor.facts import Fact, HalfAngle, LensFacts, NonNegative, Positive, Share, UnitFacts, Wavelength
+from scenes.sensor.facts import (
+    Fact,
+    HalfAngle,
+    LengthPx,
+    LensFacts,
+    NonNegative,
+    Positive,
+    Share,
+    UnitFacts,
+    Wavelength,
+    checked,
+)
 
 NS = 1e-9
 """Seconds in a nanosecond."""
@@ -32,11 +43,15 @@ class ReceiverFacts(Config):
     cutoff_half_angle_deg: HalfAngle
 
 
+BeamWidth = Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
+ExcessNoise = Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
+
+
 class BeamFacts(Config):
     """The beam at rest: round, Gaussian in angle. ``power_mw``: of its light, averaged over the code; only ambient
     light is measured by it."""
 
-    fwhm_mrad: Positive
+    fwhm_mrad: BeamWidth
     power_mw: Positive
 
 
@@ -73,7 +88,7 @@ class LidarPhotonFacts(Config):
     """
 
     signal_electrons: Positive
-    excess_noise_factor: Positive
+    excess_noise_factor: ExcessNoise
     amplifier_electrons: NonNegative
     band_nm: Positive
     room_albedo: Share
@@ -89,7 +104,7 @@ class RippleFacts(Config):
     """What is the same in every frame of one unit: smooth ripples of range."""
 
     smooth_mm: NonNegative
-    smooth_length_px: Positive
+    smooth_length_px: LengthPx
 
 
 class LidarEngineFacts(Config):
