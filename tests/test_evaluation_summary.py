@@ -7,7 +7,16 @@ import pandas as pd
 import pytest
 from synthetic_tables import World, joined, tables
 
-from harness.evaluation.summary import STATES, false_calls, found_holes, summarise_holes
+from harness.evaluation.intervals import wilson
+from harness.evaluation.summary import (
+    FOUND_RULE,
+    STATES,
+    false_calls,
+    found_holes,
+    found_rule,
+    status_of,
+    summarise_holes,
+)
 
 
 def test_a_hole_by_hand() -> None:
@@ -74,3 +83,9 @@ def test_a_repeat_of_rows_changes_counts_not_means() -> None:
     pd.testing.assert_series_equal(once["extent_diameter_mean_mm"], twice["extent_diameter_mean_mm"])
     assert (twice["n"] == 2 * once["n"]).all()
     assert (twice["rate_high"] - twice["rate_low"] < once["rate_high"] - once["rate_low"]).all()
+
+
+def test_too_few_trials_to_find_anything_are_told():
+    assert [status_of(*(float(bound) for bound in wilson(n, n))) for n in (3, 4)] == ["undecided", "found"]
+    assert found_rule(4) == FOUND_RULE
+    assert "With 3 of them no hole can count as either" in found_rule(3)

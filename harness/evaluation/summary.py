@@ -23,6 +23,8 @@ FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, else as undecided."
 )
+FEWEST_TRIALS = 4
+"""4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain."""
 GROUP = ["variant", "frames", "hole"]
 TRUTH = ["kind", "true_diameter_mm", "true_depth_mm", "seen_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
 MEASURED = ["diameter_mm", "offset_mm", "error_mm"]
@@ -116,6 +118,13 @@ def status_of(rate_low: float, rate_high: float) -> HoleState:
     if rate_low > 0.5:
         return "found"
     return "missed" if rate_high < 0.5 else "undecided"
+
+
+def found_rule(trials: int) -> str:
+    """`FOUND_RULE`, and that it can call no hole found where there are so few trials of each."""
+    if trials >= FEWEST_TRIALS:
+        return FOUND_RULE
+    return f"{FOUND_RULE} With {trials} of them no hole can count as either: that takes {FEWEST_TRIALS} at least."
 
 
 def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:

@@ -13,11 +13,11 @@ from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.profile import RINGS, hole_shapes
 from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.summary import (
-    FOUND_RULE,
     MAIN,
     ResultTables,
     false_calls,
     found_holes,
+    found_rule,
     summarise_holes,
 )
 from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_figure
@@ -71,7 +71,7 @@ def report_html(
     return template("report.html").render(
         title=title,
         answer=answer_sentence(main, verdicts),
-        found_rule=FOUND_RULE,
+        found_rule=found_rule(int(main["n"].max()) if len(main) else 0),
         frames=sorted(int(n) for n in main["frames"].unique()),
         repeats=int(main["n"].max()) if len(main) else 0,
         holes=_hole_rows(main),

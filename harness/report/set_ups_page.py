@@ -12,7 +12,7 @@ from harness.evaluation.claim_rules import Verdict
 from harness.evaluation.effects import EffectCosts, effect_costs
 from harness.evaluation.limits import LIMIT_RULE
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
-from harness.evaluation.summary import FOUND_RULE, ResultTables, false_calls, summarise_holes
+from harness.evaluation.summary import ResultTables, false_calls, found_rule, summarise_holes
 from harness.report.clouds import residual_figure
 from harness.report.effects_figure import cost_text, effects_figure
 from harness.report.example import ExampleCloud
@@ -53,7 +53,7 @@ def set_ups_html(
     return template("set_ups.html").render(
         title=title,
         answer=answer_sentence(compared, layout, costs, verdict),
-        found_rule=FOUND_RULE,
+        found_rule=found_rule(int(compared["repeats"].max()) if len(compared) else 0),
         limit_rule=LIMIT_RULE,
         repeats=int(compared["repeats"].max()) if len(compared) else 0,
         layout=layout,
