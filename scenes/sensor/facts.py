@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
@@ -129,6 +130,21 @@ class UnitFacts(Config):
     jump_rate: Share
     jump_mm: NonNegative
     jitter_mm: NonNegative
+
+
+class CameraFacts(Config):
+    """What every camera's file holds, whatever its kind."""
+
+    name: str
+    title: str
+    wavelength_nm: Wavelength
+    lens: LensFacts
+    unit: UnitFacts
+
+    @cached_property
+    def nominal_lens(self) -> Lens:
+        """The lens of the file; without distortion, that of a scanner is the raster of its beam's directions."""
+        return self.lens.lens()
 
 
 def unfolded_slope(distortion: tuple[float, ...]) -> float:

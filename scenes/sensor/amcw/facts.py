@@ -10,21 +10,18 @@ from pydantic import model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.optics import Optics, PixelFootprint
 from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.facts import (
+    CameraFacts,
     Fact,
     HalfAngle,
     LengthPx,
-    LensFacts,
     NonNegative,
     Positive,
     PositiveInt,
     Share,
-    UnitFacts,
-    Wavelength,
     above_zero,
     checked,
     share,
@@ -198,20 +195,15 @@ class EngineFacts(Config):
         return self
 
 
-class AmcwCamera(Config):
+class AmcwCamera(CameraFacts):
     """A continuous-wave time-of-flight imager: everything that its model needs, as data."""
 
-    name: str
-    title: str
     kind: Literal["amcw_imager"]
-    wavelength_nm: Wavelength
-    lens: LensFacts
     emitter: EmitterFacts
     modulation: ModulationFacts
     photons: PhotonFacts
     converter: ConverterFacts
     fixed_pattern: FixedPatternFacts
-    unit: UnitFacts
     engine: EngineFacts
 
     @model_validator(mode="after")
@@ -222,11 +214,6 @@ class AmcwCamera(Config):
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
         return self
-
-    @cached_property
-    def nominal_lens(self) -> Lens:
-        """The lens of the file."""
-        return self.lens.lens()
 
     @cached_property
     def emitter_position_m(self) -> np.ndarray:

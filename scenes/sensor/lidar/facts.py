@@ -9,19 +9,16 @@ import numpy as np
 from pydantic import model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
 from scenes.sensor.facts import (
+    CameraFacts,
     Fact,
     HalfAngle,
     LengthPx,
-    LensFacts,
     NonNegative,
     Positive,
     Share,
-    UnitFacts,
-    Wavelength,
     checked,
 )
 
@@ -123,24 +120,19 @@ class LidarEngineFacts(Config):
     output_step_mm: Positive
 
 
-class ScannedLidar(Config):
+class ScannedLidar(CameraFacts):
     """A lidar that sends one beam per pixel, one after the other: everything that its model needs, as data.
 
     Co-ordinates are at the transmitter: pixels are directions of the beam.
     """
 
-    name: str
-    title: str
     kind: Literal["scanned_lidar"]
-    wavelength_nm: Wavelength
-    lens: LensFacts
     receiver: ReceiverFacts
     beam: BeamFacts
     scan: ScanFacts
     code: CodeFacts
     photons: LidarPhotonFacts
     fixed_pattern: RippleFacts
-    unit: UnitFacts
     engine: LidarEngineFacts
 
     @model_validator(mode="after")
@@ -156,11 +148,6 @@ class ScannedLidar(Config):
         if len(self.weights) < 3:
             raise ValueError("code.period_ns must be longer: fewer than three spectral lines are within the band")
         return self
-
-    @cached_property
-    def nominal_lens(self) -> Lens:
-        """The lens of the file: without distortion it is the raster of the beam's directions."""
-        return self.lens.lens()
 
     @property
     def receiver_m(self) -> np.ndarray:
