@@ -21,12 +21,13 @@ SHOWN_APART = ("command", "seconds", "failures")
 """Keys of the provenance with a section of their own."""
 
 
-def template(name: str) -> Template:
-    """A template of this folder; a missing name is an error, text is escaped."""
+def template(name: str, folder: Path | None = None) -> Template:
+    """A template of ``folder``, which may use those of this one, or of this one; a missing name is an error, text is
+    escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader([one for one in (folder, Path(__file__).parent) if one]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

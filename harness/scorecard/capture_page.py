@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.report import canvas
+from harness.report.page_parts import template
 from harness.scorecard.capture import Beside, Captured, Twin
-from harness.scorecard.page import environment, told
+from harness.scorecard.page import told
 from harness.scorecard.plots import COLOURS
 from harness.scorecard.tables import interval, number
 from harness.vocabulary.units import MM
@@ -66,21 +68,17 @@ def capture_csv(rows: Sequence[Beside]) -> str:
 
 def capture_html(captured: Captured, twin: Twin, rows: Sequence[Beside], provenance: Mapping[str, Any]) -> str:
     """The page as text."""
-    return (
-        environment()
-        .get_template("capture.html")
-        .render(
-            name=captured.name,
-            camera=twin.camera.title,
-            frames=len(captured.z_m),
-            albedo=f"{twin.albedo:g}",
-            answer=_answer(rows),
-            heads=HEADS,
-            rows=[cells(row) for row in rows],
-            figure=_figure(captured, rows),
-            edges=any("edge" in row.where for row in rows),
-            provenance=told(provenance),
-        )
+    return template("capture.html", Path(__file__).parent).render(
+        name=captured.name,
+        camera=twin.camera.title,
+        frames=len(captured.z_m),
+        albedo=f"{twin.albedo:g}",
+        answer=_answer(rows),
+        heads=HEADS,
+        rows=[cells(row) for row in rows],
+        figure=_figure(captured, rows),
+        edges=any("edge" in row.where for row in rows),
+        provenance=told(provenance),
     )
 
 

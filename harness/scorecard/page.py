@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.report.page_parts import template
 from harness.scorecard.judge import Score
 from harness.scorecard.quantities import QUANTITIES
 from harness.scorecard.tables import HEADS, score_cells
@@ -47,30 +48,13 @@ def scorecard_html(
     quick: bool = False,
 ) -> str:
     """The page as text; ``figures`` are SVG texts by name, ``cameras`` titles by name."""
-    return (
-        environment()
-        .get_template("scorecard.html")
-        .render(
-            answer=answer(scores, quick),
-            heads=HEADS,
-            groups=[(title, _rows(scores, camera)) for camera, title in cameras.items()],
-            figures=[(TITLES[name], name, figures[name], CAPTIONS[name]) for name in TITLES if name in figures],
-            quantities=QUANTITIES.values(),
-            provenance=told(provenance),
-        )
-    )
-
-
-def environment() -> Any:
-    """The templates of this folder, autoescaped, without undefined names."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    return Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    return template("scorecard.html", Path(__file__).parent).render(
+        answer=answer(scores, quick),
+        heads=HEADS,
+        groups=[(title, _rows(scores, camera)) for camera, title in cameras.items()],
+        figures=[(TITLES[name], name, figures[name], CAPTIONS[name]) for name in TITLES if name in figures],
+        quantities=QUANTITIES.values(),
+        provenance=told(provenance),
     )
 
 
