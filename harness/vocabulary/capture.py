@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -96,6 +96,11 @@ class Cloud:
     frames where no sample was valid); ``count`` (h, w) valid samples; ``variance_m2`` (h, w) sample variance of one
     frame's z, NaN below two samples. An unorganised cloud has h == 1 and ``organised`` False. ``region`` places the
     grid on the sensor; ``z_step_m`` is the rounding step of one frame's z.
+
+    A map of several views is a cloud too: its frame is its maker's, with z away from the viewer. ``projection`` says
+    how its grid samples space: "central" (rays through the origin, a camera) or "parallel" (equal cells in x and y, a
+    map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts included, where its maker
+    states it; a plain average does not.
     """
 
     points_m: np.ndarray
@@ -110,6 +115,8 @@ class Cloud:
     rgb: np.ndarray | None = None
     amplitude: np.ndarray | None = None
     left_out: tuple[LeftOut, ...] = field(default=())
+    projection: Literal["central", "parallel"] = "central"
+    mean_variance_m2: np.ndarray | None = None
 
     @property
     def valid(self) -> np.ndarray:

@@ -1,0 +1,3 @@
+"""Rigid registration of views of one target: where each stands to the first, how well that is known, and when not."""
+
+from __future__ import annotations

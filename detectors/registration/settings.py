@@ -1,0 +1,72 @@
+"""How views are to be registered."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from harness.vocabulary.config import Config
+
+
+class NominalRegistration(Config):
+    """The guesses as they are."""
+
+    method: Literal["nominal"] = "nominal"
+
+
+class IcpRegistration(Config):
+    """Iterative closest point (Open3D), from the guess."""
+
+    method: Literal["icp"] = "icp"
+    points: Literal["marks", "target"] = "marks"
+    estimation: Literal["point_to_point", "point_to_plane"] = "point_to_point"
+
+
+class CpdRegistration(Config):
+    """Coherent point drift, rigid, without scale; the defaults are MATLAB's."""
+
+    method: Literal["cpd"] = "cpd"
+    points: Literal["marks", "target"] = "marks"
+    outlier_ratio: float = Field(default=0.1, ge=0, lt=1)
+    max_iterations: int = Field(default=20, ge=1, le=1000)
+    tolerance: float = Field(default=1e-5, gt=0)
+
+
+class MarksRegistration(Config):
+    """Centroids of marks, matched by their mutual distances, weighted by their covariances."""
+
+    method: Literal["marks"] = "marks"
+
+
+class JointRegistration(Config):
+    """Marks and the common surface of all views together, from the marks' registration."""
+
+    method: Literal["joint"] = "joint"
+
+
+class OdometryRegistration(Config):
+    """RGB-D odometry from view to view (Open3D), no marks: what a SLAM system does without closing loops."""
+
+    method: Literal["odometry"] = "odometry"
+
+
+RegistrationConfig = Annotated[
+    NominalRegistration
+    | IcpRegistration
+    | CpdRegistration
+    | MarksRegistration
+    | JointRegistration
+    | OdometryRegistration,
+    Field(discriminator="method"),
+]
+AnyRegistration = (
+    NominalRegistration
+    | IcpRegistration
+    | CpdRegistration
+    | MarksRegistration
+    | JointRegistration
+    | OdometryRegistration
+)
+PAIRWISE = ("nominal", "icp", "cpd", "marks")
+"""Methods that register each view to the first by itself, so that other views cannot change it."""

@@ -1,0 +1,41 @@
+"""Several views of one target: each a cloud in its own camera's frame, the first being the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from detectors.marks.mark import MarkSet
+from harness.vocabulary.capture import Cloud
+
+
+@dataclass(frozen=True)
+class View:
+    """One view. ``T_reference_view_guess`` (4, 4): where it is thought to stand, this view's camera frame to the first
+    view's, good to some degrees and centimetres; the identity for the first; None where nothing is known."""
+
+    name: str
+    cloud: Cloud
+    T_reference_view_guess: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A view with its target cut out and its marks found. ``inside`` (h, w) bool: valid pixels of the target."""
+
+    view: View
+    inside: np.ndarray
+    marks: MarkSet
+
+    @property
+    def points_m(self) -> np.ndarray:
+        """(n, 3) the target's points, camera frame of this view, in the order of the grid."""
+        points: np.ndarray = self.view.cloud.points_m[self.inside]
+        return points
+
+    @property
+    def mark_points_m(self) -> np.ndarray:
+        """(m, 3) the fiducial cloud: valid points of the fiducial colour."""
+        points: np.ndarray = self.view.cloud.points_m.reshape(-1, 3)[self.marks.points]
+        return points
