@@ -75,6 +75,11 @@ ViewsConfig = Annotated[ArcViews | GridViews | HandHeldViews | ListedViews, Fiel
 AnyViews = ArcViews | GridViews | HandHeldViews | ListedViews
 
 
+def view_count(views: AnyViews) -> int:
+    """How many views there are."""
+    return len(views.poses) if isinstance(views, ListedViews) else views.count
+
+
 def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
     """The target's pose before the camera for each view; the first is ``pose`` itself unless poses are listed.
 

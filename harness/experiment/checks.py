@@ -8,6 +8,8 @@ from itertools import combinations
 from math import dist
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from harness.experiment.declared import DETECTOR_NAME, detector_names
 from harness.experiment.recorded import recording_of
 from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
@@ -17,6 +19,7 @@ from harness.vocabulary.declaration.problems import Problem
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
 from scenes.field_of_view import check_in_view
+from scenes.perspectives import AnyViews, poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
 from scenes.target.declaration import TargetConfig
@@ -41,6 +44,7 @@ def joint_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem
         yield Problem("an experiment counts its frames by `capture.frames`", place, fix="remove this key")
     if isinstance(config.source, SimulatedSource):
         yield from _target_problems(config, config.source, source)
+        yield from _mapping_problems(config, config.source, source)
     else:
         yield from _capture_problems(config, config.source, source)
 
@@ -51,8 +55,10 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     if mistake:
         place = source.place_of(("source", "target"))
         yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
-    else:
+    elif simulated.views is None:
         yield from _camera_problems(simulated.camera, target, source)
+    else:
+        yield from _view_problems(simulated, target, simulated.views, source)
     pitch_mm = _smallest_pitch_mm(target)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
         yield Problem(
@@ -71,6 +77,46 @@ def _camera_problems(config: CameraConfig, target: TargetConfig, source: Source)
     if found:
         path, mistake = found
         yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
+
+
+def _view_problems(
+    simulated: SimulatedSource, target: TargetConfig, views: AnyViews, source: Source
+) -> Iterator[Problem]:
+    """Whether every view can be had: a legal pose that sees the whole face. The first that cannot is told."""
+    place = source.place_of(("source", "views"))
+    try:
+        poses = poses_of(views, target.pose)
+    except ValidationError as error:
+        first = error.errors()[0]
+        message = f"a view's pose is not legal: {first['loc'][-1]} would be {first['input']:g}"
+        yield Problem(message, place, legal=first["msg"], fix="lower the spread or the sway")
+        return
+    for number, pose in enumerate(poses):
+        found = _camera_mistake(simulated.camera, target.model_copy(update={"pose": pose}))
+        if found and found[0] != ("source", "target"):
+            path, mistake = found
+            yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
+            return
+        if found:
+            where = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            message = f"view {number} of {len(poses)} ({where}): {found[1].message}"
+            yield Problem(message, place, legal=found[1].legal, fix=found[1].fix)
+            return
+
+
+def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+    """Whether views and what is made of them fit together."""
+    if simulated.views is None and config.mapping is not None:
+        fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
+        yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
+    elif simulated.views is not None and config.mapping is None:
+        fix = "declare mapping, for instance {registration: {method: marks}, merge: {kind: fusion}}"
+        yield Problem("several views need a mapping into one cloud", source.place_of(("source", "views")), fix=fix)
+    elif simulated.views is not None and config.mapping is not None and config.mapping.views is not None:
+        there = view_count(simulated.views)
+        if config.mapping.views > there:
+            place = source.place_of(("mapping", "views"))
+            yield Problem(f"{config.mapping.views} views, but source.views has {there}", place, legal=f"1 to {there}")
 
 
 @lru_cache(maxsize=10_000)
@@ -104,6 +150,9 @@ def _smallest_pitch_mm(target: TargetConfig) -> float | None:
 def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
     missing = list(_missing_files(capture, source))
     yield from missing
+    if config.mapping is not None:
+        place = source.place_of(("mapping",))
+        yield Problem("a mapping needs the views of a simulated source", place, fix="use harness.detect --register")
     mistake = None if missing else _recording_mistake(capture)
     if mistake:
         yield Problem(mistake.message, source.place_of(("source", "paths")), legal=mistake.legal, fix=mistake.fix)

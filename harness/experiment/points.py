@@ -92,6 +92,7 @@ def source_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
             "target": source.target.declare().to_data(),
             "camera": camera,
             "render": source.render.to_data(),
+            **({} if source.views is None else {"views": source.views.to_data()}),
         }
     return recorded.content_of(source)
 

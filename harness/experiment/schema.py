@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from detectors.average import AverageConfig
+from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
+from scenes.perspectives import ViewsConfig
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig
 from scenes.target.declaration import AnyTargetConfig
@@ -26,16 +28,22 @@ AxisValues = Annotated[
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
 Reason = Annotated[str, Field(min_length=1, max_length=1000)]
+StudyFrames = Annotated[
+    tuple[Frames, ...],
+    Field(min_length=1, max_length=100),
+    BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values),
+]
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class SimulatedSource(Config):
-    """Frames come from a simulated camera that looks at a declared target."""
+    """Frames come from a simulated camera that looks at a declared target, from one place or from several ``views``."""
 
     kind: Literal["simulated"]
     target: AnyTargetConfig
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
+    views: ViewsConfig | None = Field(None, description="none: the target's own pose only")
 
 
 class CaptureSource(Config):
@@ -94,6 +102,7 @@ class ValuesVariation(Config):
     path: DottedPath
     values: AxisValues
     reason: Reason
+    frames: StudyFrames | None = Field(None, description="none: as the study's")
 
 
 class LabelledVariation(Config):
@@ -102,6 +111,7 @@ class LabelledVariation(Config):
     label: Label
     set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
     reason: Reason
+    frames: StudyFrames | None = Field(None, description="none: as the study's")
 
 
 class SensitivityConfig(Config):
@@ -111,7 +121,7 @@ class SensitivityConfig(Config):
     calibration_repeats: Repeats | None = Field(
         None, description="hole-free repeats of a variation; null: as threshold"
     )
-    frames: Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100)]
+    frames: StudyFrames
     vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
 
 
@@ -125,6 +135,7 @@ class ExperimentConfig(Config):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
+    mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()

@@ -47,6 +47,7 @@ class Draft:
     is_variation: bool = False
     repeats: int | None = None
     calibration_repeats: int | None = None
+    frames: tuple[Setting, ...] = ()
 
 
 def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
@@ -90,13 +91,17 @@ def _written_variations(data: Any) -> Iterator[Draft]:
     for index, one in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
         path, values, label, together = (shape.child(one, key) for key in ("path", "values", "label", "set"))
+        own = shape.child(one, "frames")
+        frames = tuple(
+            Setting(FRAMES, n, (*at, "frames", k)) for k, n in enumerate(own if isinstance(own, list) else ())
+        )
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
                 setting = Setting(path, value, (*at, "values", number))
-                yield Draft(_label([setting]), _label([setting]), (setting,), is_variation=True)
+                yield Draft(_label([setting]), _label([setting]), (setting,), is_variation=True, frames=frames)
         elif isinstance(label, str) and isinstance(together, dict):
             settings = tuple(Setting(key, value, (*at, "set", key)) for key, value in together.items())
-            yield Draft(label, label, settings, is_variation=True)
+            yield Draft(label, label, settings, is_variation=True, frames=frames)
 
 
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -118,6 +123,7 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
 def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
     first: dict[str, Draft] = {}
     for draft in variations:
+        yield from _repeated_values(list(draft.frames), source)
         for one in draft.settings:
             is_list = "values" in one.written_at
             at = source.place_of((*one.written_at[:3], "path")) if is_list else source.key_place_of(one.written_at)
@@ -198,9 +204,12 @@ def _drafts(axes: list[list[Setting]], variations: list[Draft], config: Experime
         yield Draft(_label(settings), variant, settings)
     study = config.sensitivity
     for variation in variations if study else ():
-        for index, frames in enumerate(study.frames if study else ()):
-            settings = (Setting(FRAMES, frames, ("sensitivity", "frames", index)), *variation.settings)
-            label = f"{variation.label}, {FRAMES}={frames}"
+        common = tuple(
+            Setting(FRAMES, n, ("sensitivity", "frames", i)) for i, n in enumerate(study.frames if study else ())
+        )
+        for frames in variation.frames or common:
+            settings = (frames, *variation.settings)
+            label = f"{variation.label}, {FRAMES}={frames.value}"
             repeats = (study.repeats, study.calibration_repeats) if study else (None, None)
             yield Draft(label, variation.label, settings, True, *repeats)
 

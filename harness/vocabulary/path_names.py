@@ -8,13 +8,15 @@ from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
 """Endings of keys that name a unit, longer ones first."""
+CHOICES = ("name", "kind", "method")
+"""Keys that say which of several; what it is of stands before them."""
 LONGEST = 60
 """Characters of a value that a table can show."""
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """A name for each path, without its unit: the last key (of ``camera.name`` the one before); the whole path where
-    that would be the same for two."""
+    """A name for each path, without its unit: the last key (of ``camera.name`` and the like the one before); the whole
+    path where that would be the same for two."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 
@@ -39,6 +41,6 @@ def on_one_line(value: Any) -> str:
 
 def _split(path: str) -> tuple[str, str]:
     keys = path.split(".")
-    key = keys[-2] if keys[-1] == "name" and len(keys) > 1 else keys[-1]
+    key = keys[-2] if keys[-1] in CHOICES and len(keys) > 1 else keys[-1]
     ending = next((one for one in UNITS if key.endswith(one) and len(key) > len(one)), "")
     return key.removesuffix(ending).replace("_", " "), UNITS.get(ending, "")
