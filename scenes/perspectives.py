@@ -71,7 +71,6 @@ class ListedViews(_Guess):
     poses: Annotated[tuple[PoseConfig, ...], Field(min_length=1, max_length=MAX_VIEWS)]
 
 
-ViewsConfig = Annotated[ArcViews | GridViews | HandHeldViews | ListedViews, Field(discriminator="kind")]
 AnyViews = ArcViews | GridViews | HandHeldViews | ListedViews
 
 

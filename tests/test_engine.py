@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -21,14 +22,15 @@ from harness.engine.journal import Journal, without_nan
 from harness.engine.plan import plan_of
 from harness.engine.run import pending_counts
 from harness.engine.setup import SetUp
-from harness.engine.trial import _on_board, run_trial
+from harness.engine.sight import sight_of_view
+from harness.engine.trial import run_trial
 from harness.experiment.load import load_experiment
 from scenes.target.declaration import TargetConfig
 from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import truth_of
 
 if TYPE_CHECKING:
-    from detectors.interface import Measurement
+    from harness.vocabulary.capture import Cloud
     from scenes.sensor.source import SimulatedUnit
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -343,5 +345,6 @@ def test_matching_places_findings_on_a_curved_face():
     unit = cast("SimulatedUnit", None)
     set_up = SetUp(unit, unit, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
-    measured = [cast("Measurement", SimpleNamespace(extent_centre_m=deeper))]
-    assert _on_board(set_up, measured)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)
+    set_up.__dict__ |= {"outlines": {}, "intact": np.ones((1, 1), bool)}
+    sight = sight_of_view(set_up, cast("Cloud", SimpleNamespace(projection="central")), hole_free=False)
+    assert sight.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

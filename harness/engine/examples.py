@@ -24,7 +24,7 @@ def examples_of(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCl
     chosen = _ends([point for point in group.points if point.digest in thresholds])
     if not chosen:
         return []
-    set_up = load_set_up(group.set_up)
+    set_up = load_set_up(group.set_ups[0])
     counts = sorted({point.config.capture.frames for point in chosen})
     capture = set_up.damaged.capture(counts[-1], group.seed, "damaged", 0)
     averages = {canonical_json(point.config.capture.average.to_data()): point for point in chosen}

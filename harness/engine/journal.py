@@ -10,7 +10,7 @@ from typing import Any
 from harness.vocabulary.files import write_text
 from harness.vocabulary.seeds import canonical_json, digest
 
-JOURNAL_VERSION = 2
+JOURNAL_VERSION = 3
 """Raised by every change to the records' content or to what a trial computes."""
 
 

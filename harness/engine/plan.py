@@ -16,6 +16,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import canonical_json, digest
 from harness.vocabulary.sources import source_digest
 from harness.vocabulary.units import MM
+from scenes.perspectives import AnyViews, poses_of
 from scenes.render.cache import render_key
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
@@ -43,14 +44,35 @@ class RenderJob:
 
 
 @dataclass(frozen=True)
-class Group:
-    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them."""
+class PlannedView:
+    """One pose of the target: both its renders, and what names them to a worker."""
 
-    points: tuple[Point, ...]
     damaged: RenderJob
     hole_free: RenderJob
     set_up: SetUpRef
+
+
+@dataclass(frozen=True)
+class Group:
+    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them.
+
+    ``views``: one, or those from which the points' maps are made, of which ``poses`` is the declaration.
+    """
+
+    points: tuple[Point, ...]
+    views: tuple[PlannedView, ...]
     seed: int
+    poses: AnyViews | None = None
+
+    @property
+    def renders(self) -> tuple[RenderJob, ...]:
+        """All renders, hole-free ones first."""
+        return (*(view.hole_free for view in self.views), *(view.damaged for view in self.views))
+
+    @property
+    def set_ups(self) -> tuple[SetUpRef, ...]:
+        """Of each view."""
+        return tuple(view.set_up for view in self.views)
 
     def repeats(self, role: Role, point: Point) -> int:
         """How many trials of a role a point wants. With a given threshold, as many hole-free ones as damaged ones."""
@@ -67,7 +89,7 @@ class Group:
                 for point in self.points
                 if repeat < self.repeats(role, point)
             )
-            task = TrialTask(self.set_up, self.seed, role, repeat, wanted)
+            task = TrialTask(self.set_ups, self.seed, role, repeat, wanted, self.poses)
             yield self._key(task), task
 
     def _key(self, task: TrialTask) -> str:
@@ -75,8 +97,8 @@ class Group:
         content = [
             JOURNAL_VERSION,
             source_digest(CODE, PACKAGES),
-            self.damaged.path.stem,
-            self.hole_free.path.stem,
+            *(render.path.stem for render in self.renders),
+            None if self.poses is None else self.poses.to_data(),
             task.role,
             task.repeat,
             asked,
@@ -95,6 +117,7 @@ def _point_task(point: Point, threshold: float | None) -> PointTask:
         average=config.capture.average,
         radius_m=config.matching.radius_mm * MM,
         threshold=threshold,
+        mapping=config.mapping,
     )
 
 
@@ -107,7 +130,7 @@ class Plan:
     @property
     def renders(self) -> tuple[RenderJob, ...]:
         """The distinct views, in the order in which trials need them."""
-        jobs = {job.path: job for group in self.groups for job in (group.hole_free, group.damaged)}
+        jobs = {job.path: job for group in self.groups for job in group.renders}
         return tuple(jobs.values())
 
     @property
@@ -135,8 +158,13 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
             legal="at least one hole or dent",
             fix="declare source.target.holes or source.target.dents",
         )
+    poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
+    views = tuple(_view(target.model_copy(update={"pose": pose}), source, cache) for pose in poses)
+    return Group(points, views, points[0].config.seed, source.views)
+
+
+def _view(target: TargetConfig, source: SimulatedSource, cache: Path) -> PlannedView:
     damaged, hole_free = (
         RenderJob(declared, source.camera, source.render, cache) for declared in (target, target.hole_free())
     )
-    ref = SetUpRef(str(damaged.path), str(hole_free.path), source.camera, target)
-    return Group(points, damaged, hole_free, ref, points[0].config.seed)
+    return PlannedView(damaged, hole_free, SetUpRef(str(damaged.path), str(hole_free.path), source.camera, target))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -16,9 +16,11 @@ import numpy as np
 from harness.engine import workers
 from harness.engine.examples import examples_of
 from harness.engine.journal import Journal, without_nan
+from harness.engine.map_examples import map_examples_of
 from harness.engine.plan import Group, Plan, RenderJob
 from harness.engine.trial import Record, Role, TrialTask, run_trial
 from harness.report.example import ExampleCloud
+from harness.report.views_example import MappedExample
 from harness.vocabulary.errors import UserError
 
 FAILURE_CHARACTERS = 4000
@@ -40,7 +42,7 @@ class Outcome:
     records: dict[str, Record] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
     thresholds: dict[str, float] = field(default_factory=dict)
-    examples: list[ExampleCloud] = field(default_factory=list)
+    examples: list[ExampleCloud | MappedExample] = field(default_factory=list)
     renders_done: int = 0
     renders_cached: int = 0
     render_seconds: float = 0.0
@@ -109,12 +111,12 @@ class _Run:
         self.report = report
         self.outcome = Outcome()
         self.pending: dict[Future[Any], _Render | _Trial | _Examples] = {}
-        self._views_missing = [{g.damaged.path, g.hole_free.path} for g in plan.groups]
+        self._views_missing = [{job.path for job in g.renders} for g in plan.groups]
         self._trials_missing: list[set[str]] = [set() for _ in plan.groups]
         self._quiet: dict[str, list[float]] = {}
 
     def start(self) -> None:
-        """Submit every render; a group's trials follow when both its views are there."""
+        """Submit every render; a group's trials follow when all its views are there."""
         for job in self.plan.renders:
             arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
             self.pending[self.renderer.submit(workers.render, *arguments)] = _Render(job)
@@ -205,7 +207,7 @@ class _Run:
         """After the hole-free trials each point has its threshold; then the damaged ones begin."""
         group = self.plan.groups[number]
         if role == "damaged":
-            future = self.trial_pool.submit(examples_of, group, self.outcome.thresholds)
+            future = self.trial_pool.submit(_examples_of, group, self.outcome.thresholds)
             self.pending[future] = _Examples(number)
             return
         for point in group.points:
@@ -223,6 +225,10 @@ class _Run:
         renders = o.renders_done + o.renders_cached
         trials = o.trials_done + o.trials_resumed + len(o.failures)
         self.report(Progress(renders, len(self.plan.renders), trials, self.plan.trial_count))
+
+
+def _examples_of(group: Group, thresholds: dict[str, float]) -> Sequence[ExampleCloud | MappedExample]:
+    return examples_of(group, thresholds) if group.poses is None else map_examples_of(group, thresholds)
 
 
 def pending_counts(plan: Plan, journal: Journal) -> Iterator[tuple[str, int, int]]:

@@ -134,7 +134,7 @@ def _z_m(unit: SimulatedUnit) -> np.ndarray:
     return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=32)
 def load_set_up(ref: SetUpRef) -> SetUp:
     """The set-up behind a reference, kept for the worker's next trials."""
     camera = camera_of(ref.camera)

@@ -105,7 +105,7 @@ def _provenance(
 def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
     """The damaged views of all set-ups, variations left out."""
     set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    views = (read_view(group.damaged.path) for group in set_ups or plan.groups[:1])
+    views = (read_view(view.damaged.path) for group in set_ups or plan.groups[:1] for view in group.views)
     return [view for view in views if view is not None]
 
 
@@ -131,7 +131,10 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> N
     numbers = {k: provenance[k] for k in ("results_version", "experiment", "digest", "seed", "commit", "dirty")}
     note = json.dumps({**numbers, "versions": provenance["versions"]}, sort_keys=True)
     stored_tables = {"trials": tables.holes, "runs": tables.runs, "probes": tables.probes, "noise": tables.noise}
+    stored_tables |= {"registrations": tables.registrations, "walls": tables.walls}
     for name, table in stored_tables.items():
+        if table.empty and name in ("registrations", "walls"):
+            continue
         stored = pa.Table.from_pandas(table, preserve_index=False)
         stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
         with atomic_path(folder / f"{name}.parquet") as path:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from harness.engine.walls import wall_rows
 from harness.experiment.points import MAIN, Experiment, Point
 from harness.experiment.schema import LabelledVariation
 from harness.experiment.set_ups import FRAMES
@@ -20,6 +21,7 @@ ORDERS = {
     "holes": ["variant", "frames", "repeat", "true_diameter_mm", "hole"],
     "runs": ["variant", "role", "frames", "repeat"],
     "noise": ["variant", "frames", "repeat"],
+    "registrations": ["variant", "role", "frames", "repeat", "view"],
 }
 
 
@@ -29,10 +31,12 @@ class Tables:
 
     ``holes``: one row per variant, frames, repeat and hole. ``runs``: per variant, frames, repeat and role.
     ``probes``: per variant, frames and probe pixel, over repeats. ``noise``: per variant, frames and hole-free repeat
-    (columns of `harness.engine.board_noise`). All four carry a column per axis other than the number of frames, named
-    by its path, where there are any. ``variants``: one row per set-up, then per variation: variant, reason, settings,
-    is_variation, reference (the set-up to compare with, or empty), switches (JSON, or empty), and the axes.
-    ``axes``: path, name, unit of each of those axes, in their order.
+    (columns of `harness.engine.board_noise`). ``registrations``: per registration that was made, under the first
+    variant that shares it (columns of `harness.engine.maps`); empty where there are no maps. All five carry a column
+    per axis other than the number of frames, named by its path, where there are any. ``variants``: one row per set-up,
+    then per variation: variant, reason, settings, is_variation, reference (the set-up to compare with, or empty),
+    switches (JSON, or empty), and the axes. ``axes``: path, name, unit of each of those axes, in their order.
+    ``walls``: what of each hole's wall is shadowed, by number of views (`harness.evaluation.walls`); empty likewise.
     """
 
     holes: pd.DataFrame
@@ -41,11 +45,13 @@ class Tables:
     variants: pd.DataFrame
     noise: pd.DataFrame
     axes: pd.DataFrame
+    registrations: pd.DataFrame = field(default_factory=pd.DataFrame)
+    walls: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> Tables:
     """Collect records, in any order, into tables in a fixed order."""
-    rows: dict[str, list[dict[str, Any]]] = {"holes": [], "runs": [], "probes": [], "noise": []}
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ("probes", *ORDERS)}
     for record in records:
         for name, collected in rows.items():
             collected.extend(record[name])
@@ -55,9 +61,9 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> T
     def with_axes(table: pd.DataFrame) -> pd.DataFrame:
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
-    holes, runs, noise = (_ordered(rows[name], order) for name, order in ORDERS.items())
-    probes = _probes(rows["probes"])
-    return Tables(with_axes(holes), with_axes(runs), with_axes(probes), variants, noise=with_axes(noise), axes=axes)
+    ordered = {name: with_axes(_ordered(rows[name], order)) for name, order in ORDERS.items()}
+    probes = with_axes(_probes(rows["probes"]))
+    return Tables(**ordered, probes=probes, variants=variants, axes=axes, walls=wall_rows(experiment))
 
 
 def _ordered(rows: list[dict[str, Any]], order: list[str]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from detectors.average import AverageConfig
 from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
-from scenes.perspectives import ViewsConfig
+from scenes.perspectives import AnyViews
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig
 from scenes.target.declaration import AnyTargetConfig
@@ -43,7 +43,7 @@ class SimulatedSource(Config):
     target: AnyTargetConfig
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
-    views: ViewsConfig | None = Field(None, description="none: the target's own pose only")
+    views: AnyViews | None = Field(None, discriminator="kind", description="none: the target's own pose only")
 
 
 class CaptureSource(Config):

@@ -1,0 +1,129 @@
+"""One detector on one cloud, measured against the truth: the rows of a run and of each damage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from detectors import load_detector
+from detectors.interface import Detector, Evidence, Measurement
+from harness.engine.sight import Sight
+from harness.evaluation.match import match
+from harness.vocabulary.units import MM
+from scenes.target.truth import Damage
+
+
+@lru_cache(maxsize=32)
+def _detector(name: str, settings_json: str) -> Detector:
+    import json
+
+    return load_detector(name, json.loads(settings_json))
+
+
+def judge(
+    sight: Sight, detector_name: str, settings_json: str, threshold: float | None, radius_m: float, *, hole_free: bool
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """One detector on one cloud: the run's row, and one row per damage where there is any.
+
+    Without a threshold only the quiet one is found.
+    """
+    cloud = sight.cloud
+    detector = _detector(detector_name, settings_json)
+    evidence = detector.analyse(cloud)
+    run: dict[str, Any] = {
+        "threshold": threshold if threshold is not None else np.nan,
+        "quiet_threshold": detector.quiet_threshold(cloud, evidence) if hole_free else np.nan,
+        "scale_mm": evidence.scale_m / MM,
+        "surface_noise_mm": _robust_std(evidence.residual_m[sight.undamaged]) / MM,
+        "frames_used": cloud.n_frames,
+        "left_out": len(cloud.left_out),
+        "detections": 0,
+        "false_calls": 0,
+    }
+    if threshold is None:
+        return run, []
+    detections = detector.find(cloud, evidence, threshold)
+    measured = [detector.measure(cloud, evidence, detection) for detection in detections]
+    pairs = {} if hole_free else matched(sight, measured, radius_m)
+    run |= {"detections": len(detections), "false_calls": len(detections) - len(pairs)}
+    if hole_free:
+        return run, []
+    largest = max(measured, key=lambda m: m.points, default=None)
+    holes = [
+        _hole_row(sight, evidence, damage, measured[pairs[i]] if i in pairs else None, largest)
+        | {"threshold": threshold}
+        for i, damage in enumerate(sight.truth)
+    ]
+    return run, holes
+
+
+def matched(sight: Sight, measured: Sequence[Measurement], radius_m: float) -> dict[int, int]:
+    """Which finding counts for which damage: index into ``sight.truth`` -> index into ``measured``."""
+    damages = np.array([damage.centre_board_m[:2] for damage in sight.truth]).reshape(-1, 2)
+    centres = np.array([m.extent_centre_m for m in measured]).reshape(-1, 3)
+    return match(damages, sight.on_board(centres), radius_m)
+
+
+def _hole_row(
+    sight: Sight, evidence: Evidence, damage: Damage, found: Measurement | None, largest: Measurement | None
+) -> dict[str, Any]:
+    """How one damage fared. Distances in mm; positions as the thesis takes them, from the largest cluster's centre."""
+    inside = sight.outlines[damage.id]
+    # a cloud without a grid has no pixels that could lack a range
+    missing = float((~sight.cloud.valid.ravel()[inside]).mean()) if sight.cloud.organised else np.nan
+    residual = evidence.residual_m.ravel()[inside]
+    median_m = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
+    last = max(sight.truth, key=lambda d: d.diameter_m)
+    row: dict[str, Any] = {
+        "hole": str(damage.id),
+        "kind": damage.kind,
+        "true_diameter_mm": damage.diameter_m / MM,
+        "true_depth_mm": damage.depth_m / MM,
+        "seen_depth_mm": sight.seen_depth_m[damage.id] / MM,
+        "true_x_mm": float(damage.centre_board_m[0]) / MM,
+        "true_y_mm": float(damage.centre_board_m[1]) / MM,
+        "true_offset_mm": float(np.linalg.norm(damage.centre_board_m - last.centre_board_m)) / MM,
+        "detected": found is not None,
+        "invalid_fraction": missing,
+        "median_residual_mm": median_m / MM,
+        "state": _state(found is not None, missing, median_m, evidence.scale_m),
+    }
+    return row | _measured_columns(sight, damage, found, largest)
+
+
+def _state(detected: bool, invalid_fraction: float, median_m: float, scale_m: float) -> str:
+    """How a hole shows: "found"; else "invalid" (most of its pixels have no range), "wrong depth" (its pixels lie off
+    the surface by more than the detector's scale, yet below threshold), or "invisible"."""
+    if detected:
+        return "found"
+    if invalid_fraction > 0.5:
+        return "invalid"
+    return "wrong depth" if abs(median_m) > scale_m else "invisible"
+
+
+def _measured_columns(
+    sight: Sight, damage: Damage, found: Measurement | None, largest: Measurement | None
+) -> dict[str, Any]:
+    names = ("extent_diameter", "model_diameter", "model_diameter_se", "model_depth", "model_depth_se")
+    if found is None or largest is None:
+        blank = dict.fromkeys((*names, "extent_offset", "extent_error", "model_offset", "model_error"), np.nan)
+        return {f"{k}_mm": v for k, v in blank.items()} | {"score": np.nan, "points": 0, "model_note": ""}
+    values = {name: getattr(found, f"{name}_m") for name in names}
+    true_centre = sight.centre_in_cloud_m(damage)
+    for kind in ("extent", "model"):
+        centre, reference = getattr(found, f"{kind}_centre_m"), getattr(largest, f"{kind}_centre_m")
+        values[f"{kind}_offset"] = float(np.linalg.norm(centre - reference))
+        values[f"{kind}_error"] = float(np.linalg.norm(centre - true_centre))
+    return {f"{k}_mm": float(v) / MM for k, v in values.items()} | {
+        "score": float(found.score),
+        "points": int(found.points),
+        "model_note": found.model_note,
+    }
+
+
+def _robust_std(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(np.abs(finite - np.median(finite))) / 0.6745) if finite.size else float("nan")

@@ -1,0 +1,148 @@
+"""A cloud with the truth on its own grid, be it one view's average or a map of several: what a judge needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.engine.setup import INTACT_MARGIN_PX, SetUp
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import invert, transform_points
+from harness.vocabulary.units import MM
+from scenes.target.custom import TargetConfig
+from scenes.target.face import face_of
+from scenes.target.truth import Damage
+
+SIGHT_STEPS = 8
+"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A cloud and where the truth lies in it.
+
+    ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true. ``outlines``: by damage the flat indices of the
+    pixels (cells, points) that see into it, at least one. ``undamaged`` (h, w) bool: face well away from damage and
+    rim. ``seen_depth_m``: by damage, how far behind the face a view of it ends.
+    """
+
+    cloud: Cloud
+    T_board_cloud: np.ndarray
+    target: TargetConfig
+    truth: tuple[Damage, ...]
+    outlines: Mapping[int, np.ndarray]
+    undamaged: np.ndarray
+    seen_depth_m: Mapping[int, float]
+
+    def on_board(self, centres_m: np.ndarray) -> np.ndarray:
+        """(m, 2) places on the face of findings whose centres (m, 3) are given in the cloud's frame: where the line of
+        sight through a centre meets the face.
+
+        The centre itself lies at depth, up to a centimetre aside of where a viewer would point on the face. On a
+        map the line of sight is its z axis.
+        """
+        board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
+        face = face_of(self.target.board)
+        if self.cloud.projection == "parallel":
+            direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
+        else:
+            direction = board - self.T_board_cloud[:3, 3]
+        place = board
+        for _ in range(SIGHT_STEPS):
+            height = np.nan_to_num(face.height_m(place[:, 0], place[:, 1]))
+            place = board + ((height - board[:, 2]) / direction[:, 2])[:, None] * direction
+        return np.asarray(place[:, :2])
+
+    def centre_in_cloud_m(self, damage: Damage) -> np.ndarray:
+        """(3,) true centre of a damage on the face, in the cloud's frame."""
+        return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
+
+
+def sight_of_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> Sight:
+    """Of one view's average: the truth along each pixel's central ray."""
+    # where the camera is so far that nothing undamaged is left beside the damage, a hole-free board but for its rim
+    undamaged = set_up.bare if hole_free and not set_up.intact.any() else set_up.intact
+    return Sight(
+        cloud=cloud,
+        T_board_cloud=invert(set_up.T_camera_board),
+        target=set_up.target,
+        truth=set_up.truth,
+        outlines=set_up.outlines,
+        undamaged=undamaged,
+        seen_depth_m={damage.id: _seen_depth_m(set_up, damage) for damage in set_up.truth},
+    )
+
+
+def sight_of_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> Sight:
+    """Of a map of several views, ``first`` being the reference view's set-up: the truth by each point's own place.
+
+    A point deep in a hole that was seen at an angle lies beside the place on the face where it was looked for; on the
+    target's scale that is within the margin round the damage.
+    """
+    T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
+    place = board_places_m(cloud, T_board_cloud)
+    margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
+    size = first.target.board
+    half = np.array([size.width_mm, size.height_mm]) / 2 * MM - margin_m
+    with np.errstate(invalid="ignore"):
+        bare = (np.abs(place) < half).all(axis=-1)
+    outlines, intact = {}, bare.copy()
+    for damage in first.truth:
+        distance = np.linalg.norm(place - damage.centre_board_m[:2], axis=-1)
+        with np.errstate(invalid="ignore"):
+            intact &= distance > damage.diameter_m / 2 + margin_m
+            within = np.flatnonzero(distance.ravel() < damage.diameter_m / 2)
+        outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(distance))])
+    return Sight(
+        cloud=cloud,
+        T_board_cloud=T_board_cloud,
+        target=first.target,
+        truth=first.truth,
+        outlines=outlines,
+        undamaged=bare if hole_free and not intact.any() else intact,
+        seen_depth_m={damage.id: _seen_depth_m(first, damage) for damage in first.truth},
+    )
+
+
+def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
+    """(h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid knows."""
+    points = cloud.points_m
+    if cloud.projection == "parallel":
+        x, y = np.nanmedian(points[..., 0], axis=0), np.nanmedian(points[..., 1], axis=1)
+        z = float(np.nanmedian(points[..., 2]))
+        grid = np.stack([*np.meshgrid(_continued(x), _continued(y)), np.full(cloud.valid.shape, z)], axis=-1)
+        points = np.where(cloud.valid[..., None], points, grid)
+    return np.asarray(transform_points(T_board_cloud, points)[..., :2])
+
+
+def face_errors_m(sight: Sight, places_m: np.ndarray) -> np.ndarray:
+    """(p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along the
+    board's normal; NaN where the nearest is more than four times as far aside as the median place's."""
+    from scipy.spatial import cKDTree
+
+    points = transform_points(sight.T_board_cloud, sight.cloud.points_m[sight.cloud.valid])
+    # the undamaged face only: what lies behind a rim is nearest to no place on the face
+    points = points[np.abs(points[:, 2]) < 50 * MM]
+    tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
+    distance, nearest = tree.query(places_m)
+    face = face_of(sight.target.board)
+    error = face.height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
+    return np.asarray(np.where(distance <= 4 * np.median(distance), error, np.nan))
+
+
+def _continued(ticks: np.ndarray) -> np.ndarray:
+    """Equally spaced ticks, those that are not known filled in."""
+    known = np.flatnonzero(np.isfinite(ticks))
+    step, first = np.polyfit(known, ticks[known], 1) if len(known) > 1 else (0.0, float(ticks[known[0]]))
+    return np.asarray(np.where(np.isfinite(ticks), ticks, first + step * np.arange(len(ticks))))
+
+
+def _seen_depth_m(set_up: SetUp, damage: Damage) -> float:
+    """How far behind the face the central rays through a hole end, along the optical axis: the median of those that
+    come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the backing."""
+    inside = set_up.outlines[damage.id]
+    depth = set_up.seen_z_m.ravel()[inside] - set_up.true_z_m.ravel()[inside]
+    depth = depth[np.isfinite(depth)]
+    return float(np.median(depth[depth > depth.max() - 1 * MM])) if depth.size else float("nan")
