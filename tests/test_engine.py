@@ -345,6 +345,7 @@ def test_matching_places_findings_on_a_curved_face():
     unit = cast("SimulatedUnit", None)
     set_up = SetUp(unit, unit, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
-    set_up.__dict__ |= {"outlines": {}, "intact": np.ones((1, 1), bool)}
+    one, pixels = np.ones((1, 1)), {1: np.array([0])}
+    vars(set_up).update({"outlines": pixels, "intact": one > 0, "seen_z_m": one, "true_z_m": one})
     sight = sight_of_view(set_up, cast("Cloud", SimpleNamespace(projection="central")), hole_free=False)
     assert sight.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

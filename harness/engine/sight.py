@@ -119,7 +119,7 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
 
 def face_errors_m(sight: Sight, places_m: np.ndarray) -> np.ndarray:
     """(p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along the
-    board's normal; NaN where the nearest is more than four times as far aside as the median place's."""
+    board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
     from scipy.spatial import cKDTree
 
     points = transform_points(sight.T_board_cloud, sight.cloud.points_m[sight.cloud.valid])
@@ -127,9 +127,10 @@ def face_errors_m(sight: Sight, places_m: np.ndarray) -> np.ndarray:
     points = points[np.abs(points[:, 2]) < 50 * MM]
     tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
     distance, nearest = tree.query(places_m)
+    spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
     face = face_of(sight.target.board)
     error = face.height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
-    return np.asarray(np.where(distance <= 4 * np.median(distance), error, np.nan))
+    return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
 
 
 def _continued(ticks: np.ndarray) -> np.ndarray:
