@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,8 @@ class Tables:
     variants: pd.DataFrame
     noise: pd.DataFrame
     axes: pd.DataFrame
+    registrations: pd.DataFrame = field(default_factory=pd.DataFrame)
+    walls: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16

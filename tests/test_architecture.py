@@ -17,6 +17,7 @@ ALLOWED = {
     "scenes": ("harness.vocabulary", "scenes"),
     "detectors": ("harness.vocabulary", "detectors"),
     "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
+    "harness/exchange": ("harness.vocabulary", "harness.exchange"),
     "harness/evaluation": ("harness.vocabulary", "harness.evaluation"),
     "harness/report": ("harness.vocabulary", "harness.evaluation", "harness.report", "detectors.interface"),
     "harness": ("",),
@@ -59,14 +60,14 @@ def test_no_further_code_folder():
     assert folders <= {*ROOMS, "tests"}
 
 
-@pytest.mark.parametrize("program", ["sweep", "detect", "target", "validate", "prepare"])
+@pytest.mark.parametrize("program", ["sweep", "detect", "export", "target", "validate", "prepare"])
 def test_help_loads_nothing_heavy(program):
     code = (
         f"import sys; sys.argv = ['x', '--help']\n"
         f"import harness.{program} as program\n"
         "try: program.main()\n"
         "except SystemExit as end: assert end.code == 0\n"
-        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2'}\n"
+        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', 'rosbags'}\n"
         "heavy &= set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )

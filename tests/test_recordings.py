@@ -116,7 +116,7 @@ def test_every_format_gives_the_points_that_were_written(opened: Callable[[Path]
     stores_zero = frame.reason[plane.NO_RETURN] == Reason.NO_RETURN
     expected[plane.NO_RETURN] = Reason.NO_RETURN if stores_zero else Reason.NOT_FINITE
     np.testing.assert_array_equal(frame.reason, expected)
-    assert recording.z_step_m == pytest.approx(0.2e-3 if opened is tum else 1e-3, rel=1e-12)
+    assert recording.z_step_m == pytest.approx(1e-3, rel=1e-12)
     assert all(path.is_file() for path in recording.files)
 
 

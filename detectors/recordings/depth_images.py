@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detectors.recordings.distances import UNITS_M, frame_from_depth
+from detectors.recordings.distances import UNITS_M, frame_from_depth, rounding_step_m
 from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
@@ -95,7 +95,15 @@ def _open(
     scale_m = scale_m or UNITS_M["mm"]
     files = (*depths, *(c for c in aligned if c), *([lens_file] if lens_file else []))
     reader = PngReader(depths, aligned, scale_m)
-    return Recording(name, reader, lens.whole, scale_m, z_step_m=scale_m, files=files, lens=lens, notes=notes)
+    step_m = _step_m(depths[0], scale_m)
+    return Recording(name, reader, lens.whole, scale_m, z_step_m=step_m, files=files, lens=lens, notes=notes)
+
+
+def _step_m(first: Path, scale_m: float) -> float:
+    """The camera's rounding step: TUM's unit of 0.2 mm is finer than the steps of most cameras."""
+    if scale_m != UNITS_M["tum"]:
+        return scale_m
+    return rounding_step_m(frame_from_depth(first.name, read_depth_png(first), scale_m).z_m) or scale_m
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:

@@ -23,6 +23,7 @@ FOUND_BESIDE = (
     "camera",
     "camera_info",
     "calibration",
+    "rtabmap_calib",
 )
 """Stems of the files that are taken for the lens of the frames beside or below them."""
 

@@ -110,9 +110,9 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
     """(h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid knows."""
     points = cloud.points_m
     if cloud.projection == "parallel":
-        x, y = np.nanmedian(points[..., 0], axis=0), np.nanmedian(points[..., 1], axis=1)
+        x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
         z = float(np.nanmedian(points[..., 2]))
-        grid = np.stack([*np.meshgrid(_continued(x), _continued(y)), np.full(cloud.valid.shape, z)], axis=-1)
+        grid = np.stack([*np.meshgrid(x, y), np.full(cloud.valid.shape, z)], axis=-1)
         points = np.where(cloud.valid[..., None], points, grid)
     return np.asarray(transform_points(T_board_cloud, points)[..., :2])
 
@@ -133,11 +133,14 @@ def face_errors_m(sight: Sight, places_m: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
 
 
-def _continued(ticks: np.ndarray) -> np.ndarray:
-    """Equally spaced ticks, those that are not known filled in."""
-    known = np.flatnonzero(np.isfinite(ticks))
-    step, first = np.polyfit(known, ticks[known], 1) if len(known) > 1 else (0.0, float(ticks[known[0]]))
-    return np.asarray(np.where(np.isfinite(ticks), ticks, first + step * np.arange(len(ticks))))
+def _ticks(places: np.ndarray) -> np.ndarray:
+    """(w,) equally spaced co-ordinates of the columns of (h, w) places, those of empty columns filled in."""
+    known = np.flatnonzero(np.isfinite(places).any(axis=0))
+    ticks = np.nanmedian(places[:, known], axis=0)
+    step, first = np.polyfit(known, ticks, 1) if len(known) > 1 else (0.0, float(ticks[0]))
+    filled = first + step * np.arange(places.shape[1])
+    filled[known] = ticks
+    return np.asarray(filled)
 
 
 def _seen_depth_m(set_up: SetUp, damage: Damage) -> float:

@@ -8,7 +8,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
 from scenes.render.cache import read_view
 from scenes.view import NoiseFreeView
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 RESULTS_VERSION = 1
 """Stands in every result folder; raised when the tables' meaning changes."""
@@ -156,22 +159,34 @@ def _write_report(
 
 def _conclude(folder: Path, tables: Tables, outcome: Outcome) -> None:
     """The final table, the failures, and where to look."""
-    from harness.evaluation.set_ups import compare_set_ups, set_ups_of
-    from harness.evaluation.summary import summarise_holes
-    from harness.report import terminal
-    from harness.report.set_ups_rows import Layout
+    from rich.console import Console
 
-    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
-    several = len(set_ups_of(tables)) > 1
-    if several:
-        compared = compare_set_ups(tables, summary, set_ups_of(tables))
-        layout = Layout.of(tables, compared)
+    table, text = _final_table(tables)
     if sys.stdout.isatty():
-        from rich.console import Console
-
-        Console().print(terminal.set_ups_table(compared, layout) if several else terminal.terminal_table(summary))
+        Console().print(table)
     else:
-        print(terminal.set_ups_text(compared, layout) if several else terminal.terminal_text(summary))
+        print(text)
     if outcome.failures:
         print(f"{len(outcome.failures)} trials failed: {_reasons(outcome)}", file=sys.stderr)
     print(f"report: {folder / 'report.html'}")
+
+
+def _final_table(tables: Tables) -> tuple[Table, str]:
+    """What a terminal shows at the end, and the same as plain text: by the kind of experiment."""
+    from harness.evaluation.maps import compare_maps
+    from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+    from harness.evaluation.summary import summarise_holes
+    from harness.report import terminal
+    from harness.report.perspectives_rows import Ways
+    from harness.report.set_ups_rows import Layout
+
+    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
+    if not tables.registrations.empty:
+        compared = compare_maps(tables, summary)
+        ways = Ways.of(tables, compared)
+        return terminal.maps_table(compared, ways), terminal.maps_text(compared, ways)
+    if len(set_ups_of(tables)) > 1:
+        compared = compare_set_ups(tables, summary, set_ups_of(tables))
+        layout = Layout.of(tables, compared)
+        return terminal.set_ups_table(compared, layout), terminal.set_ups_text(compared, layout)
+    return terminal.terminal_table(summary), terminal.terminal_text(summary)

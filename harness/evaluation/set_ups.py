@@ -21,25 +21,29 @@ def set_ups_of(tables: ResultTables) -> list[str]:
     return [str(name) for name in tables.variants["variant"][~tables.variants["is_variation"].astype(bool)]]
 
 
-def compare_set_ups(tables: ResultTables, summary: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
+def compare_set_ups(
+    tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
+) -> pd.DataFrame:
     """One row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
 
     ``holes``; ``found`` and ``undecided`` (lists of names); ``limit_mm`` and ``half_mm`` with ``half_low_mm``,
-    ``half_high_mm`` (`harness.evaluation.limits`); for each measure ``<measure>_bias_mm``, ``_std_mm``, ``_n`` of all
-    single diameters of found holes against the truth, and ``<measure>_place_*`` likewise of the distances from the
-    largest hole (none where several are the largest); ``threshold``, ``threshold_mm``, ``false_calls``, ``runs``;
-    ``temporal_mm``, ``offset_mm``, ``pattern_mm`` of the averaged z on probe pixels; ``surface_mm``: robust deviation
-    from the fitted surface on undamaged face; and means over hole-free runs of the columns of ``tables.noise``.
+    ``half_high_mm`` (`harness.evaluation.limits`; without ``half_sizes`` left out, which saves a bootstrap); for each
+    measure ``<measure>_bias_mm``, ``_std_mm``, ``_n`` of all single diameters of found holes against the truth, and
+    ``<measure>_place_*`` likewise of the distances from the largest hole (none where several are the largest);
+    ``threshold``, ``threshold_mm``, ``false_calls``, ``runs``; ``temporal_mm``, ``offset_mm``, ``pattern_mm`` of the
+    averaged z on probe pixels; ``surface_mm``: robust deviation from the fitted surface on undamaged face; and means
+    over hole-free runs of the columns of ``tables.noise``, where it has any.
     """
     import pandas as pd
 
     summary = summary[summary["variant"].isin(variants)]
-    rows = [_row(tables, part) for _, part in summary.groupby(["variant", "frames"], sort=False)]
+    rows = [_row(tables, part, half_sizes) for _, part in summary.groupby(["variant", "frames"], sort=False)]
     table = pd.DataFrame(rows)
     if table.empty:
         return table
     table = table.merge(_noise(tables), "left", ["variant", "frames"]).merge(_calls(tables), "left", KEYS)
-    table = table.merge(_boards(tables), "left", KEYS)
+    if len(tables.noise):  # empty for maps, whose pixels are no camera's
+        table = table.merge(_boards(tables), "left", KEYS)
     order = {variant: place for place, variant in enumerate(variants)}
     return table.sort_values(KEYS, key=lambda c: c.map(order) if c.name == "variant" else c, ignore_index=True)
 
@@ -54,11 +58,10 @@ def ladders(tables: ResultTables, variants: list[str]) -> dict[tuple[str, int], 
     return {(str(part["variant"].iloc[0]), int(part["frames"].iloc[0])): ladder_of(part) for _, part in groups}
 
 
-def _row(tables: ResultTables, part: pd.DataFrame) -> dict[str, Any]:
+def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
     """What the holes of one set-up at one number of frames say; ``part``: their summary rows."""
     first = part.iloc[0]
     trials = tables.holes[(tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])]
-    ladder = ladder_of(trials)
     found = list(part["hole"][part["status"] == "found"])
     row: dict[str, Any] = {
         "variant": first["variant"],
@@ -69,10 +72,9 @@ def _row(tables: ResultTables, part: pd.DataFrame) -> dict[str, Any]:
         "found": found,
         "undecided": list(part["hole"][part["status"] == "undecided"]),
         "limit_mm": found_limit_mm(part),
-        "half_mm": ladder.half_mm,
-        "half_low_mm": ladder.half_interval.low,
-        "half_high_mm": ladder.half_interval.high,
     }
+    if half_sizes:
+        row |= _half(ladder_of(trials))
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())
     for measure in MEASURES:
@@ -82,6 +84,11 @@ def _row(tables: ResultTables, part: pd.DataFrame) -> dict[str, Any]:
         place = away[f"{measure}_offset_mm"] - away["true_offset_mm"]
         row |= _spread(f"{measure}", size) | _spread(f"{measure}_place", place)
     return row
+
+
+def _half(ladder: Ladder) -> dict[str, float]:
+    interval = ladder.half_interval
+    return {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
 
 
 def _spread(name: str, errors: pd.Series) -> dict[str, float]:

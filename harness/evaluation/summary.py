@@ -47,11 +47,18 @@ class ResultTables(Protocol):
 
     ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
     ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
-    quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*.
+    quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*; of maps also
+    views_used, views_left_out and seconds_map.
     ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, displacement_std_mm, repeats; in sensor order.
     ``variants``: variant, reason, settings (JSON text), is_variation, reference, switches (JSON text).
-    ``noise``: variant, frames, repeat, valid_share, pitch_u_mm, pitch_v_mm, single_frame_mm, correlation_u1 ... _v3.
-    ``axes``: path, name, unit of what tells set-ups apart; every other table has a column for each path.
+    ``noise``: variant, frames, repeat, valid_share, pitch_u_mm, pitch_v_mm, single_frame_mm, correlation_u1 ... _v3;
+    empty for maps.
+    ``axes``: path, name, unit of what tells set-ups apart; every other table but ``walls`` has a column for each path.
+    ``registrations``: one row for each registration of maps, under the first variant that shares it: variant, frames,
+    repeat, role, view (1 ...; the reference is 0), method, tre_mm, tre_in_plane_mm, tre_across_mm (root mean square
+    over the board), predicted_in_plane_mm, predicted_across_mm (NaN without an estimate), guess_tre_mm, residual_mm,
+    overlap, pairs, marks, iterations, converged, seconds, failure (empty for none). Empty without maps.
+    ``walls``: views, hole, true_diameter_mm, depth_mm and the shares of `harness.evaluation.walls`. Empty without maps.
     """
 
     @property
@@ -66,6 +73,10 @@ class ResultTables(Protocol):
     def noise(self) -> pd.DataFrame: ...
     @property
     def axes(self) -> pd.DataFrame: ...
+    @property
+    def registrations(self) -> pd.DataFrame: ...
+    @property
+    def walls(self) -> pd.DataFrame: ...
 
 
 def by_hole(names: pd.Series) -> pd.Series:

@@ -9,7 +9,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -98,25 +98,37 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     )
 
 
-def write_findings(folder: Path, judged: Judged, about: Mapping[str, Any], title: str) -> tuple[Path, ...]:
+def write_findings(
+    folder: Path,
+    judged: Judged,
+    about: Mapping[str, Any],
+    title: str,
+    cloud_name: str = "cloud.ply",
+    beside: Mapping[str, Callable[[Path], object]] | None = None,
+) -> tuple[Path, ...]:
     """Write all files of a run into ``folder`` (made where it is missing); all of them or none.
 
     ``about``: what the JSON says beside the findings (capture, threshold, settings, provenance): plain data.
+    ``beside``: further files by name, each written by its function to the path that it is given.
     Raises UserError where the folder cannot be written or the disk is full.
     """
     is_new = not folder.exists()
+    further = beside or {}
+    names = (*FILES[:-1], cloud_name, *further)
     try:
         with ExitStack() as stack:
-            part = {name: stack.enter_context(atomic_path(folder / name)) for name in FILES}
+            part = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
             part["findings.csv"].write_text(csv_text(judged.findings), encoding="utf-8")
             part["findings.json"].write_text(json_text(judged, about), encoding="utf-8")
             save_picture(part["annotated.png"], judged.cloud, judged.evidence, judged.detections, title)
-            part["cloud.ply"].write_bytes(ply_bytes(judged.cloud, judged.detections))
+            part[cloud_name].write_bytes(ply_bytes(judged.cloud, judged.detections))
+            for name, write in further.items():
+                write(part[name])
     except BaseException:
         if is_new and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
         raise
-    return tuple(folder / name for name in FILES)
+    return tuple(folder / name for name in names)
 
 
 def csv_text(findings: Sequence[Finding]) -> str:
@@ -141,7 +153,12 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
     rows = []
     for finding, measured in zip(judged.findings, judged.measurements, strict=True):
         rows.append({**asdict(finding), "extent": _extent(measured), "model": _model(measured)})
-    return json.dumps(_without_nan({"findings": rows, **about}), indent=2, allow_nan=False) + "\n"
+    return plain_json({"findings": rows, **about})
+
+
+def plain_json(data: Mapping[str, Any]) -> str:
+    """Plain data and NumPy's numbers as JSON; null where there is no number."""
+    return json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
 
 
 def _extent(measured: Measurement) -> dict[str, Any]:

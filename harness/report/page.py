@@ -25,7 +25,10 @@ from harness.report.example import ExampleCloud
 from harness.report.measures import inches, positions_figure, sizes_figure
 from harness.report.noise import noise_figure
 from harness.report.page_parts import MARKS, call_row, closing, mm, rate_cell, template
+from harness.report.perspectives_page import map_files, map_text, perspectives_html
 from harness.report.set_ups_page import set_ups_html
+from harness.report.view3d import write_view3d
+from harness.report.views_example import MappedExample
 from harness.vocabulary.files import write_text
 
 if TYPE_CHECKING:
@@ -35,20 +38,28 @@ if TYPE_CHECKING:
 def write_report(
     folder: Path,
     tables: ResultTables,
-    examples: Sequence[ExampleCloud],
+    examples: Sequence[ExampleCloud | MappedExample],
     provenance: Mapping[str, Any],
     experiment_yaml_text: str,
     title: str,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path: the page of one set-up, or that of several side by side.
+    """Write ``folder/report.html`` and return its path: the page of one set-up, that of several side by side, or that
+    of maps, with a page beside it for each map of ``examples`` that turns in the browser.
 
     ``provenance`` may hold: ``command``, ``commit``, ``dirty``, ``versions``, ``mitsuba_variant``, ``seed``,
     ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``renders``, ``failures`` (texts, or
     mappings with their parts); whatever else it holds is shown as it is, and a missing one as not recorded. The same
     input gives the same bytes. Raises UserError where the folder cannot be written.
     """
-    several = len(set_ups_of(tables)) > 1
-    page = (set_ups_html if several else report_html)(tables, examples, provenance, experiment_yaml_text, title)
+    rest = provenance, experiment_yaml_text, title
+    clouds = [example for example in examples if isinstance(example, ExampleCloud)]
+    maps = [example for example in examples if isinstance(example, MappedExample)]
+    if len(tables.registrations):
+        page = perspectives_html(tables, maps, *rest)
+    else:
+        page = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, *rest)
+    for name, example in map_files(maps).items():
+        write_view3d(Path(folder) / name, example, map_text(example))
     path = Path(folder) / "report.html"
     write_text(path, page)
     return path

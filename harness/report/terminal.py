@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.evaluation.summary import MAIN
 from harness.report.measures import inches
+from harness.report.perspectives_rows import Ways
 from harness.report.set_ups_rows import Layout, count_text, found_text
 
 if TYPE_CHECKING:
@@ -70,6 +72,52 @@ def set_ups_table(compared: pd.DataFrame, layout: Layout) -> Table:
 def set_ups_text(compared: pd.DataFrame, layout: Layout) -> str:
     """`set_ups_table` as plain lines."""
     return _aligned(_set_up_lines(compared, layout), "<")
+
+
+def maps_table(compared: pd.DataFrame, ways: Ways) -> Table:
+    """Of an experiment with several views: holes found for each way of registering and merging (down) and number of
+    views (across), with the least and the most frames a view.
+
+    ``compared``: of `harness.evaluation.maps.compare_maps`.
+    """
+    from rich.table import Table
+
+    lines = _map_lines(compared, ways)
+    frames = " / ".join(f"N={n}" for n in ways.shown_frames)
+    title = f"holes found{_of_holes(compared)} with {frames} frames a view (+: undecided)"
+    table = Table(title=title, box=None, pad_edge=False, collapse_padding=True)
+    for head in lines[0]:
+        table.add_column(head, no_wrap=True)
+    for line in lines[1:]:
+        table.add_row(*line)
+    return table
+
+
+def maps_text(compared: pd.DataFrame, ways: Ways) -> str:
+    """`maps_table` as plain lines."""
+    return _aligned(_map_lines(compared, ways), "<")
+
+
+def _map_lines(compared: pd.DataFrame, ways: Ways) -> list[list[str]]:
+    cells: list[list[list[str]]] = [
+        [row["cells"] for row in ways.table(compared, n, _map_count)] for n in ways.shown_frames
+    ]
+    heads = ["registration, merge", *(f"{n} view{'s' if n > 1 else ''}" for n in ways.views)]
+    return [heads] + [
+        [name, *(" / ".join(counts) for counts in zip(*(table[place] for table in cells), strict=True))]
+        for place, name in enumerate(ways.rows)
+    ]
+
+
+def _map_count(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return "–"
+    open_ = len(row["undecided"])
+    return f"{len(row['found'])}{f'+{open_}' if open_ else ''}"
+
+
+def _of_holes(compared: pd.DataFrame) -> str:
+    return f" of {int(compared['holes'].max())}" if len(compared) else ""
 
 
 def _set_up_lines(compared: pd.DataFrame, layout: Layout) -> list[list[str]]:

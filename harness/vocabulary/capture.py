@@ -89,6 +89,17 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
+class MapViews:
+    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4): their camera frames to the map's; ``shares``
+    (k,): their weights in it, which sum to 1. ``pixel_m``: along x and y the sides of a rectangle that spreads as far
+    as their pixels do on its surface."""
+
+    T_cloud_cameras: np.ndarray
+    shares: np.ndarray
+    pixel_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Cloud:
     """The average of frames as points in the camera's frame: what a detector sees.
 
@@ -100,7 +111,7 @@ class Cloud:
     A map of several views is a cloud too: its frame is its maker's, with z away from the viewer. ``projection`` says
     how its grid samples space: "central" (rays through the origin, a camera) or "parallel" (equal cells in x and y, a
     map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts included, where its maker
-    states it; a plain average does not.
+    states it; a plain average does not. ``map_views``: of a map, what it was made from, where its maker says.
     """
 
     points_m: np.ndarray
@@ -117,6 +128,7 @@ class Cloud:
     left_out: tuple[LeftOut, ...] = field(default=())
     projection: Literal["central", "parallel"] = "central"
     mean_variance_m2: np.ndarray | None = None
+    map_views: MapViews | None = None
 
     @property
     def valid(self) -> np.ndarray:

@@ -1,0 +1,82 @@
+"""The arguments that concern several views, and what they mean as settings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.inspection.steps import assign, crop_from_text
+from harness.vocabulary.errors import UserError
+
+if TYPE_CHECKING:
+    from detectors.mapping.settings import MappingConfig
+
+METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
+MERGES = ("fusion", "grid", "volume")
+MARKS = ("colour", "red", "coded")
+PREFIX = "mapping."
+"""Of the --set keys that concern the way from views to one cloud; all others are the detector's."""
+
+
+def add_to(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments to the program's own."""
+    add = parser.add_argument_group(
+        "several views of one target",
+        "Each PATH is then one view. --crop cuts the target out of each; the detector judges all that is merged, unless"
+        " --set crop.kind=.. says otherwise. --set mapping.KEY=VALUE sets what the arguments below do not name, such as"
+        " mapping.registration.max_iterations=50, mapping.merge.cell_mm=1 or mapping.marks.dictionary=DICT_4X4_50.",
+    ).add_argument
+    add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
+    add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
+    add(
+        "--marks",
+        choices=MARKS,
+        metavar="KIND",
+        help="the fiducial marks: colour (strips of any colour that stands apart; default), red (the thesis' rule),"
+        " coded (ArUco, AprilTag)",
+    )
+    add(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="where the views are thought to stand: JSON, a list of 4x4 matrices to one common frame in metres, or"
+        " lines of TUM's groundtruth.txt, one a view; only a start for the registration",
+    )
+
+
+def refuse_without_register(arguments: argparse.Namespace) -> None:
+    """Raise UserError where an argument for several views is given to a run of one capture."""
+    given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
+    given += [f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)]
+    if given:
+        raise UserError(
+            f"--{given[0]}: concerns several views, and without --register all PATHs are one capture",
+            legal=f"--register {'|'.join(METHODS)}",
+        )
+
+
+def mapping_config(arguments: argparse.Namespace) -> tuple[MappingConfig, tuple[str, ...]]:
+    """The settings from views to one cloud, and the --set assignments that are the detector's.
+
+    Raises UserError where they are not legal, every problem at once.
+    """
+    from pydantic import ValidationError
+
+    from detectors.mapping.settings import MappingConfig
+
+    data: dict[str, Any] = {
+        "crop": crop_from_text(arguments.crop),
+        "marks": {"kind": arguments.marks or MARKS[0]},
+        "registration": {"method": arguments.register},
+        "merge": {"kind": arguments.merge or MERGES[0]},
+    }
+    for assignment in arguments.set:
+        if assignment.startswith(PREFIX):
+            assign(data, assignment.removeprefix(PREFIX))
+    try:
+        config = MappingConfig.from_data(data)
+    except ValidationError as error:
+        problems = [f"{PREFIX}{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()]
+        raise UserError("settings of the mapping:\n  " + "\n  ".join(problems)) from error
+    return config, tuple(each for each in arguments.set if not each.startswith(PREFIX))

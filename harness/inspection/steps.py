@@ -1,0 +1,144 @@
+"""What the program does with a capture before anything is judged: its arguments become a detector, frames, a cloud."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.vocabulary.errors import UserError
+
+if TYPE_CHECKING:
+    from detectors.interface import Detector
+    from detectors.recordings import Recording
+    from harness.vocabulary.capture import Cloud
+
+DEFAULT_K = 5.0
+"""Robust standard deviations: of a million normal pixels 0.6 lie beyond by chance. Real surfaces are not that kind."""
+LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
+
+
+def detector_of(
+    arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
+) -> tuple[Detector, dict[str, Any]]:
+    """The detector with a crop and settings as --crop and --set state them, and these settings with all defaults."""
+    from detectors import detector_type, load_detector
+
+    settings: dict[str, Any] = {}
+    known = detector_type(arguments.detector).settings_type
+    if "crop" in known.model_fields:
+        settings["crop"] = crop_from_text(crop)
+    for assignment in assignments:
+        assign(settings, assignment)
+    detector = load_detector(arguments.detector, settings)
+    return detector, known.from_data(settings).to_data()
+
+
+def crop_from_text(text: str) -> dict[str, Any]:
+    """The crop's declaration from ``auto``, ``none``, ``box:..`` or ``polygon:..``; UserError on anything else."""
+    kind, _, values = text.partition(":")
+    try:
+        numbers = [float(value) for value in values.split(",")] if values else []
+    except ValueError as error:
+        raise UserError(f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP) from error
+    if kind in ("auto", "none") and not numbers:
+        return {"kind": kind}
+    if kind == "box" and len(numbers) == 6:
+        x, y, z = numbers[0:2], numbers[2:4], numbers[4:6]
+        return {"kind": "box", "x_mm": x, "y_mm": y, "z_mm": z, "range_max_m": None}
+    if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
+        return {"kind": "polygon", "vertices_px": [numbers[i : i + 2] for i in range(0, len(numbers), 2)]}
+    raise UserError(f"--crop {text}: no such crop", legal=LEGAL_CROP)
+
+
+def assign(settings: dict[str, Any], assignment: str) -> None:
+    """Put one KEY=VALUE into nested settings; the value is JSON where it can be, else text. UserError without one."""
+    import json
+
+    path, equals, text = assignment.partition("=")
+    if not (path and equals):
+        raise UserError(f"--set {assignment}: no value", legal="KEY=VALUE, for instance surface.degree=5")
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = text
+    *folders, leaf = path.split(".")
+    for folder in folders:
+        settings = settings.setdefault(folder, {})
+        if not isinstance(settings, dict):
+            raise UserError(f"--set {assignment}: {folder} is a value, not a group")
+    settings[leaf] = value
+
+
+def opened(arguments: argparse.Namespace, paths: list[Path]) -> Recording:
+    """The capture; --intrinsics may name a camera, whose nominal lens then counts."""
+    from detectors.recordings import open_capture
+
+    lens, file = None, None
+    if arguments.intrinsics is not None:
+        from scenes.sensor.camera import camera_names, load_camera
+
+        file = Path(arguments.intrinsics)
+        if arguments.intrinsics in camera_names():
+            lens, file = load_camera(arguments.intrinsics).nominal_lens, None
+        elif not file.exists():
+            legal = f"a file, or one of the cameras {', '.join(camera_names())}"
+            raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
+    first = slice(arguments.max_frames) if arguments.max_frames else None
+    return open_capture(paths, unit=arguments.unit, intrinsics=file, lens=lens, frames=first, topic=arguments.topic)
+
+
+def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
+    """The capture's average as --average says."""
+    from detectors.average import AverageConfig, average
+
+    return average(recording, AverageConfig(method=arguments.average))
+
+
+def threshold_of(
+    arguments: argparse.Namespace, detector: Detector, quiet: Callable[[], tuple[float, str]]
+) -> tuple[float, str]:
+    """The threshold and its origin: given, calibrated on a quiet capture (``quiet`` does it), the detector's own, or
+    the default."""
+    if arguments.threshold is not None and arguments.quiet_capture is not None:
+        raise UserError("--threshold and --quiet-capture both set the threshold", fix="give one of them")
+    if arguments.threshold is not None:
+        if not 0 < arguments.threshold < float("inf"):
+            raise UserError(f"--threshold {arguments.threshold:g}", legal="a number above 0")
+        return arguments.threshold, "given"
+    if arguments.quiet_capture is not None:
+        return quiet()
+    own = getattr(detector, "default_threshold", None)
+    if own is not None:
+        return float(own), "the detector's own"
+    return DEFAULT_K, "default, not calibrated: without an undamaged capture the rate of false calls is unknown"
+
+
+def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Command, code, versions, and the content of every file that can change a number."""
+    import hashlib
+
+    from harness.vocabulary.provenance import record
+
+    files = []
+    for path in (path for recording in recordings for path in recording.files):
+        with path.open("rb") as stream:
+            files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
+    return {**record("python -m harness.detect " + shlex.join(sys.argv[1:])), "files": files}
+
+
+def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
+    """What the JSON says of a capture."""
+    import dataclasses
+
+    return {
+        "name": recording.name,
+        "frames_used": cloud.n_frames,
+        "frames_left_out": [dataclasses.asdict(left) for left in cloud.left_out],
+        "lens": dataclasses.asdict(cloud.lens) if cloud.lens else None,
+        "rounding_step_mm": 1e3 * cloud.z_step_m,
+        "notes": recording.notes,
+    }

@@ -1,0 +1,182 @@
+"""The claims on several views: borne out, refuted and undecided where the tables are made so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_perspectives import MapWorld, name_of, perspectives, with_variation
+
+from harness.evaluation.claim_maps import rms_gap
+from harness.evaluation.claim_views import VIEW_CLAIMS, verdicts_of
+from harness.evaluation.map_case import LARGE_MM
+from harness.evaluation.summary import summarise_holes
+
+
+def verdict(claim, found):
+    summary = summarise_holes(found.holes, list(found.axes["path"]))
+    verdicts = {one.claim: one for one in verdicts_of(found, summary)}
+    assert list(verdicts) == list(VIEW_CLAIMS)
+    return verdicts[claim]
+
+
+def worlds(world, **settings):
+    chosen = {"counts": (1, 2), "methods": ("icp", "cpd"), "merges": ("grid",), "frames": (1, 50)} | settings
+    return perspectives(world, **chosen)
+
+
+def registered(icp, cpd, **others):
+    return MapWorld(tre_mm={"icp": icp, "cpd": cpd}, surface_mm=lambda *which: 0.2, **others)
+
+
+@pytest.mark.parametrize(
+    ("world", "expected"),
+    [
+        (registered((1.5, 0.1), (0.4, 0.1)), "borne out"),
+        (registered((0.4, 0.1), (1.5, 0.1)), "not borne out"),  # ICP is the better within the plane
+        (registered((1.5, 0.5), (0.4, 0.1)), "not borne out"),  # ICP leaves the marks out of the plane
+        (registered((0.5, 0.1), (0.5, 0.1), spread=0.5), "undecided"),
+        (registered((1.5, 0.2), (0.4, 0.1), spread=0.5), "undecided"),  # ICP's error across is about the noise
+        (registered((1.5, 0.1), (0.4, 0.1), failing={"cpd": 0.75}), "not borne out"),
+    ],
+)
+def test_c7(world, expected):
+    answer = verdict("C7", worlds(world))
+    assert answer.verdict == expected
+    assert "With 50 frames a view" in answer.evidence
+
+
+def test_c7_needs_both_methods():
+    answer = verdict("C7", worlds(MapWorld(), methods=("cpd", "marks")))
+    assert answer.verdict == "undecided"
+    assert "not both tried" in answer.evidence
+
+
+def sized(large, small, threshold, first=4):
+    """|size error| of two views: that of one view, 1 mm, changed by so much for large and for small holes."""
+
+    def bias(diameter, views, method, merge):
+        return 1.0 + (views == 2) * (large if diameter >= LARGE_MM - 1e-9 else small)
+
+    return MapWorld(
+        size_bias_mm=bias,
+        size_std_mm=0.1,
+        threshold=lambda views, merge: 5.0 + threshold * (views - 1),
+        surface_mm=lambda *which: 0.2,
+        first=lambda views, method, merge, frames: first if views > 1 else 4,
+    )
+
+
+@pytest.mark.parametrize(
+    ("world", "expected"),
+    [
+        (sized(-0.5, 0.5, 1.0), "borne out"),
+        (sized(-0.5, 0.5, -1.0), "not borne out"),  # the threshold falls
+        (sized(0.5, 0.5, 1.0), "not borne out"),
+        (sized(-0.5, -0.5, 1.0), "not borne out"),
+        (sized(0.0, 0.5, 1.0), "undecided"),
+        (sized(-0.5, 0.5, 1.0, first=6), "borne out"),  # two views miss both smaller holes that one view finds
+    ],
+)
+def test_c8(world, expected):
+    assert verdict("C8", worlds(world)).verdict == expected
+
+
+def test_c8_tells_the_crossing_and_what_is_lost():
+    answer = verdict("C8", worlds(sized(-0.5, 0.5, 1.0, first=5)))
+    # from +0.5 at 7.94 mm to -0.5 at 9.53 mm
+    assert "It turns at 8.7 mm" in answer.evidence
+    assert "Found by one view only: 4." in answer.evidence
+
+
+def slam(noise_mm, size_mm, place_mm, first=6):
+    found = worlds(MapWorld(surface_mm=lambda *which: 0.2))
+    world = MapWorld(
+        surface_mm=lambda *which: noise_mm,
+        size_bias_mm=lambda *which: 0.0,
+        size_std_mm=size_mm,
+        place_std_mm=place_mm,
+        first=lambda *which: first,
+    )
+    return with_variation(found, world, "hand-held", (24, "odometry", "volume"), (1,), of=name_of(2, "cpd", "grid"))
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (slam(1.0, 2.0, 5.0), "borne out"),
+        (slam(0.1, 2.0, 5.0), "not borne out"),  # less noise
+        (slam(1.0, 0.01, 5.0), "not borne out"),  # better sizes
+        (slam(1.0, 2.0, 0.01), "not borne out"),  # better places
+        (slam(1.0, 2.0, 0.6), "undecided"),
+        (slam(1.0, 2.0, 5.0, first=12), "borne out"),  # it finds no hole at all
+    ],
+)
+def test_c10(found, expected):
+    assert verdict("C10", found).verdict == expected
+
+
+def test_c10_without_a_slam_map_is_not_judged():
+    answer = verdict("C10", worlds(MapWorld()))
+    assert answer.verdict == "undecided"
+    assert "no SLAM map" in answer.evidence
+
+
+def mapped(noise, size, first=4, exposures=None):
+    """Nine fused views against one: factor of noise, change of |size error|, smallest hole; and of one view of nine
+    times the frames its noise."""
+
+    def many(views, merge):
+        return views == 9 and merge == "fusion"
+
+    world = MapWorld(
+        surface_mm=lambda views, method, merge, frames: 0.2 * (noise if many(views, merge) else 1.0),
+        size_bias_mm=lambda d, views, method, merge: 1.0 + (size if many(views, merge) else 0.0),
+        size_std_mm=0.1,
+        first=lambda views, method, merge, frames: first if many(views, merge) else 4,
+    )
+    found = worlds(world, counts=(1, 9), methods=("marks",), merges=("grid", "fusion"), frames=(50,))
+    if exposures is None:
+        return found
+    rival = MapWorld(surface_mm=lambda *which: exposures, size_bias_mm=lambda *which: 1.0 + size, size_std_mm=0.1)
+    return with_variation(found, rival, "as many exposures", (1, "marks", "grid"), (450,))
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (mapped(0.3, -0.5), "borne out"),
+        (mapped(0.3, -0.5, exposures=0.15), "borne out"),
+        (mapped(0.3, -0.5, exposures=0.03), "not borne out"),  # the long exposure has less noise
+        (mapped(0.3, 0.5), "not borne out"),
+        (mapped(1.5, -0.5), "not borne out"),
+        (mapped(0.3, -0.5, first=5), "not borne out"),  # a hole fewer
+        (mapped(1.0, 0.0), "undecided"),
+    ],
+)
+def test_h1(found, expected):
+    assert verdict("H1", found).verdict == expected
+
+
+def test_h1_says_against_what_it_was_held():
+    answer = verdict("H1", mapped(0.3, -0.5, first=3))
+    assert "No single view has as many exposures" in answer.evidence
+    assert "holes ahead, size ahead, noise ahead. Found 9 of 11 against 8 of 11" in answer.evidence
+    assert "of 50 frames against one of 450 frames" in verdict("H1", mapped(0.3, -0.5, exposures=0.1)).evidence
+
+
+def test_equal_exposures_are_found_within_the_table_too():
+    # five views of 10 frames against one of 50
+    world = MapWorld(surface_mm=lambda views, method, merge, frames: 0.2 / views)
+    found = worlds(world, counts=(1, 5), methods=("marks",), merges=("grid", "fusion"), frames=(10, 50))
+    assert "5 views (marks, fusion) of 10 frames against one of 50 frames" in verdict("H1", found).evidence
+
+
+def test_a_gap_of_root_mean_squares_covers_the_truth():
+    rng = np.random.default_rng(2)
+    inside = 0
+    for _ in range(100):
+        gap = rms_gap(rng.normal(0, 2.0, (40, 3)), rng.normal(0, 1.0, (40, 3)))
+        inside += gap.low <= 1.0 <= gap.high
+    # 95 expected of 100; fewer than 86 have a chance of 1e-4 at nominal coverage
+    assert inside >= 86
+    assert not rms_gap(np.zeros((1, 2)), np.ones((5, 2))).known

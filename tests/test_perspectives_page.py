@@ -1,0 +1,174 @@
+"""The page of several views and its table for a terminal: complete, self-contained, honest about what is missing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_perspectives import MapWorld, map_example, name_of, perspectives, with_variation
+from synthetic_tables import provenance
+
+from harness.evaluation.maps import compare_maps
+from harness.evaluation.summary import summarise_holes
+from harness.report.page import write_report
+from harness.report.perspectives_page import map_files, perspectives_html
+from harness.report.perspectives_rows import Ways
+from harness.report.terminal import maps_table, maps_text
+
+YAML = "name: perspectives # <few> & many\n"
+METHODS = ("icp", "cpd", "marks")
+
+
+@pytest.fixture(scope="module")
+def found():
+    world = MapWorld(
+        first=lambda views, method, merge, frames: 4 + (frames == 1) - (views == 9 and merge == "fusion"),
+        size_bias_mm=lambda d, views, method, merge: 1.0 + (0.0 if views == 1 else 0.4 if d < 9 else -0.4),
+        failing={"icp": 0.25},
+    )
+    tables = perspectives(world, (1, 50), (1, 2, 9), METHODS, ("grid", "fusion"))
+    slam = MapWorld(surface_mm=lambda *which: 1.0, first=lambda *which: 7)
+    return with_variation(
+        tables, slam, "SLAM along a hand-held path", (24, "odometry", "volume"), (1,), of=name_of(2, "cpd", "grid")
+    )
+
+
+@pytest.fixture(scope="module")
+def small():
+    return perspectives(MapWorld(), (50,), (1, 2), ("cpd",), ("grid", "fusion"))
+
+
+def examples():
+    return [map_example(2), map_example(9, "fusion", registration="marks")]
+
+
+@pytest.fixture(scope="module")
+def page(found):
+    return perspectives_html(found, examples(), provenance(), YAML, "Several perspectives")
+
+
+def headings(page: str) -> list[str]:
+    return re.findall(r"<h2>(.*?)</h2>", page)
+
+
+def text_of(page: str) -> str:
+    return re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+
+
+def test_every_section_is_there_and_nothing_comes_from_outside(page):
+    assert headings(page) == [
+        "The thesis' claims and its proposal",
+        "Holes found",
+        "Fiducials before and after",
+        "Registration error",
+        "Merged clouds",
+        "One view and two",
+        "Shadow in the holes",
+        "Noise of the map",
+        "Thresholds and false calls",
+        "If facts were otherwise",
+        "Time of a map",
+        "Failures",
+        "Cost",
+        "Provenance",
+    ]
+    for name in ("found", "fiducials", "tre", "merged", "two_views", "shadow", "map_noise"):
+        assert f'<figure id="{name}">' in page
+    assert "No data for this figure" not in page
+    assert "<script" not in page
+    assert not re.findall(r'(?:src|href)="(?:https?:)?//(?!www\.w3\.org)', page)
+    assert "&lt;few&gt; &amp; many" in page
+    assert "None" not in text_of(page)
+    assert ">nan" not in page
+
+
+def test_the_answer_counts_holes_and_says_every_verdict(page):
+    answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
+    assert (
+        "With 50 frames a view one view finds 8 of 11 holes, 2 views (CPD, grid) 8, 9 views (marks, fusion) 9."
+        in answer
+    )
+    assert re.search(r"C7 is [a-z ]+, C8 is [a-z ]+, C10 is [a-z ]+, H1 is ", answer)
+
+
+def test_the_same_input_gives_the_same_bytes(small):
+    first, second = (perspectives_html(small, [map_example(2)], provenance(), YAML, "T") for _ in range(2))
+    assert first == second
+
+
+def test_failed_registrations_are_shown_with_their_reason(page):
+    # a quarter of 12 repeats, two boards, eight views
+    assert "48 (19–32 %)" in page
+    assert "icp, 50 frames a view: the residual is too large (48)" in page
+
+
+def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
+    row = page[page.index("SLAM along a hand-held path</th>") :]
+    row = text_of(row[: row.index("</tbody>")])
+    assert "24 views × 1 frame<" in row
+    assert "2 views × 1 frame<" in row
+    assert "≠ 5 of 11<br>7–11" in row
+    assert "in the plane" in row
+
+
+def test_without_pictures_and_walls_the_page_says_so(small):
+    bare = perspectives_html(replace(small, walls=pd.DataFrame()), [], provenance(), YAML, "T")
+    assert text_of(bare).count("No data for this figure were kept") == 3
+    for name in ("fiducials", "merged", "shadow"):
+        assert f'<figure id="{name}">' not in bare
+
+
+def test_nothing_finished_is_said(found):
+    empty = replace(found, **{name: getattr(found, name).iloc[:0] for name in ("holes", "runs", "probes")})
+    page = perspectives_html(empty, [], provenance(), YAML, "T")
+    assert "No trial of any set-up finished" in page
+    assert page.count("undecided</span>") == 4
+
+
+def test_a_missing_set_up_leaves_a_dash(small):
+    gone = name_of(2, "cpd", "fusion")
+    names = ("holes", "runs", "probes")
+    part = replace(small, **{name: getattr(small, name)[getattr(small, name)["variant"] != gone] for name in names})
+    page = perspectives_html(part, [], provenance(), YAML, "T")
+    assert "not finished" in page
+    assert ">nan" not in page
+
+
+def test_the_report_has_a_page_for_each_map_that_turns(small, tmp_path):
+    path = write_report(tmp_path, small, [*examples(), map_example(2)], provenance(), YAML, "T")
+    files = sorted(file.name for file in tmp_path.iterdir())
+    assert files == [
+        "map-2-views-cpd-grid-50-frames-2.html",
+        "map-2-views-cpd-grid-50-frames.html",
+        "map-9-views-marks-fusion-50-frames.html",
+        "report.html",
+    ]
+    links = re.findall(r'<a href="([^"]+)"', path.read_text())
+    assert sorted(links) == files[:3]
+    assert sorted(map_files([*examples(), map_example(2)])) == files[:3]
+
+
+def test_the_terminal_shows_counts_of_both_numbers_of_frames(found):
+    summary = summarise_holes(found.holes, list(found.axes["path"]))
+    compared = compare_maps(found, summary)
+    ways = Ways.of(found, compared)
+    lines = maps_text(compared, ways).splitlines()
+    assert len(lines) == 1 + 6
+    assert re.match(r"registration, merge +1 view +2 views +9 views$", lines[0])
+    assert re.match(r"marks, fusion +7 / 8 +7 / 8 +8 / 9$", lines[-1])
+    assert "of 11 with N=1 / N=50 frames a view" in str(maps_table(compared, ways).title)
+    half = found.holes["hole"].eq("4") & found.holes["repeat"].lt(6)
+    unsure = replace(found, holes=found.holes.assign(detected=found.holes["detected"] & ~half))
+    again = compare_maps(unsure, summarise_holes(unsure.holes, list(found.axes["path"])))
+    assert re.match(r"icp, grid +7 / 7\+1 +7 / 7\+1 +7 / 7\+1$", maps_text(again, ways).splitlines()[1])
+
+
+def test_a_guess_that_was_never_known_gives_no_picture_of_fiducials(small):
+    example = map_example(2)
+    placed = [replace(view, T_board_view={"truth": np.eye(4)}) for view in example.placed]
+    page = perspectives_html(small, [replace(example, placed=tuple(placed))], provenance(), YAML, "T")
+    assert '<figure id="fiducials">' not in page
+    assert '<figure id="merged">' in page

@@ -1,0 +1,301 @@
+"""ROS 2 bags as captures: every layout of a cloud gives the same frame, and every fault is told once."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+from pathlib import Path
+from typing import Any
+
+import bag_of_a_plane as bags
+import numpy as np
+import pytest
+import recorded_plane as plane
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import CompressionMode
+
+from detectors.average import AverageConfig, average
+from detectors.recordings import bag_files, open_capture
+from detectors.recordings.point_messages import frame_from_message
+from harness.vocabulary.capture import Reason
+from harness.vocabulary.errors import UserError
+
+POINTS = plane.points_m(plane.depth_mm())
+VALID = np.isfinite(POINTS[..., 2])
+
+
+def refusal(path: Path, **options: Any) -> str:
+    """The message of opening and reading a capture to its end."""
+    with pytest.raises(UserError) as caught:
+        list(open_capture([path], **options).frames())
+    return str(caught.value)
+
+
+# ---- a message -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    number=st.sampled_from(["f4", "f8"]),
+    big=st.booleans(),
+    lead=st.integers(0, 9),
+    row_padding=st.integers(0, 40),
+    organised=st.booleans(),
+    coloured=st.booleans(),
+    packed_as=st.sampled_from(["f4", "u4"]),
+)
+def test_every_layout_of_one_cloud_is_one_frame(
+    number: str, big: bool, lead: int, row_padding: int, organised: bool, coloured: bool, packed_as: str
+) -> None:
+    rgb = np.stack([np.full(VALID.shape, c, np.uint8) for c in (200, 7, 129)], axis=-1)
+    message = bags.cloud(
+        POINTS,
+        number=number,
+        big=big,
+        lead=lead,
+        row_padding=row_padding,
+        organised=organised,
+        rgb=rgb if coloured else None,
+        packed_as=packed_as,
+    )
+    frame = frame_from_message("m", message, 1.0)
+    shape = VALID.shape if organised else (1, VALID.size)
+    assert frame.z_m.dtype == np.float32 and frame.xy_m is not None
+    np.testing.assert_array_equal(frame.z_m, POINTS[..., 2].astype(np.float32).reshape(shape))
+    np.testing.assert_array_equal(frame.xy_m, POINTS[..., :2].astype(number).reshape(*shape, 2))
+    np.testing.assert_array_equal(frame.reason, np.where(VALID, Reason.VALID, Reason.NO_RETURN).reshape(shape))
+    if coloured:
+        np.testing.assert_array_equal(frame.rgb, rgb.reshape(*shape, 3))
+    else:
+        assert frame.rgb is None
+
+
+def test_whole_millimetres_are_read_in_their_unit() -> None:
+    stored = np.rint(1e3 * np.nan_to_num(POINTS)).astype(int)
+    frame = frame_from_message("m", bags.cloud(stored, number="i2"), 1e-3)
+    np.testing.assert_array_equal(frame.z_m, np.where(VALID, POINTS[..., 2], np.nan).astype(np.float32))
+    assert frame.reason[plane.NO_RETURN] == Reason.NO_RETURN
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    (
+        ({"leave_out": "z"}, "has no field z; its fields: x (type 7, count 1), y"),
+        ({"cut": 1}, "is truncated"),
+        ({"cut": 10_000, "row_padding": 8}, "is truncated"),
+    ),
+)
+def test_a_broken_cloud_is_refused(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(UserError, match="the cloud: ") as caught:
+        frame_from_message("the cloud", bags.cloud(POINTS, **options), 1.0)
+    assert told in str(caught.value)
+
+
+def test_layouts_that_contradict_themselves_are_refused() -> None:
+    def told(**changes: Any) -> str:
+        message = bags.cloud(POINTS)
+        for key, value in changes.items():
+            setattr(message, key, value)
+        with pytest.raises(UserError) as caught:
+            frame_from_message("m", message, 1.0)
+        return str(caught.value)
+
+    message = bags.cloud(POINTS)
+    assert "cannot hold 96 points" in told(row_step=100)
+    assert "holds no points (0 x 72)" in told(width=0)
+    assert "ends at byte 12 of points of 8 bytes" in told(point_step=8)
+    assert "x (type 9" in told(fields=[type(f)(f.name, f.offset, 9, 1) for f in message.fields])
+    assert "count 3" in told(fields=[type(f)(f.name, f.offset, 7, 3) for f in message.fields])
+
+
+# ---- a bag -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mcap", (False, True))
+def test_a_bag_is_read_as_its_folder_and_as_its_file(tmp_path: Path, mcap: bool) -> None:
+    messages = [("/depth/camera_info", bags.INFO, bags.info()), *bags.clouds(3), ("/other", bags.IMAGE, bags.image())]
+    folder = bags.write_bag(tmp_path / "bag", messages, mcap=mcap)
+    for path in (folder, folder / f"bag.{'mcap' if mcap else 'db3'}"):
+        recording = open_capture([path])
+        assert recording.lens == plane.LENS and recording.z_step_m == 1e-3 and recording.notes == ()
+        frames = list(recording.frames())
+        assert len(frames) == 3
+        for i, frame in enumerate(frames):
+            stored = plane.depth_mm(i, noise_mm=0.6)
+            np.testing.assert_array_equal(np.nan_to_num(frame.z_m), (stored * 1e-3).astype(np.float32))
+            np.testing.assert_array_equal(frame.rgb, plane.rgb(i))
+        assert frames[2].name == f"{path.name} /points2 message 2"
+
+
+def test_the_digest_covers_the_messages_and_the_metadata(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    assert [path.name for path in open_capture([folder]).files] == ["bag.db3", "metadata.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("mcap", "compression"),
+    ((True, CompressionMode.STORAGE), (False, CompressionMode.MESSAGE), (True, CompressionMode.MESSAGE)),
+)
+def test_compressed_chunks_and_messages_are_unpacked(tmp_path: Path, mcap: bool, compression: CompressionMode) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(2), mcap=mcap, compression=compression)
+    stored = [np.nan_to_num(frame.z_m) for frame in open_capture([folder]).frames()]
+    for i in range(2):
+        np.testing.assert_array_equal(stored[i], (plane.depth_mm(i, noise_mm=0.6) * 1e-3).astype(np.float32))
+
+
+def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> None:
+    points = bags.clouds(2)
+    beside = [("/a", bags.INFO, bags.info(shift_px=0.02)), ("/b", bags.INFO, bags.info(width=97))]
+    apart = open_capture([bags.write_bag(tmp_path / "apart", [*beside, *points])])
+    assert apart.lens is None and "no CameraInfo in the bag fits" in apart.notes[0]
+    assert apart.first_frame().xy_m is not None
+    right = [*beside, ("/c", bags.INFO, bags.info(shift_px=0.005))]
+    assert open_capture([bags.write_bag(tmp_path / "right", [*right, *points])]).lens is not None
+    # both ways give the same points, to what float32 leaves of x and y
+    exact = open_capture([bags.write_bag(tmp_path / "exact", [("/c", bags.INFO, bags.info()), *points])])
+    by_lens, by_points = (average(source, AverageConfig()).points_m for source in (exact, apart))
+    np.testing.assert_allclose(by_lens, by_points, atol=3e-8)
+
+
+def test_a_named_lens_must_be_that_of_the_points(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    assert open_capture([folder], lens=plane.LENS).lens == plane.LENS
+    assert "they lie up to" in refusal(folder, lens=type(plane.LENS)(96, 72, 140.0, 141.0, 47.0, 36.0))
+    assert "but the lens is of 10 x 10" in refusal(folder, lens=type(plane.LENS)(10, 10, 15.0, 15.0, 5.0, 5.0))
+
+
+def test_single_points_stay_single_points(tmp_path: Path) -> None:
+    flat = bags.cloud(POINTS, organised=False)
+    messages = [("/c", bags.INFO, bags.info()), ("/points2", bags.CLOUD, flat)]
+    recording = open_capture([bags.write_bag(tmp_path / "bag", messages)])
+    assert not recording.organised and recording.lens is None and "single points" in recording.notes[0]
+
+
+def test_the_usual_topic_the_only_one_or_the_named_one(tmp_path: Path) -> None:
+    two = bags.write_bag(tmp_path / "two", [*bags.clouds(1, "/near"), *bags.clouds(2, "/far")])
+    assert "2 topics hold clouds" in refusal(two) and "legal: /far, /near" in refusal(two)
+    assert len(list(open_capture([two], topic="far").frames())) == 2
+    assert len(list(open_capture([two], topic="/near").frames())) == 1
+    usual = bags.write_bag(tmp_path / "usual", [*bags.clouds(1, "/near"), *bags.clouds(3, "points2")])
+    assert len(list(open_capture([usual]).frames())) == 3
+    only = bags.write_bag(tmp_path / "only", bags.clouds(1, "/only"))
+    assert len(list(open_capture([only]).frames())) == 1
+
+
+# ---- what it refuses -------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
+    none = bags.write_bag(tmp_path / "none", [("/picture", bags.IMAGE, bags.image())])
+    assert "no topic with sensor_msgs/msg/PointCloud2; its topics: /picture (sensor_msgs/msg/Image)" in refusal(none)
+    some = bags.write_bag(tmp_path / "some", [("/picture", bags.IMAGE, bags.image()), *bags.clouds(1)])
+    assert "no topic points; its topics: /picture" in refusal(some, topic="points")
+    assert "/picture holds sensor_msgs/msg/Image" in refusal(some, topic="picture")
+    np.save(tmp_path / "d.npy", plane.depth_mm())
+    assert "is no ROS 2 bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
+
+
+def test_a_bag_of_ros_1_is_told_how_to_be_converted(tmp_path: Path) -> None:
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert "rosbags-convert" in refusal(tmp_path / "old.bag")
+
+
+@pytest.mark.parametrize("mcap", (False, True))
+def test_an_empty_bag_is_refused(tmp_path: Path, mcap: bool) -> None:
+    folder = bags.write_bag(tmp_path / "bag", [], mcap=mcap)
+    assert "no topic with sensor_msgs/msg/PointCloud2; its topics: none" in refusal(folder)
+
+
+def test_a_topic_without_messages_is_refused(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    with sqlite3.connect(folder / "bag.db3") as database:
+        database.execute("DELETE FROM messages")
+    assert "no message on /points2" in refusal(folder)
+
+
+def test_a_recording_that_was_not_closed_has_no_metadata(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    (folder / "metadata.yaml").unlink()
+    assert "has no metadata.yaml" in refusal(folder) and "bag.db3" in refusal(folder)
+    assert open_capture([folder / "bag.db3"]).first_frame().z_m.shape == VALID.shape
+
+
+@pytest.mark.parametrize("text", ("rosbag2_bagfile_information: [", "rosbag2_bagfile_information: 3", "\xff"))
+def test_metadata_that_says_nothing_is_refused(tmp_path: Path, text: str) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    (folder / "metadata.yaml").write_bytes(text.encode("latin1"))
+    assert "metadata.yaml: is no description of a ROS 2 bag" in refusal(folder)
+
+
+def test_metadata_may_not_name_what_is_not_there(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
+    (folder / "bag.db3").rename(folder / "other.db3")
+    assert "names bag.db3, which is not there" in refusal(folder)
+
+
+def test_files_that_are_compressed_whole_are_told_how_to_be_unpacked(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1), compression=CompressionMode.FILE)
+    assert "zstd -d" in refusal(folder)
+
+
+@pytest.mark.parametrize("part", (0.0, 0.001, 0.3, 0.9, 0.999))
+@pytest.mark.parametrize("mcap", (False, True))
+def test_a_truncated_file_is_named(tmp_path: Path, mcap: bool, part: float) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(3), mcap=mcap)
+    file = folder / f"bag.{'mcap' if mcap else 'db3'}"
+    content = file.read_bytes()
+    file.write_bytes(content[: int(part * len(content))])
+    for path in (folder, file):
+        message = refusal(path)
+        assert file.name in message and "is truncated or damaged" in message
+
+
+@settings(max_examples=25, deadline=None)
+@given(place=st.floats(0, 1), byte=st.integers(1, 255), mcap=st.booleans())
+def test_a_changed_byte_is_read_or_told(
+    tmp_path_factory: pytest.TempPathFactory, place: float, byte: int, mcap: bool
+) -> None:
+    folder = bags.write_bag(tmp_path_factory.mktemp("bags") / "bag", bags.clouds(1), mcap=mcap)
+    file = folder / f"bag.{'mcap' if mcap else 'db3'}"
+    content = bytearray(file.read_bytes())
+    content[int(place * (len(content) - 1))] ^= byte
+    file.write_bytes(content)
+    try:
+        frames = list(open_capture([file]).frames())
+    except UserError as mistake:
+        assert str(mistake)
+    else:
+        assert len(frames) == 1
+    shutil.rmtree(folder)
+
+
+def test_a_chunk_may_not_unpack_to_more_than_it_says(tmp_path: Path) -> None:
+    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1), mcap=True, compression=CompressionMode.STORAGE)
+    file = folder / "bag.mcap"
+    content = bytearray(file.read_bytes())
+    start = next(at for at in _records(content) if content[at] == bag_files.MCAP_CHUNK)
+    (promised,) = struct.unpack_from("<Q", content, start + 9 + 16)
+    struct.pack_into("<Q", content, start + 9 + 16, promised - 1)
+    file.write_bytes(content)
+    assert f"unpacks to more than the {promised - 1} bytes" in refusal(file)
+    struct.pack_into("<Q", content, start + 9 + 16, bag_files.MAX_CHUNK_BYTES + 1)
+    file.write_bytes(content)
+    assert "up to 1024 MiB" in refusal(file)
+
+
+def test_a_message_may_not_be_larger_than_a_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_files, "MAX_MESSAGE_BYTES", 2**17)
+    for mode in (CompressionMode.NONE, CompressionMode.MESSAGE):
+        folder = bags.write_bag(tmp_path / mode.name, bags.clouds(1), compression=mode)
+        assert "has more than 0 MiB" in refusal(folder)
+
+
+def _records(content: bytearray) -> list[int]:
+    """Where the records of an MCAP begin."""
+    at, found = len(bag_files.MCAP_MAGIC), []
+    while at < len(content) - len(bag_files.MCAP_MAGIC):
+        found.append(at)
+        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
+    return found
