@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.hole_model import HoleFit, Patch, Sight, blurred_disc, fit_hole
+from detectors.hole_image import Patch, Sight, blurred_disc
+from detectors.hole_model import HoleFit, fit_hole
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Region, rotate_vectors
 from harness.vocabulary.units import MM
 
 NOWHERE = np.full(3, np.nan)
@@ -51,6 +52,23 @@ class HoleModelConfig(Config):
         if blur_px % 2 == 0:
             raise ValueError("blur_px must be odd (1, 3, 5 ...): the filter has a centre pixel")
         return blur_px
+
+
+def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
+    """Sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or cells.
+
+    A map adds the linear interpolation of its views' pixels, whose variance is a sixth of a pixel squared, to the
+    square's twelfth: as a square of side sqrt(blur^2 + 2) pixels. Cells of more than a pixel take a mean of their own.
+    """
+    if cloud.map_views is None or not cloud.organised:
+        return float(config.blur_px), float(config.blur_px)
+    across, down = (np.diff(cloud.points_m[..., k], axis=1 - k) for k in (0, 1))
+    cells = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 for steps in (across, down)]
+    pixels = [pitch / cell for pitch, cell in zip(cloud.map_views.pixel_m, cells, strict=True)]
+    along_u, along_v = (
+        math.sqrt((config.blur_px**2 + 2.0) * pixel**2 + (1.0 if round(1.0 / pixel) > 1 else 0.0)) for pixel in pixels
+    )
+    return along_u, along_v
 
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
@@ -125,27 +143,28 @@ class _Surroundings:
     ) -> _Surroundings | None:
         """Twice the blur of margin on each side; None where the surface around cannot be placed."""
         h, w = cloud.valid.shape
+        sides = blur_in_cells(cloud, config)
+        blur = max(sides)
         tight = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
-        corner = tight.grown(2 * config.blur_px + 2, h, w)
+        corner = tight.grown(math.ceil(2 * blur) + 2, h, w)
         cut = corner.within(Region(0, h, 0, w))
         residual = evidence.residual_m[cut]
         own = np.zeros(residual.shape, dtype=bool)
         own[rows - corner.row0, columns - corner.col0] = True
         finite = np.isfinite(residual)
-        ring = finite & ~_grown(own, config.blur_px // 2 + 1)
+        ring = finite & ~_grown(own, int(blur / 2) + 1)
         if ring.sum() < 12:
             return None
         offset, noise = _level(residual[ring])
-        plane = _local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own)
+        plane = _local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own, cloud.projection)
         if plane is None:
             return None
-        used = finite & ~_other_damage(residual - offset, own, noise, config.blur_px)
+        used = finite & ~_other_damage(residual - offset, own, noise, blur)
         deviations = residual[own] - offset
         sign = 1.0 if deviations.sum() >= 0 else -1.0
         peak = max(float(np.quantile(sign * deviations, 0.9)), 1e-9)
         metric = plane[1] @ plane[1].T
-        sight = Sight.of(*plane, np.array(config.emitter_mm) * MM)
-        patch = Patch(residual, used, metric, config.blur_px, noise, sight)
+        patch = Patch(residual, used, metric, sides, noise, _sight(cloud, *plane, np.array(config.emitter_mm) * MM))
         invalid = ~cloud.valid[cut]
         v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
         return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])
@@ -180,36 +199,56 @@ def _level(values: np.ndarray) -> tuple[float, float]:
 
 
 def _local_plane(
-    points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray
+    points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression.
 
-    Directions x/z and y/z and the surface's z are each linear in the pixel over a patch; then the product rule.
+    Directions x/z and y/z and the surface's z are each linear in the pixel over a patch; then the product rule. In a
+    parallel projection x and y themselves are.
     """
     v, u = np.nonzero(finite)
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     design = np.column_stack([np.ones(len(u)), u - u0, v - v0])
     p = points[finite]
-    targets = np.column_stack([p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], surface_z[finite]])
+    across = p[:, :2] if projection == "parallel" else p[:, :2] / p[:, 2:]
+    targets = np.column_stack([across, surface_z[finite]])
     try:
         beta = np.linalg.solve(design.T @ design, design.T @ targets)
     except np.linalg.LinAlgError:
         return None
-    slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
-    per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
+    if projection == "parallel":
+        centre, per_px = beta[0], beta[1:]
+    else:
+        slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
+        centre = slopes * z
+        per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
     if not np.linalg.norm(np.cross(per_px[0], per_px[1])) > 1e-12:
         return None
-    return slopes * z, per_px
+    return centre, per_px
 
 
-def _other_damage(deviation: np.ndarray, own: np.ndarray, noise: float, blur_px: int) -> np.ndarray:
+def _sight(cloud: Cloud, centre: np.ndarray, per_px: np.ndarray, emitter_camera_m: np.ndarray) -> Sight:
+    """From where the surface's point (3,) is seen: the camera, or all those that a map was made from."""
+    if cloud.projection == "central":
+        return Sight.of(centre, per_px, emitter_camera_m)
+    if cloud.map_views is None:
+        return Sight.straight(per_px)
+    views = cloud.map_views
+    places = [
+        replace(Sight.of(centre - T[:3, 3], per_px, rotate_vectors(T, emitter_camera_m)), share=float(share))
+        for T, share in zip(views.T_cloud_cameras, views.shares, strict=True)
+    ]
+    return replace(places[0], others=tuple(places[1:]))
+
+
+def _other_damage(deviation: np.ndarray, own: np.ndarray, noise: float, blur_px: float) -> np.ndarray:
     """Pixels that stand out without touching the detection, with the blur around them."""
     stands_out = (np.abs(np.nan_to_num(deviation)) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
     count, labels = cv2.connectedComponents(stands_out.astype(np.uint8), connectivity=8)
     touching = np.zeros(count, dtype=bool)
     touching[labels[own]] = True
     others = stands_out & ~touching[labels]
-    return _grown(others, blur_px // 2) & ~own if others.any() else others
+    return _grown(others, int(blur_px / 2)) & ~own if others.any() else others
 
 
 # ---------------------------------------------------------------- the model, and what to do without it
@@ -225,7 +264,7 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
         return None, too_deep
     fit = fit_hole(around.patch, *_start(around))
     h, w = around.own.shape
-    reach = np.pad(_grown(around.own, config.blur_px // 2 + 1), 1)
+    reach = np.pad(_grown(around.own, int(max(around.patch.blur_px) / 2) + 1), 1)
     at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
     if not (fit.converged and reach[at[0], at[1]]):
         return None, "the model of a blurred hole does not fit"
@@ -244,7 +283,7 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
 
 def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
     """(u, v, radius, depth, offset): centroid of the deviation, peak depth, and the radius that gives the volume."""
-    near = _grown(around.own, around.patch.blur_px // 2) & around.patch.used
+    near = _grown(around.own, int(max(around.patch.blur_px) / 2)) & around.patch.used
     deviation = np.where(near, around.sign * (around.patch.residual_m - around.offset_m), 0.0)
     weights = np.maximum(deviation, 0.0)
     v, u = np.nonzero(near)
@@ -314,5 +353,5 @@ def _reached(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 def _volume(around: _Surroundings) -> float:
     """Sum of the deviation times the pixel's area across the axis, over the detection and the blur around it."""
-    near = _grown(around.own, around.patch.blur_px // 2 + 1) & around.patch.used
+    near = _grown(around.own, int(max(around.patch.blur_px) / 2) + 1) & around.patch.used
     return float((around.patch.residual_m[near] - around.offset_m).sum()) * around.facing_area_m2

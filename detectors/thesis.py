@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, measure_detection
+from detectors.rounding import rounding_left_m2
 from detectors.segment import euclidean_clusters
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.capture import Cloud
@@ -34,13 +35,17 @@ class ThesisConfig(Config):
     """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
 
     ``scale``: the standard deviation that one unit of score means: ``mad`` (median |residual| / 0.6745),
-    ``residual_std`` or ``raw_z_std``. ``min_points``: clusters with fewer points are no detections.
+    ``residual_std`` or ``raw_z_std``. ``use_variance``: where the cloud's maker states each point's variance, as a map
+    does, one unit of score is a multiple of each point's own deviation, and the scale is taken of residuals over
+    deviations (``raw_z_std`` knows no residual and leaves the variances alone). ``min_points``: clusters with fewer
+    points are no detections.
     """
 
     variant: Literal["text", "script"] = "text"
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
     scale: Literal["mad", "residual_std", "raw_z_std"] = "mad"
+    use_variance: bool = True
     min_points: int = Field(default=1, ge=1)
     cluster_distance_mm: float = Field(default=10.0, gt=0)
     hole_model: HoleModelConfig = Field(default_factory=HoleModelConfig)
@@ -82,23 +87,33 @@ class ThesisDetector:
         fitted = surface.evaluate(x, y)
         residual = z - fitted
         floor = rounding_floor(cloud, mask)
-        spread = _spread(residual, z, self.settings.scale)
-        scale = max(spread, floor)
+        deviation = self._stated_deviation(cloud, mask)
+        spread = _spread(residual / deviation, z, self.settings.scale)
+        scale = np.maximum(spread * deviation, floor)
         notes = {
             "surface": surface.note,
             "surface_iterations": surface.iterations,
             "surface_converged": surface.converged,
             "points": len(z),
-            "spread_m": spread,
+            "spread_m": spread * float(np.median(deviation)),
             "floor_m": floor,
         }
         return Evidence(
             score=_spread_out(np.abs(residual) / scale, mask),
             residual_m=_spread_out(residual, mask),
             surface_z_m=_spread_out(fitted, mask),
-            scale_m=scale,
+            scale_m=float(np.median(scale)),
             notes=notes,
         )
+
+    def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray:
+        """(n,) standard deviation that the cloud states of each point, metres; ones where it states none or none is
+        wanted."""
+        wanted = self.settings.use_variance and self.settings.scale != "raw_z_std"
+        if cloud.mean_variance_m2 is None or not wanted:
+            return np.ones(int(mask.sum()))
+        deviation: np.ndarray = np.sqrt(cloud.mean_variance_m2[mask])
+        return deviation
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Clusters of pixels whose score is above the threshold, strongest first."""
@@ -144,12 +159,11 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
     """The standard deviation that the rounding of z leaves in the average, metres: the least credible scale.
 
     Rounding to a step q errs by q / sqrt(12). Noise of deviation s before the rounding (a dither) turns part of that
-    into noise, which averages out, and leaves a fixed pattern with the variance
-    b^2 = (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2 (q^2 / 12 at s = 0, next to nothing from s = q / 2).
-    So after n frames the rounding's variance is b^2 + (q^2 / 12 - b^2) / n. s^2 is the frames' median variance less
-    q^2 / 12; on a surface so quiet that most pixels never change it is 0 and the floor stays q / sqrt(12), 0.29 mm
-    for 1 mm; likewise where the averaged z still lies on the steps, as a median does. Without a step, z is taken to
-    have been stored as float32.
+    into noise, which averages out, and leaves a fixed pattern with the variance b^2 (`rounding_left_m2`). So after n
+    frames the rounding's variance is b^2 + (q^2 / 12 - b^2) / n. s^2 is the frames' median variance less q^2 / 12; on a
+    surface so quiet that most pixels never change it is 0 and the floor stays q / sqrt(12), 0.29 mm for 1 mm; likewise
+    where the averaged z still lies on the steps, as a median does. Without a step, z is taken to have been stored as
+    float32.
     """
     z = cloud.points_m[..., 2][mask]
     step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
@@ -159,9 +173,7 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
     variances = cloud.variance_m2[mask]
     variances = variances[np.isfinite(variances)]
     dither = max(float(np.median(variances)) - whole, 0.0) if len(variances) else 0.0
-    k = np.arange(1, 200)
-    fixed = (step / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither / step**2) / k**2).sum())
-    fixed = min(fixed, whole)
+    fixed = rounding_left_m2(step, dither)
     return float(np.sqrt(fixed + (whole - fixed) / max(cloud.n_frames, 1)))
 
 

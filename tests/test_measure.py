@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from detectors.hole_model import Patch, Sight, blurred_disc, blurred_hole, derivatives
+from detectors.hole_image import Patch, Sight, blurred_disc, blurred_hole, derivatives
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, extents, measure_detection
 from harness.vocabulary.capture import Cloud
@@ -156,7 +156,7 @@ def patch_of(board: Board) -> tuple[Patch, np.ndarray]:
     per_px *= 2
     used = np.ones((HEIGHT, WIDTH), dtype=bool)
     sight = Sight.of(board.centre, per_px, board.emitter)
-    patch = Patch(board.image, used, per_px @ per_px.T, board.blur, 1e-4, sight)
+    patch = Patch(board.image, used, per_px @ per_px.T, (board.blur, board.blur), 1e-4, sight)
     return patch, np.array([u, v, board.radius, board.depth_m, 0.6])
 
 

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from detectors.mapping.settings import AnyMerge
+from detectors.mapping.chosen_views import ChosenView, choose
+from detectors.mapping.fusion import fuse
+from detectors.mapping.grid_merge import merge_on_grid
+from detectors.mapping.settings import AnyMerge, FusedMerge, GridMerge
+from detectors.mapping.surface_map import SurfaceMap
+from detectors.mapping.volume import integrate
 from detectors.registration.registered import Registration
 from detectors.views import PreparedView
 from harness.vocabulary.capture import Cloud
+from harness.vocabulary.units import MM
 
 
 @dataclass(frozen=True)
 class Merged:
     """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame, the
-    identity where it is that frame. ``views_used``: names of those that went in. ``seconds``: of merging."""
+    identity where it is that frame. ``views_used``: names of those that went in. ``seconds``: of merging.
+    ``surface_map``: what a fused map knows beside its cloud; None of the others."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray
     views_used: tuple[str, ...]
     seconds: float
     notes: tuple[str, ...] = ()
+    surface_map: SurfaceMap | None = None
 
 
 def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge) -> Merged:
@@ -30,4 +39,21 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
 
     Raises UserError where nothing is left to merge.
     """
-    raise NotImplementedError
+    began = time.perf_counter()
+    chosen, left_out = choose(views, registrations)
+    surface_map: SurfaceMap | None = None
+    T_reference_cloud, notes = np.eye(4), tuple[str, ...]()
+    if isinstance(config, GridMerge):
+        cloud = merge_on_grid(chosen, config.step_mm * MM)
+    elif isinstance(config, FusedMerge):
+        surface_map, notes = fuse(chosen, None if config.cell_mm is None else config.cell_mm * MM)
+        cloud, T_reference_cloud = _cloud(chosen, surface_map), surface_map.T_reference_map
+    else:
+        cloud, notes = integrate(chosen, None if config.voxel_mm is None else config.voxel_mm * MM)
+    used = tuple(view.prepared.view.name for view in chosen)
+    return Merged(cloud, T_reference_cloud, used, time.perf_counter() - began, left_out + notes, surface_map)
+
+
+def _cloud(views: Sequence[ChosenView], surface_map: SurfaceMap) -> Cloud:
+    clouds = [view.cloud for view in views]
+    return surface_map.cloud(sum(c.n_frames for c in clouds), tuple(left for c in clouds for left in c.left_out))
