@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import exit_code_of
+
+if TYPE_CHECKING:
+    from harness.vocabulary.capture import Cloud
 
 
 def main() -> int:
@@ -39,8 +43,33 @@ def _prepare() -> int:
         evidence = detector.analyse(cloud)
         for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
             detector.measure(cloud, evidence, detection)
+    _prepare_maps(cloud)
     print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def _prepare_maps(cloud: Cloud) -> None:
+    """The loops of registering and of merging, with one small view standing for two."""
+    import numpy as np
+
+    from detectors import load_detector
+    from detectors.mapping.merge import merge
+    from detectors.mapping.settings import FusedMerge, GridMerge
+    from detectors.marks.mark import MarkSet
+    from detectors.registration.register import register
+    from detectors.registration.settings import CpdRegistration, NominalRegistration
+    from detectors.views import PreparedView, View
+
+    nothing = MarkSet((), np.zeros(0, np.int64))
+    views = [PreparedView(View(name, cloud, np.eye(4)), cloud.valid, nothing) for name in ("first", "second")]
+    register(views, CpdRegistration(points="target", max_iterations=2))
+    registrations = register(views, NominalRegistration())
+    merge(views, registrations, GridMerge())
+    fused = merge(views, registrations, FusedMerge()).cloud
+    detector = load_detector("thesis", {"crop": {"kind": "none"}})
+    evidence = detector.analyse(fused)
+    for detection in detector.find(fused, evidence, detector.quiet_threshold(fused, evidence) / 2):
+        detector.measure(fused, evidence, detection)
 
 
 if __name__ == "__main__":

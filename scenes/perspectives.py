@@ -39,6 +39,9 @@ class _Spread(_Guess):
     distance_jitter_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(
         0.0, description="standard deviation of each view's distance; the first keeps its own"
     )
+    aim_jitter_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(
+        0.0, description="standard deviation of where each view looks, sideways and upwards; the first keeps its own"
+    )
 
 
 class ArcViews(_Spread):
@@ -94,7 +97,7 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
     else:
         turns = [(x * half, y * half) for x, y in _grid(views.count)]
     return tuple(
-        _moved(pose, turn_x, turn_y, 0.0, 0.0, 0.0, _jitter_mm(views, number))
+        _moved(pose, turn_x, turn_y, 0.0, *_jitter_mm(views, number))
         for number, (turn_x, turn_y) in enumerate(turns)
     )
 
@@ -150,10 +153,13 @@ def _grid(count_: int) -> list[tuple[float, float]]:
     raise AssertionError("endless")
 
 
-def _jitter_mm(views: ArcViews | GridViews, number: int) -> float:
-    if number == 0 or views.distance_jitter_mm == 0:
-        return 0.0
-    return float(random_stream(views.seed, "distance jitter", number).standard_normal()) * views.distance_jitter_mm
+def _jitter_mm(views: ArcViews | GridViews, number: int) -> tuple[float, float, float]:
+    """Shifts along the camera's x, y and z; none for the first view."""
+    if number == 0:
+        return 0.0, 0.0, 0.0
+    distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
+    aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
+    return aside * views.aim_jitter_mm, up * views.aim_jitter_mm, distance * views.distance_jitter_mm
 
 
 @lru_cache(maxsize=16)

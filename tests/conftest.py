@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from detectors.recordings.pointclouds import MissingLibrary
+from detectors.open3d_library import MissingLibrary
 from scenes.render.variant import load_mitsuba
 
 

@@ -50,7 +50,7 @@ def test_a_grid_of_nine_views_is_three_by_three_with_corners_first():
 def test_fewer_views_are_the_first_of_more(kind, count, more):
     kind_of = {"arc": ArcViews, "grid": GridViews}[kind]
     few, many = (
-        poses_of(kind_of(kind=kind, count=n, spread_deg=30.0, distance_jitter_mm=20.0), POSE)
+        poses_of(kind_of(kind=kind, count=n, spread_deg=30.0, distance_jitter_mm=20.0, aim_jitter_mm=9.0), POSE)
         for n in (count, count + more)
     )
     assert many[:count] == few

@@ -18,6 +18,7 @@ import numpy as np
 
 from detectors.mapping.chosen_views import ChosenView
 from detectors.mapping.raster import Grid, raster_between
+from detectors.open3d_library import open3d_on_one_thread
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, invert
@@ -84,8 +85,13 @@ def _pitch(view: ChosenView) -> float:
 def _crossings(
     views: Sequence[ChosenView], images: Sequence[_Pinhole], voxel: float
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    import open3d as o3d
+    with open3d_on_one_thread() as o3d:
+        return _integrated(o3d, views, images, voxel)
 
+
+def _integrated(
+    o3d: Any, views: Sequence[ChosenView], images: Sequence[_Pinhole], voxel: float
+) -> tuple[np.ndarray, np.ndarray | None]:
     core = o3d.core
     coloured = all(image.rgb is not None for image in images)
     names, channels = ["tsdf", "weight"], [[1], [1]]
@@ -94,7 +100,7 @@ def _crossings(
     kinds = [core.float32] * len(names)
     field = o3d.t.geometry.VoxelBlockGrid(names, kinds, channels, voxel, BLOCK, BLOCKS_AT_FIRST)
     for view, image in zip(views, images, strict=True):
-        _add(field, image, invert(view.registration.T_reference_view), coloured)
+        _add(o3d, field, image, invert(view.registration.T_reference_view), coloured)
     try:
         found = field.extract_point_cloud(0.5)
     except RuntimeError as error:
@@ -107,9 +113,7 @@ def _crossings(
     return points, found.point.colors.numpy() if coloured else None
 
 
-def _add(field: Any, image: _Pinhole, T_view_reference: np.ndarray, coloured: bool) -> None:
-    import open3d as o3d
-
+def _add(o3d: Any, field: Any, image: _Pinhole, T_view_reference: np.ndarray, coloured: bool) -> None:
     depth = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(image.z_m[..., None])))
     matrix, pose = o3d.core.Tensor(image.matrix), o3d.core.Tensor(T_view_reference)
     farthest = float(image.z_m.max()) * 2.0

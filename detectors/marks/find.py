@@ -78,6 +78,9 @@ def _standing_out(cloud: Cloud, inside: np.ndarray, feature: Feature) -> tuple[M
     contrast[inside], margin[inside] = apart.contrast, apart.margin
     coloured = above_half(margin > 1.0, contrast) if cloud.organised else margin > 1.0
     found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
+    # a hole through which another colour shows is no fiducial
+    own = np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in found.marks)]))
+    found = replace(found, points=own)
     pixels = [mark.pixels for mark in found.trusted]
     return found, float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
 

@@ -11,10 +11,10 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from detectors.open3d_library import load_open3d
 from detectors.recordings.distances import UNITS_M, frame_from_points, rounding_step_m
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
@@ -70,7 +70,7 @@ def open_clouds(paths: Sequence[Path], scale_m: float | None, name: str) -> Reco
 
 def read_cloud(path: Path, scale_m: float) -> Frame:
     """One cloud as a frame (h, w), or (1, n) without a grid. Raises UserError on a broken file."""
-    o3d = _open3d()
+    o3d = load_open3d()
     header = cloud_header(path)
     # Open3D's complaints go to the terminal; what they say is checked here and told once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -93,30 +93,6 @@ def read_cloud(path: Path, scale_m: float) -> Frame:
         rgb=_bytes(colours).reshape(*grid, 3) if colours is not None else None,
         amplitude=amplitude.reshape(grid).astype(np.float32) if amplitude is not None else None,
     )
-
-
-DEBIAN_PACKAGES = {"libGL": "libgl1", "libgomp": "libgomp1", "libX11": "libx11-6", "libudev": "libudev1"}
-"""Where Debian keeps the system libraries that Open3D's wheel expects."""
-
-
-class MissingLibrary(UserError):
-    """Open3D is installed, but the system lacks a library that it needs."""
-
-
-def _open3d() -> Any:
-    """The module open3d. Raises MissingLibrary that names the Debian package where a system library is missing."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        package = next((package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None)
-        if package is None:
-            raise
-        raise MissingLibrary(
-            f"PLY and PCD files are read by Open3D, which cannot start: {error}",
-            legal=f"a system with the libraries of the Debian packages {', '.join(DEBIAN_PACKAGES.values())}",
-            fix=f"apt install {package}, or give depth images, .npy, .npz or .mat instead",
-        ) from error
-    return open3d
 
 
 def cloud_header(path: Path) -> CloudHeader:

@@ -14,9 +14,9 @@ import numpy as np
 
 from detectors.average import CORRELATED_PIXELS
 from detectors.marks.placing import kabsch
+from detectors.open3d_library import open3d_on_one_thread
 from detectors.registration.covariance import clustered_sandwich
 from detectors.registration.failure import moved_m, still_moving, too_few_points
-from detectors.registration.one_thread import open3d_on_one_thread
 from detectors.registration.points import NO_GUESS, cloud_of, guess_of, unplaced
 from detectors.registration.registered import Registration, displacement_jacobian
 from detectors.registration.sampling import local_normals, sampling_of, thinned

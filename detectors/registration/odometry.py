@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from detectors.open3d_library import open3d_on_one_thread
 from detectors.registration.failure import MIN_OVERLAP
-from detectors.registration.one_thread import open3d_on_one_thread
 from detectors.registration.points import unplaced
 from detectors.registration.registered import Registration
 from detectors.views import PreparedView

@@ -57,11 +57,13 @@ def map_examples_of(group: Group, thresholds: Mapping[str, float]) -> list[Mappe
 
 
 def _chosen(points: Sequence[Point], views: int) -> list[Point]:
-    most = max((point.config.capture.frames for point in points), default=0)
+    counted = [(_mapping(point).views or views, point) for point in points]
+    several = [(count, point) for count, point in counted if count > 1]
+    most = max((point.config.capture.frames for _, point in several), default=0)
     last: dict[tuple[int, str], Point] = {}
-    for point in points:
-        count = _mapping(point).views or views
-        if point.config.capture.frames == most and count > 1:
+    for count, point in several:
+        # of what is not the experiment itself there is a picture where nothing else is in the group
+        if point.config.capture.frames == most and (not point.is_variation or points[0].is_variation):
             last[count, _mapping(point).merge.kind] = point
     counts = {count for count, _ in last}
     return [point for (count, _), point in last.items() if count in (min(counts), max(counts))]

@@ -1,0 +1,47 @@
+"""Open3D where it is needed: files of points, ICP, odometry, volumes. Importing it takes seconds, so nothing else does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from harness.vocabulary.errors import UserError
+
+DEBIAN_PACKAGES = {"libGL": "libgl1", "libgomp": "libgomp1", "libX11": "libx11-6", "libudev": "libudev1"}
+"""Where Debian keeps the system libraries that Open3D's wheel expects."""
+
+
+class MissingLibrary(UserError):
+    """Open3D is installed, but the system lacks a library that it needs."""
+
+
+def load_open3d() -> Any:
+    """The module open3d. Raises MissingLibrary that names the Debian package where a system library is missing."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        package = next((package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None)
+        if package is None:
+            raise
+        raise MissingLibrary(
+            f"this needs Open3D, which cannot start: {error}",
+            legal=f"a system with the libraries of the Debian packages {', '.join(DEBIAN_PACKAGES.values())}",
+            fix=f"apt install {package}",
+        ) from error
+    return open3d
+
+
+@contextmanager
+def open3d_on_one_thread() -> Iterator[Any]:
+    """The module open3d, silent and on one OpenMP thread within the block: sums in one order, hence the same bits
+    whatever the number of cores. Raises MissingLibrary where it cannot start.
+
+    On pictures of a target's size a second thread gains nothing, and loses tenfold where cores are shared.
+    """
+    import threadpoolctl
+
+    o3d = load_open3d()
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    with threadpoolctl.threadpool_limits(1, user_api="openmp"), quiet:
+        yield o3d
