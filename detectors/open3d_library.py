@@ -1,4 +1,4 @@
-"""Open3D where it is needed: files of points, ICP, odometry, volumes. Importing it takes seconds, so nothing else does."""
+"""Open3D where it is needed: files of points, ICP, odometry, volumes. Importing it takes seconds: nothing else does."""
 
 from __future__ import annotations
 
