@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluation.claim_maps import equal_frames
+from harness.evaluation.claim_maps import equal_exposures, equal_frames
 from harness.evaluation.claim_rules import Verdict
 from harness.evaluation.claim_views import score_views
 from harness.evaluation.map_case import (
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_CLOUDS = 5
+RESPECTS = {"holes": "holes found", "size": "their size", "noise": "noise"}
+"""In what H1's map may be ahead."""
 LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That stays open"}
 """The first words of the answer, by the verdict on H1."""
 
@@ -101,7 +103,15 @@ def answer_sentence(cases: Sequence[MapCase], verdicts: Sequence[Verdict]) -> st
         return "No trial of any set-up finished, so there is no answer."
     answers = ", ".join(f"{verdict.claim} is {verdict.verdict}" for verdict in verdicts)
     leads = [LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1"]
-    return f"Do more views beat one? {' / '.join(dict.fromkeys(leads))}. {' '.join(said)} {answers}."
+    ahead = _ahead(cases) if leads == [LEADS["borne out"]] else ""
+    return f"Do more views beat one? {' / '.join(dict.fromkeys(leads))}{ahead}. {' '.join(said)} {answers}."
+
+
+def _ahead(cases: Sequence[MapCase]) -> str:
+    """In what the fused map is ahead of its rivals everywhere, such as ", in size and noise"."""
+    duels = [duel for case in cases for duel in (equal_frames(case), equal_exposures(case)) if duel is not None]
+    everywhere = [name for name in RESPECTS if all(duel.standings[name] == "ahead" for duel in duels)]
+    return f", in {' and '.join(RESPECTS[name] for name in everywhere)}" if everywhere else ""
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
