@@ -26,8 +26,11 @@ finer colour camera needs as many *depth* pixels: 2.4 times as many for the Azur
 WIDEST_SLOPE = 5.7
 """tan(80 degrees): no camera sees so far off its axis; a cloud that does was not recorded from its origin."""
 CELL_SPACINGS = 1.5
-"""Side of a cell over the distance between neighbours: above sqrt 2, so that no cell of a cloud that was an image stays
-empty, however its rows lie; of random points one cell in five does, which joins the rest all the same."""
+"""Least side of a cell over the distance between neighbours: above sqrt 2, so that no cell of a cloud that was an image
+stays empty, however its rows lie."""
+CELL_GROWTH, CELLS_FILLED = 1.25, 0.99
+"""Cells grow by this factor until so many of them, away from rims, hold a point. Where the pixel grids of several views
+lie over one another, their points gather in bands, and lines of empty cells between these would part a target."""
 MAX_RASTER = 4096
 """Cells along one side of the raster that stands in for a missing pixel grid."""
 
@@ -85,7 +88,7 @@ class AutoCrop(_Crop):
     Without a pixel grid: the same on a raster of x/z, y/z (of x, y where the cloud cannot have been recorded from its
     origin) that holds the nearest point of each cell; all points of a kept cell are kept. ``smooth_px`` counts
     distances between neighbours, ``inset_px`` is the least number of them that is taken off, and the image's edge,
-    which such a cloud does not tell, is a rim.
+    which such a cloud does not tell, is a rim. Several views laid over one another have closer neighbours than one.
     """
 
     kind: Literal["auto"] = "auto"
@@ -259,26 +262,29 @@ def _largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -
 def _largest_on_raster(cloud: Cloud, config: AutoCrop) -> np.ndarray:
     """As `_largest_surface`; a hole's floor, an island without a grid, lies inside the outline as it does on one."""
     mask = cloud.valid.copy()
-    raster, rows, columns = _raster(cloud.points_m[mask], cloud)
-    coarse = config.model_copy(update={"smooth_px": max(3, 2 * round(config.smooth_px / CELL_SPACINGS / 2) - 1)})
+    raster, rows, columns, spacings = _raster(cloud.points_m[mask], cloud)
+    coarse = config.model_copy(update={"smooth_px": max(3, 2 * round(config.smooth_px / spacings / 2) - 1)})
     kept = _largest_surface(raster, coarse)
     if config.inset_px:
         # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
-        kept = _inset(kept, math.ceil((config.inset_px - 1) / CELL_SPACINGS) + 1)
+        kept = _inset(kept, math.ceil((config.inset_px - 1) / spacings) + 1)
     mask[mask] = kept[rows, columns]
     return mask
 
 
-def _raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray]:
-    """A grid that holds the nearest of points (n, 3) in each cell, with an empty border; each point's row and column.
+def _raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
+    """A grid that holds the nearest of points (n, 3) in each cell, with an empty border; each point's row and column;
+    and the side of a cell in distances between neighbours.
 
     Seen from the camera, what shows through a hole lies inside its mouth, and what shows past the rim outside of it,
     however oblique the view.
     """
     plan = _plan(points)
-    low, high = plan.min(axis=0), plan.max(axis=0)
-    side = max(CELL_SPACINGS * _spacing(plan), float((high - low).max()) / MAX_RASTER, 1e-9)
-    columns, rows = (np.floor((plan - low) / side).astype(int) + 1).T
+    spacing = max(_spacing(plan), 1e-9)
+    side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
+    while _filled(plan, side) < CELLS_FILLED:
+        side *= CELL_GROWTH
+    columns, rows = (_cells(plan, side) + 1).T
     shape = (int(rows.max()) + 2, int(columns.max()) + 2)
     image = np.full((*shape, 3), np.nan)
     # of repeated indices numpy keeps the last
@@ -286,7 +292,26 @@ def _raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.nda
     image[rows[far_first], columns[far_first]] = points[far_first]
     none, zeros = np.full(shape, np.nan), np.zeros(shape, dtype=np.uint8)
     region = Region(0, shape[0], 0, shape[1])
-    return Cloud(image, zeros, zeros.astype(int), none, region, cloud.z_step_m, cloud.n_frames), rows, columns
+    raster = Cloud(image, zeros, zeros.astype(int), none, region, cloud.z_step_m, cloud.n_frames)
+    return raster, rows, columns, side / spacing
+
+
+def _cells(plan: np.ndarray, side: float) -> np.ndarray:
+    """(n, 2) column and row of each of places (n, 2)."""
+    cells: np.ndarray = np.floor((plan - plan.min(axis=0)) / side).astype(int)
+    return cells
+
+
+def _filled(plan: np.ndarray, side: float) -> float:
+    """Share of the cells that hold a place, of those in blocks of 2 x 2 that do, as do all eight blocks around them: a
+    gap wider than a block is no lack of points. 1 where there are no such blocks."""
+    columns, rows = _cells(plan, side).T
+    held = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
+    held[rows, columns] = True
+    in_block = held.reshape(held.shape[0] // 2, 2, held.shape[1] // 2, 2).sum(axis=(1, 3))
+    kernel = np.ones((3, 3), np.uint8)
+    inner = cv2.erode((in_block > 0).astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return float(in_block[inner].mean()) / 4.0 if inner.any() else 1.0
 
 
 def _plan(points: np.ndarray) -> np.ndarray:

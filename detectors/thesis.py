@@ -66,7 +66,7 @@ class ThesisDetector:
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 2
+    version = 3
 
     def __init__(self, settings: ThesisConfig) -> None:
         self.settings = settings

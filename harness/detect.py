@@ -41,7 +41,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="folder or list of depth .png, .ply, .pcd; .npy .npz .mat .mkv; a ROS 2 bag (folder, .mcap, .db3)",
     )
-    add("--out", type=Path, metavar="DIR", help="write findings.csv, findings.json, annotated.png and cloud.ply here")
+    add(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write findings.csv, findings.json, annotated.png and cloud.ply here; of several views merged.ply,"
+        " registrations.json and view3d.html (turns in the browser) too",
+    )
     add(
         "--unit",
         help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: the format's usual one",
@@ -107,20 +113,21 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
 
     detector, settings = steps.detector_of(arguments, arguments.crop, arguments.set)
     recording = steps.opened(arguments, arguments.paths)
+    wants_quiet = arguments.quiet_capture is not None and arguments.threshold is None
+    quiet = steps.opened(arguments, [arguments.quiet_capture]) if wants_quiet else None
     if arguments.frames_report:
         printed.print_frames(recording)
     cloud = steps.averaged(arguments, recording)
     evidence = detector.analyse(cloud)
-    threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_threshold(arguments, detector, cloud))
+    threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
     detections = detector.find(cloud, evidence, threshold)
     judged = Judged(cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections))
     printed.print_capture(recording, cloud, evidence, arguments.crop)
-    beyond = printed.mm(threshold * evidence.scale_m)
-    print(f"threshold: {threshold:.4g} x {printed.mm(evidence.scale_m)} = {beyond} ({origin})")
+    print(printed.threshold_text(threshold, evidence, origin))
     printed.print_findings(judged.findings)
     if arguments.out is not None:
-        about = _about(arguments, recording, judged, detector, settings, threshold, origin)
-        title = f"{recording.name}: {len(detections)} findings beyond {beyond}"
+        about = _about(arguments, recording, quiet, judged, detector, settings, threshold, origin)
+        title = f"{recording.name}: {len(detections)} findings beyond {printed.beyond_text(threshold, evidence)}"
         for path in write_findings(arguments.out, judged, about, title):
             print(f"wrote {path}")
     return 0
@@ -129,8 +136,12 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
 # ---- one capture -----------------------------------------------------------------------------------------------------
 
 
-def _quiet_threshold(arguments: argparse.Namespace, detector: Detector, cloud: Cloud) -> tuple[float, str]:
-    quiet = steps.averaged(arguments, steps.opened(arguments, [arguments.quiet_capture]))
+def _quiet_on(
+    recording: Recording | None, arguments: argparse.Namespace, detector: Detector, cloud: Cloud
+) -> tuple[float, str]:
+    """The threshold that is silent on a capture of an undamaged target, and what to say of it."""
+    assert recording is not None
+    quiet = steps.averaged(arguments, recording)
     threshold = detector.quiet_threshold(quiet, detector.analyse(quiet))
     frames = f"{quiet.n_frames} frames, here {cloud.n_frames}"
     return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
@@ -139,6 +150,7 @@ def _quiet_threshold(arguments: argparse.Namespace, detector: Detector, cloud: C
 def _about(
     arguments: argparse.Namespace,
     recording: Recording,
+    quiet: Recording | None,
     judged: Judged,
     detector: Detector,
     settings: dict[str, Any],
@@ -156,7 +168,7 @@ def _about(
             "unit": arguments.unit,
             "detector": {"name": detector.name, "version": detector.version, "settings": settings},
         },
-        "provenance": steps.provenance([recording]),
+        "provenance": steps.provenance([recording] if quiet is None else [recording, quiet]),
     }
 
 

@@ -46,7 +46,7 @@ class _Spread(_Guess):
 
 class ArcViews(_Spread):
     """Views on an arc about the target's centre. The first is the target's own pose, then come the ends, then the
-    middles of what is left: fewer views are always the first of more."""
+    middles of what is left, nearer ones first: fewer views are always the first of more."""
 
     kind: Literal["arc"]
     about: Literal["x", "y"] = Field("y", description="board axis about which the arc turns")
@@ -97,8 +97,7 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
     else:
         turns = [(x * half, y * half) for x, y in _grid(views.count)]
     return tuple(
-        _moved(pose, turn_x, turn_y, 0.0, *_jitter_mm(views, number))
-        for number, (turn_x, turn_y) in enumerate(turns)
+        _moved(pose, turn_x, turn_y, 0.0, *_jitter_mm(views, number)) for number, (turn_x, turn_y) in enumerate(turns)
     )
 
 
@@ -131,7 +130,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def _shares(count_: int) -> list[float]:
-    """0, 1, -1, 1/2, -1/2, 3/4, -3/4, 1/4 ...: of half the spread, odd multiples of ever smaller powers of two."""
+    """0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ...: of half the spread, odd multiples of ever smaller powers of two."""
     shares = [0.0, 1.0, -1.0]
     for level in count(1):
         if len(shares) >= count_:

@@ -200,6 +200,23 @@ def test_points_in_no_order_at_all_still_make_a_surface() -> None:
     assert mask[400:].mean() > 0.99 and not mask[:400].any()
 
 
+def test_the_pixel_grids_of_several_views_over_one_another_make_a_surface() -> None:
+    """Grids of nearly one pitch beat: their points gather in bands, and the gaps between these part nothing."""
+    random = np.random.default_rng(7)
+    clouds = []
+    for number in range(9):
+        pitch = 1.4e-3 * (1.0 + 0.004 * number)
+        x, y = np.meshgrid(np.arange(-0.15, 0.15, pitch), np.arange(-0.05, 0.05, pitch))
+        z = 0.7 + 0.05 * x + 3e-4 * random.standard_normal(x.shape)
+        z[np.hypot(x - 0.02, y - 0.01) < 8e-3] += 0.02
+        clouds.append(np.stack([x, y, z], axis=-1).reshape(-1, 3))
+    points = np.concatenate(clouds)
+    assert crop(without_grid(points), AutoCrop(inset_px=0)).all()
+    kept = crop(without_grid(points), AutoCrop())[0]
+    inner = (np.abs(points[:, :2]) < [0.145, 0.045]).all(axis=1)
+    assert kept[inner].all() and not kept.all()
+
+
 def test_a_polygon_needs_a_grid() -> None:
     cloud, *_ = drilled_board_before_a_wall()
     with pytest.raises(UserError, match="without a pixel grid"):

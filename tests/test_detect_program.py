@@ -151,6 +151,10 @@ def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
 def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quiet = plane.write_open3d_folder(tmp_path / "quiet", 4, noise_mm=0.6, hole=False)
     assert detect.main([str(capture), "--quiet-capture", str(quiet), "--out", str(tmp_path / "a")]) == 0
+    files = json.loads((tmp_path / "a" / "findings.json").read_text())["provenance"]["files"]
+    assert {str(quiet), str(capture)} == {
+        str(Path(file["path"]).parent.parent) for file in files if "depth" in file["path"]
+    }
     assert "silent on" in capsys.readouterr().out
     k = json.loads((tmp_path / "a" / "findings.json").read_text())["threshold"]["k"]
     assert detect.main([str(quiet), "--threshold", str(k)]) == 0

@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import re
+from hashlib import sha256
 from pathlib import Path
 
+import cv2
 import marked_board as board
 import numpy as np
 import pytest
@@ -41,6 +44,12 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Three views of the board."""
     folder = tmp_path_factory.mktemp("views")
     return [str(board.write_view(folder / f"view_{i}", pose, seed=i)) for i, pose in enumerate(POSES)]
+
+
+@pytest.fixture
+def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the files of a run the picture takes longest: left empty by tests that look at the others."""
+    monkeypatch.setattr("harness.report.findings.save_picture", lambda path, *_: path.write_bytes(b""))
 
 
 def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
@@ -93,11 +102,22 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert facts["settings"]["mapping"]["registration"]["method"] == "marks"
     assert facts["settings"]["detector"]["settings"]["crop"]["kind"] == "none"
     assert len(facts["provenance"]["files"]) == 3 * (3 + 3 + 1)
+    # the fused map states each cell's deviation, and the text says so; the ring is named like its row, in the page too
+    (cell_mm,) = re.findall(r"cells of ([0-9.]+) mm", said)
+    assert facts["merged"]["cell_mm"] == pytest.approx(float(cell_mm), rel=0.01)
+    assert "at the median point, each point's own deviation: " in said and " u cell " in said
+    assert f'"1: {found["diameter_mm"]:.1f}"' in (out / "view3d.html").read_text()
 
 
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize("merge", ("grid", "volume"))
-def test_every_merge_finds_the_hole(views: list[str], tmp_path: Path, merge: str) -> None:
+def test_every_merge_finds_the_hole(
+    views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], merge: str
+) -> None:
     assert detect.main([*views[:2], "--register", "marks", "--merge", merge, "--out", str(tmp_path / "out")]) == 0
+    # the target was cut out of each view, so nothing is cut off the merged points
+    points, judged = re.findall(r"merged: 2 views, (\d+) points, (\d+) judged", capsys.readouterr().out)[0]
+    assert points == judged
     rows = findings_of(tmp_path / "out")
     place_mm = np.array([rows[0][f"{axis}_mm"] for axis in "xyz"])
     # the mean of four extreme points, of two views of one floor from two sides: good to a quarter of the hole
@@ -105,6 +125,7 @@ def test_every_merge_finds_the_hole(views: list[str], tmp_path: Path, merge: str
     assert "<canvas" in (tmp_path / "out" / "view3d.html").read_text()
 
 
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize("method", ("icp", "cpd", "joint"))
 def test_other_methods_start_from_the_marks_where_nobody_says_where_views_stand(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
@@ -118,6 +139,7 @@ def test_other_methods_start_from_the_marks_where_nobody_says_where_views_stand(
     assert found["diameter_mm"] == pytest.approx(2e3 * board.HOLE_RADIUS_M, rel=0.15)
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_poses_may_be_stated_and_nominal_takes_them_as_they_are(views: list[str], tmp_path: Path) -> None:
     poses = tmp_path / "poses.json"
     # to the board's frame: any common one will do
@@ -127,8 +149,11 @@ def test_poses_may_be_stated_and_nominal_takes_them_as_they_are(views: list[str]
     told = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
     np.testing.assert_allclose(told["T_reference_view"], T_FIRST_VIEW[1], atol=1e-12)
     assert told["predicted_in_plane_mm"] is None
+    files = json.loads((tmp_path / "out" / "findings.json").read_text())["provenance"]["files"]
+    assert files[-1]["path"] == str(poses) and files[-1]["sha256"] == sha256(poses.read_bytes()).hexdigest()
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_settings_reach_the_way_from_views_to_a_cloud(views: list[str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     settings = ("mapping.merge.cell_mm=4", "mapping.views=2", "mapping.crop.inset_px=5", "surface.degree=1")
@@ -140,6 +165,7 @@ def test_settings_reach_the_way_from_views_to_a_cloud(views: list[str], tmp_path
     assert len(json.loads((out / "registrations.json").read_text())["views"]) == 2
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_the_same_views_give_the_same_files(views: list[str], tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert detect.main([*views[:2], "--register", "marks", "--out", str(tmp_path / name)]) == 0
@@ -181,7 +207,7 @@ def test_a_view_with_hidden_marks_is_named_with_what_is_missing(
     hidden = board.write_view(tmp_path / "hidden", POSES[1], seed=5, hidden=(0, 2, 4))
     said = failed(capsys, views[0], hidden, views[2], "--register", "marks", "--out", tmp_path / "out")
     assert "one view cannot be registered to view_0" in said
-    assert "hidden: 2 marks found, 3 needed" in said and "view_2" not in said
+    assert "\n  hidden: 2 marks found, 3 needed" in said and "view_2" not in said and "(--poses)" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -204,7 +230,7 @@ def test_views_without_overlap_are_refused(
     far[0, 3] = 1.0
     poses.write_text(json.dumps([np.eye(4).tolist(), far.tolist()]))
     said = failed(capsys, *views[:2], "--register", "nominal", "--poses", poses, "--out", tmp_path / "out")
-    assert "view_1: the views do not overlap: 0 %" in said
+    assert "view_1: the views do not overlap: 0 %" in said and "correct --poses where it is wrong" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -238,6 +264,15 @@ def test_one_view_is_none_too_many(views: list[str], capsys: pytest.CaptureFixtu
     assert "1 view to register" in failed(capsys, *views, "--register", "marks", "--set", "mapping.views=1")
 
 
+def test_several_captures_are_no_list_of_frames_and_no_capture_counts_twice(
+    views: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = failed(capsys, *views[:2])
+    assert f"2 PATHs, and {views[0]} is a capture of its own" in said and "--register marks|" in said
+    assert f"{views[0]}: is named twice" in failed(capsys, views[0], views[1], views[0] + "/", "--register", "marks")
+
+
+@pytest.mark.usefixtures("unpictured")
 def test_a_full_disk_leaves_nothing(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,11 +305,28 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     (
-        ("[[1, 2], [3, 4]]", "pose 0 is no rigid"),
-        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]), "pose 1 is no rigid"),
-        (json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]), "pose 1 is no rigid"),
-        (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views"),
+        ("[[1, 2], [3, 4]]", "pose 0 is no rigid 4x4 transform: it has the shape (2,)"),
+        (
+            json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]),
+            "pose 1 is no rigid 4x4 transform: .. 3x3 mirrors",
+        ),
+        (
+            json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]),
+            "pose 1 is no rigid 4x4 transform: .. it scales or shears",
+        ),
+        (
+            json.dumps([np.eye(4).tolist(), np.diag([1, 1, 1, 2]).tolist()]),
+            "pose 1 is no rigid 4x4 transform: its last row",
+        ),
+        (
+            json.dumps([[[float("nan")] * 4] * 4] * 2),
+            "pose 0 is no rigid 4x4 transform: not all of its numbers are finite",
+        ),
+        (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views .. one line a view"),
+        (json.dumps({"views": 1, "poses": []}), "holds no list of matrices (an object with the keys views, poses)"),
+        ("[" * 100_000, "holds no list of matrices"),
         ("[", "holds no list of matrices"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 340 0 0 0 1", "pose 1 is 340 m from pose 0 .. metres, not millimetres"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1", ":2: is no pose"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 2", ":2: is no pose"),
         ("0 0 0 0 0 0 0 one", ":1: is no pose"),
@@ -285,27 +337,40 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, told: str) -
     (tmp_path / "poses").write_text(text)
     with pytest.raises(UserError) as caught:
         read_poses(tmp_path / "poses", 2)
-    assert told in str(caught.value)
+    said = str(caught.value)
+    for part in told.split(" .. "):
+        assert part in said
 
 
 # ---- a real capture --------------------------------------------------------------------------------------------------
 
 
+def _halves(source: Path, folder: Path) -> list[str]:
+    """The first and last frames of a capture as two, every second row and column of each."""
+    told = json.loads((source / "intrinsic.json").read_text())
+    told["width"], told["height"] = told["width"] // 2, told["height"] // 2
+    told["intrinsic_matrix"] = [0.5 * value for value in told["intrinsic_matrix"][:8]] + [1.0]
+    colour = cv2.imread(str(source / "color" / "00000.jpg"))[::2, ::2]
+    depths = sorted((source / "depth").iterdir())
+    for name, part in (("first", depths[:4]), ("second", depths[-4:])):
+        for inner in ("depth", "color"):
+            (folder / name / inner).mkdir(parents=True)
+        for path in part:
+            stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(folder / name / "depth" / path.name), stored[::2, ::2])
+        cv2.imwrite(str(folder / name / "color" / f"{part[0].stem}.png"), colour)
+        (folder / name / "intrinsic.json").write_text(json.dumps(told))
+    return [str(folder / "first"), str(folder / "second")]
+
+
+@pytest.mark.usefixtures("unpictured")
 def test_two_halves_of_a_static_capture_stand_where_they_stood(shared_data: Path, tmp_path: Path) -> None:
     """The camera did not move, so the truth is the identity. The one colour picture serves both halves, so that only
     the marks' ranges differ: the error within the plane is not tested by it."""
-    source = shared_data / "azure_drilled_board"
-    depths = sorted((source / "depth").iterdir())
-    for name, part in (("first", depths[:9]), ("second", depths[9:])):
-        for inner in ("depth", "color"):
-            (tmp_path / name / inner).mkdir(parents=True)
-        for path in part:
-            (tmp_path / name / "depth" / path.name).symlink_to(path)
-        (tmp_path / name / "color" / f"{part[0].stem}.jpg").symlink_to(source / "color" / "00000.jpg")
-        (tmp_path / name / "intrinsic.json").symlink_to(source / "intrinsic.json")
-    out, paths = tmp_path / "out", [str(tmp_path / "first"), str(tmp_path / "second")]
-    # coarse and few frames: what is found on the plate is not the question
-    coarse = ("--max-frames", "5", "--merge", "grid", "--set", "mapping.merge.step_mm=2")
+    paths = _halves(shared_data / "azure_drilled_board", tmp_path)
+    out = tmp_path / "out"
+    # coarse: what is found on the plate is not the question
+    coarse = ("--merge", "grid", "--set", "mapping.merge.step_mm=5")
     arguments = ("--register", "marks", "--marks", "coded", *coarse)
     assert detect.main([*paths, *arguments, "--out", str(out)]) == 0
     row = json.loads((out / "registrations.json").read_text())["views"][1]
@@ -316,5 +381,5 @@ def test_two_halves_of_a_static_capture_stand_where_they_stood(shared_data: Path
     small = [turn[2, 1], turn[0, 2], turn[1, 0], *(transform_points(T_reference_view, centre_m) - centre_m)]
     chi2 = np.array(small) @ np.linalg.solve(np.array(row["covariance"]), small)
     assert chi2 < stats.chi2.ppf(0.999, 6)
-    assert np.hypot(row["predicted_in_plane_mm"], row["predicted_across_mm"]) < 0.1
+    assert np.hypot(row["predicted_in_plane_mm"], row["predicted_across_mm"]) < 0.2
     assert row["held_out_mark_mm"] < 0.1

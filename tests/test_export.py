@@ -35,6 +35,7 @@ from scenes.view import NoiseFreeView
 CAMERA = CameraConfig(name="azure_kinect_nfov", unit_seed=1)
 FRONT, BACK = Plane(0.7, 0.1), Plane(0.715, 0.1)
 REGION = Region(260, 340, 250, 370)
+FRAMES = 3
 DECLARED = """
 name: small
 seed: 3
@@ -43,7 +44,7 @@ source:
   target: {name: thesis}
   camera: {name: azure_kinect_nfov, unit_seed: 1}
   views: {kind: arc, count: 3, spread_deg: 40.0}
-capture: {frames: 6}
+capture: {frames: 3}
 detector:
   name: thesis
   settings: {crop: {kind: none}}
@@ -63,13 +64,29 @@ def view() -> NoiseFreeView:
     return layered_view(camera_of(CAMERA), REGION, FRONT, BACK, drilled, 0.6)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _every_render_is_the_plane(view: NoiseFreeView) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenes.render.cache.cached_view", lambda *_: (view, True))
+        yield
+
+
 @pytest.fixture
-def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, view: NoiseFreeView) -> Path:
-    """An experiment whose every render is the drilled plane."""
-    monkeypatch.setattr("scenes.render.cache.cached_view", lambda *_: (view, True))
+def experiment(tmp_path: Path) -> Path:
+    """An experiment with three views."""
     path = tmp_path / "experiment.yaml"
     path.write_text(DECLARED)
     return path
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """That experiment in each form: two views as bags, all three as one sequence."""
+    folder = tmp_path_factory.mktemp("exports")
+    path = folder / "experiment.yaml"
+    path.write_text(DECLARED)
+    bags = {form: exported(path, folder / form, form, "--views", "2") for form in ("ros2", "mcap")}
+    return bags | {"tum": exported(path, folder / "tum", "tum")}
 
 
 def exported(experiment: Path, out: Path, form: str, *more: str) -> Path:
@@ -95,7 +112,7 @@ def detected(cloud: Cloud) -> tuple[tuple[Detection, ...], tuple[Measurement, ..
 
 def simulated(view: NoiseFreeView, number: int) -> FrameSource:
     labels = ("damaged", 0) if number == 0 else ("damaged", 0, "view", number)
-    return SimulatedUnit(camera_of(CAMERA), CAMERA, view).capture(6, 3, *labels)
+    return SimulatedUnit(camera_of(CAMERA), CAMERA, view).capture(FRAMES, 3, *labels)
 
 
 # ---- bags ------------------------------------------------------------------------------------------------------------
@@ -103,9 +120,9 @@ def simulated(view: NoiseFreeView, number: int) -> FrameSource:
 
 @pytest.mark.parametrize("form", ("ros2", "mcap"))
 def test_written_read_back_and_detected_is_equal_bit_for_bit(
-    experiment: Path, tmp_path: Path, view: NoiseFreeView, form: str
+    exports: dict[str, Path], view: NoiseFreeView, form: str
 ) -> None:
-    out = exported(experiment, tmp_path / "out", form, "--views", "2")
+    out = exports[form]
     for number in (0, 1):
         source = simulated(view, number)
         expected, got = (average(each, AverageConfig()) for each in (source, open_capture([out / f"view_0{number}"])))
@@ -123,23 +140,27 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
         assert measured[0].model_diameter_m == pytest.approx(0.012, rel=0.1)
 
 
-def test_the_program_finds_the_same_in_either_storage(experiment: Path, tmp_path: Path) -> None:
+def test_the_program_finds_the_same_in_either_storage(
+    exports: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the picture takes longer than all else, and other tests look at it
+    monkeypatch.setattr("harness.report.findings.save_picture", lambda path, *_: path.write_bytes(b""))
     for form in ("ros2", "mcap"):
-        bag = exported(experiment, tmp_path / form, form, "--views", "1") / "view_00"
+        bag = exports[form] / "view_00"
         more = ["--topic", "points2", "--crop", "box:-60,60,-80,-20,0,1000", "--out", str(tmp_path / f"found_{form}")]
         assert detect.main([str(bag), *more]) == 0
     first, second = ((tmp_path / f"found_{form}" / "findings.csv").read_text() for form in ("ros2", "mcap"))
     assert first == second and len(first.splitlines()) == 2
 
 
-def test_a_bag_holds_lens_and_pose_at_the_clouds_times(experiment: Path, tmp_path: Path) -> None:
-    out = exported(experiment, tmp_path / "out", "mcap", "--views", "2", "--frames", "2")
-    with AnyReader([out / "view_01"]) as reader:
+def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path]) -> None:
+    with AnyReader([exports["mcap"] / "view_01"]) as reader:
         got = [(c.topic, stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()]
     topics = [topic for topic, _, _ in got]
-    assert topics == ["/tf_static", *["/depth/camera_info", "/points2"] * 2]
-    start = START_NS + round(2e9 / 30) + 10**9
-    assert [stamp for _, stamp, _ in got] == [start, start, start, *[start + 33_333_333] * 2]
+    assert topics == ["/tf_static", *["/depth/camera_info", "/points2"] * FRAMES]
+    start = START_NS + round(FRAMES * 1e9 / 30) + 10**9
+    stamps = [start, *(start + round(frame * 1e9 / 30) for frame in range(FRAMES) for _ in range(2))]
+    assert [stamp for _, stamp, _ in got] == stamps
     pose = got[0][2].transforms[0]
     assert (pose.header.frame_id, pose.child_frame_id) == ("board", "view_01_depth_optical_frame")
     target = ThesisTargetConfig().declare()
@@ -158,8 +179,8 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(experiment: Path, tmp_pat
     assert not cloud.is_dense and (cloud.height, cloud.width) == (576, 640)
 
 
-def test_the_truth_and_the_nominal_poses_stand_beside(experiment: Path, tmp_path: Path) -> None:
-    out = exported(experiment, tmp_path / "out", "ros2", "--views", "2", "--frames", "1")
+def test_the_truth_and_the_nominal_poses_stand_beside(exports: dict[str, Path], tmp_path: Path) -> None:
+    out = exports["ros2"]
     truth = json.loads((out / "truth.json").read_text())
     target = ThesisTargetConfig().declare()
     assert len(truth["damages"]) == 11
@@ -177,22 +198,23 @@ def test_the_truth_and_the_nominal_poses_stand_beside(experiment: Path, tmp_path
     assert (again / "truth.json").read_text() == (out / "truth.json").read_text()
 
 
-def test_without_damage_nothing_is_listed_and_the_noise_is_another(experiment: Path, tmp_path: Path) -> None:
-    more = ("--hole-free", "--views", "1", "--frames", "1")
-    free = exported(experiment, tmp_path / "free", "mcap", *more)
-    damaged = exported(experiment, tmp_path / "damaged", "mcap", *more[1:])
+def test_without_damage_nothing_is_listed_and_the_noise_is_another(
+    experiment: Path, exports: dict[str, Path], tmp_path: Path
+) -> None:
+    free = exported(experiment, tmp_path / "free", "mcap", "--hole-free", "--views", "1", "--frames", "1")
     assert json.loads((free / "truth.json").read_text())["damages"] == []
-    first, second = (open_capture([folder / "view_00"]).first_frame().z_m for folder in (free, damaged))
+    first, second = (open_capture([folder / "view_00"]).first_frame().z_m for folder in (free, exports["mcap"]))
     assert not np.array_equal(first, second, equal_nan=True)
 
 
 # ---- TUM -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(experiment: Path, tmp_path: Path) -> None:
-    out = exported(experiment, tmp_path / "out", "tum", "--frames", "2")
+def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(exports: dict[str, Path]) -> None:
+    out = exports["tum"]
     times = [line.split()[0] for line in (out / "depth.txt").read_text().splitlines() if not line.startswith("#")]
-    assert len(times) == 6 and times[:3] == ["1000000000.000000", "1000000000.033333", "1000000001.066667"]
+    assert len(times) == 3 * FRAMES
+    assert times[:4] == ["1000000000.000000", "1000000000.033333", "1000000000.066667", "1000000001.100000"]
     lines = (out / "associations.txt").read_text().splitlines()
     assert lines == [f"{t} rgb/{t}.png {t} depth/{t}.png" for t in times]
     for folder in ("depth", "depth_sync", "rgb", "rgb_sync"):
@@ -209,21 +231,21 @@ def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(experiment: Path, tm
     assert stored.getNode("distortion_coefficients").getNode("cols").real() == 5
 
 
-def test_the_ground_truth_carries_the_camera_to_the_board(experiment: Path, tmp_path: Path) -> None:
+def test_the_ground_truth_carries_the_camera_to_the_board(exports: dict[str, Path]) -> None:
     from scipy.spatial.transform import Rotation
 
-    out = exported(experiment, tmp_path / "out", "tum", "--frames", "1")
-    rows = np.loadtxt(out / "groundtruth.txt")
-    truth = json.loads((out / "truth.json").read_text())
-    assert rows.shape == (3, 8)
-    for row, told in zip(rows, truth["views"], strict=True):
+    rows = np.loadtxt(exports["tum"] / "groundtruth.txt")
+    truth = json.loads((exports["tum"] / "truth.json").read_text())
+    assert rows.shape == (3 * FRAMES, 8)
+    for row, told in zip(rows, np.repeat(truth["views"], FRAMES), strict=True):
         np.testing.assert_allclose(row[1:4], np.array(told["T_board_camera"])[:3, 3], atol=1e-9)
         turned = Rotation.from_quat(row[4:]).as_matrix()
         np.testing.assert_allclose(turned, np.array(told["T_board_camera"])[:3, :3], atol=1e-8)
 
 
 def test_a_sequence_read_back_lies_on_the_planes(experiment: Path, tmp_path: Path, view: NoiseFreeView) -> None:
-    """The pinhole's pixels are wrong by half a pixel at most, which on a plane of slope 0.1 is 0.07 mm."""
+    """The pinhole's pixels are wrong by half a pixel at most, which on a plane of slope 0.1 is 0.07 mm. One view only:
+    all frames of a sequence are read as one capture."""
     out = exported(experiment, tmp_path / "out", "tum", "--views", "1")
     recording = open_capture([out])
     assert recording.z_step_m == 1e-3 and recording.lens is not None and not any(recording.lens.distortion)
@@ -280,10 +302,10 @@ def test_the_quaternion_turns_as_the_matrix_does() -> None:
 
 
 def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
-    views = in_turn([simulated(view, i) for i in range(3)], [np.eye(4)] * 3, 6, 30.0)
-    stamps = [each.stamp_ns(frame) for each in views for frame in range(6)]
+    views = in_turn([simulated(view, i) for i in range(3)], [np.eye(4)] * 3, FRAMES, 30.0)
+    stamps = [each.stamp_ns(frame) for each in views for frame in range(FRAMES)]
     assert stamps == sorted(set(stamps)) and [each.name for each in views] == ["view_00", "view_01", "view_02"]
-    assert views[1].start_ns - views[0].stamp_ns(5) == pytest.approx(10**9 + 1e9 / 30, abs=2)
+    assert views[1].start_ns - views[0].stamp_ns(FRAMES - 1) == pytest.approx(10**9 + 1e9 / 30, abs=2)
 
 
 # ---- what it refuses -------------------------------------------------------------------------------------------------

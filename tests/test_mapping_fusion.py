@@ -44,13 +44,13 @@ def noisy(poses: list[np.ndarray], seed: int, plane: Plane, **kwargs: object) ->
 
 def deviations(found: Merged, plane: Plane, enough_views: int) -> np.ndarray:
     """Of cells that enough views see, less a common plane's worth of nothing: the plane is known."""
-    cells = found.surface_map.views_seen >= enough_views
+    cells = found.surface_map.seen_by.sum(axis=0) >= enough_views
     return plane_height(found.cloud.points_m, found.T_reference_cloud, plane)[cells]
 
 
 def interior(found: Merged) -> np.ndarray:
     """(h, w) bool: seen by all views."""
-    return found.surface_map.views_seen == len(found.views_used)
+    return found.surface_map.seen_by.sum(axis=0) == len(found.views_used)
 
 
 # ---------------------------------------------------------------- frame and exactness
@@ -109,7 +109,7 @@ def test_equal_pitches_leave_no_gaps_and_lens_distortion_no_bend() -> None:
     bent = Lens(160, 120, 500.0, 500.0, 79.5, 59.5, (0.3, -0.2, 1e-3, -1e-3, 0.1, 0.0, 0.0, 0.0))
     poses = [np.eye(4), turned(2.0, -3.0, (0.0007, 0.0003, 0.0))]
     found = fused([seen(Plane(), T, lens=bent, name=str(i)) for i, T in enumerate(poses)], poses)
-    inner = found.surface_map.views_seen[15:-15, 15:-15]
+    inner = found.surface_map.seen_by.sum(axis=0)[15:-15, 15:-15]
     assert (inner == 2).all()
     np.testing.assert_allclose(
         plane_height(found.cloud.points_m[found.cloud.valid], found.T_reference_cloud, Plane()), 0, atol=2e-7
@@ -194,7 +194,8 @@ def test_a_pattern_of_its_own_in_each_view_is_found() -> None:
     standard = deviations(found, plane, 5) / np.sqrt(found.cloud.mean_variance_m2[cells])
     assert float(np.std(standard)) == pytest.approx(1.0, rel=0.1)
     # interpolation takes about half of the variance of a pattern that changes from pixel to pixel
-    assert found.surface_map.between.tau_m == pytest.approx(own_m * np.sqrt(0.5), rel=0.15)
+    between = found.surface_map.between
+    assert np.sqrt(between.own_m2 + between.pattern_m2) == pytest.approx(own_m * np.sqrt(0.5), rel=0.15)
 
 
 def test_a_pattern_that_belongs_to_the_pixels_does_not_pass_for_independent() -> None:
@@ -249,7 +250,7 @@ def test_what_a_cell_knows_of_its_views() -> None:
     middle = np.unravel_index(
         np.argmin(np.hypot(*np.meshgrid(surface_map.x_m, surface_map.y_m))), surface_map.samples.shape
     )
-    assert surface_map.views_seen[middle] == 3 and surface_map.samples[middle] == 21
+    assert surface_map.seen_by.sum(axis=0)[middle] == 3 and surface_map.samples[middle] == 21
     np.testing.assert_allclose(surface_map.direction[middle], [0, 0, -1], atol=5e-3)
     # angles 0, 20, 20 degrees: root mean square 16.3; the resultant's chord is a little shorter
     assert surface_map.direction_spread_deg[middle] == pytest.approx(16.3, abs=0.3)

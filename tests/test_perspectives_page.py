@@ -106,7 +106,7 @@ def test_failed_registrations_are_shown_with_their_reason(page):
 
 
 def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
-    row = page[page.index("SLAM along a hand-held path</th>") :]
+    row = page[page.index("<b>SLAM along a hand-held path</b>") :]
     row = text_of(row[: row.index("</tbody>")])
     assert "24 views × 1 frame<" in row
     assert "2 views × 1 frame<" in row

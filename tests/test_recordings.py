@@ -159,6 +159,17 @@ def test_a_recording_can_be_sent_to_another_process(tmp_path: Path) -> None:
     np.testing.assert_allclose(points_of(recording, next(recording.frames())), TRUE_M, atol=1e-6)
 
 
+def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "plane", 2)
+    pictures = sorted((folder / "color").iterdir())
+    assert open_capture([folder]).first_frame().rgb is not None
+    for number, path in enumerate(pictures):
+        path.rename(path.with_stem(str(100 + number)))
+    recording = open_capture([folder])
+    told = f"none of {len(pictures)} colour pictures has the number of a depth picture"
+    assert any(told in note for note in recording.notes) and recording.first_frame().rgb is None
+
+
 def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
     folder = plane.write_open3d_folder(tmp_path / "o", 1)
     cv2.imwrite(str(folder / "color" / "00000.png"), np.zeros((10, 10, 3), np.uint8))

@@ -6,13 +6,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import bag_of_a_plane as bags
 import cv2
 import numpy as np
 import pytest
 import recorded_plane as plane
 import scipy.io
 
-from detectors.recordings import open_capture, pointclouds
+from detectors.open3d_library import load_open3d
+from detectors.recordings import open_capture
 from detectors.recordings.intrinsics import read_lens
 from harness.vocabulary.errors import UserError
 
@@ -56,7 +58,19 @@ def test_a_mixed_list_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    assert f"{tmp_path}: is empty" in refusal(tmp_path, lens=plane.LENS)
+    (tmp_path / "depth").mkdir()
     assert "no depth picture" in refusal(tmp_path, lens=plane.LENS)
+
+
+def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    assert refusal(tmp_path).splitlines()[0] == f"{tmp_path}: no capture in it; it holds notes.txt"
+    bag, other = bags.write_bag(tmp_path / "left", bags.clouds(1)), tmp_path / "other.mkv"
+    other.touch()
+    plane.write_open3d_folder(tmp_path / "right", 1)
+    said = refusal(tmp_path)
+    assert f"to do: name one of {bag}, {other}, {tmp_path / 'right'}" in said and ".npz" in said
 
 
 @pytest.mark.parametrize("part", (0.0, 0.02, 0.5, 0.98))
@@ -263,6 +277,6 @@ def test_a_missing_system_library_is_named_with_its_package(monkeypatch: pytest.
 
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
-    with pytest.raises(UserError, match="Open3D") as caught:
-        pointclouds._open3d()
+    with pytest.raises(UserError, match="needs Open3D") as caught:
+        load_open3d()
     assert "apt install libgl1" in str(caught.value)

@@ -121,6 +121,18 @@ def test_known_transforms_come_back_through_outliers(turn, shift, seed):
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
+def test_the_background_is_that_of_the_last_iteration():
+    """With it and the width found, metres give the posterior that the drift itself ended with."""
+    random = np.random.default_rng(2)
+    truth = 0.1 * cloud(300)
+    fixed = np.concatenate([truth + 3e-4 * random.standard_normal((300, 3)), random.uniform(-0.1, 0.1, (60, 3))])
+    drift = coherent_point_drift(fixed, truth, CpdRegistration(max_iterations=500, tolerance=1e-13))
+    moved = transform_points(drift.T_fixed_moving, truth)
+    sums, _ = kernels.expectation(fixed.T.copy(), moved.T.copy(), drift.sigma_m**2, drift.background)
+    assert drift.converged and drift.matched < 359
+    np.testing.assert_allclose(float(sums[:, 0].sum()), drift.matched, rtol=0, atol=1e-9)
+
+
 def test_a_grown_cloud_gives_no_scale():
     fixed = cloud(200)
     middle = fixed.mean(axis=0)

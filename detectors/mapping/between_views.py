@@ -52,11 +52,6 @@ class BetweenViews:
     exponent: float = 1.0
     noise_share: float = 1.0
 
-    @property
-    def tau_m(self) -> float:
-        """Standard deviation of all that is fixed for a view."""
-        return float(np.sqrt(self.own_m2 + self.pattern_m2))
-
 
 def between_views(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool

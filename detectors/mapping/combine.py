@@ -54,7 +54,10 @@ def combine(
         plain = values.sum(axis=0) / n
         spread = np.where(used, (heights - plain) ** 2, 0.0).sum(axis=0) / (n - 1)
     alone = (shares**2 * np.where(used, temporal + other + between.own_m2, 0.0)).sum(axis=0)
-    common = between.pattern_m2 * _shared(shares, np.ascontiguousarray(looks_px), between.length_px, between.exponent)
+    common = np.zeros(n.shape)
+    if between.pattern_m2 > 0:
+        looks = np.ascontiguousarray(looks_px)
+        common = between.pattern_m2 * _shared(shares, looks, between.length_px, between.exponent)
     return Combined(
         height_m=np.where(n > 0, (shares * values).sum(axis=0), np.nan),
         variance_m2=np.where(n > 0, alone + common, np.nan),

@@ -48,12 +48,6 @@ class SurfaceMap:
     rgb: np.ndarray | None
     amplitude: np.ndarray | None
 
-    @property
-    def views_seen(self) -> np.ndarray:
-        """(h, w) number of views that count."""
-        seen: np.ndarray = self.seen_by.sum(axis=0)
-        return seen
-
     def cloud(self, n_frames: int, left_out: tuple[LeftOut, ...]) -> Cloud:
         """What a detector sees: an organised cloud in the map's frame. ``variance_m2`` over ``count`` is the temporal
         part of the variance, ``mean_variance_m2`` all of it, which one view does not know of itself (then None).

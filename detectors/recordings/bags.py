@@ -17,7 +17,7 @@ from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag, messages, t
 from detectors.recordings.distances import UNITS_M, rounding_step_m
 from detectors.recordings.intrinsics import KNOWN_MODELS, read_lens
 from detectors.recordings.point_messages import frame_from_message
-from detectors.recordings.recording import Recording
+from detectors.recordings.recording import Recording, slopes_of
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
@@ -135,7 +135,7 @@ def _off_ray_px(lens: Lens, frame: Frame) -> float:
     valid = np.isfinite(frame.z_m)
     if not valid.any():
         return float("inf")
-    slopes = lens.region_slopes(lens.whole)[valid]
+    slopes = slopes_of(lens, lens.whole)[valid]
     off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (lens.fx, lens.fy)
     worst = float(off.max())
     return worst if np.isfinite(worst) else float("inf")

@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -56,8 +56,14 @@ def open_depth_folder(folder: Path, scale_m: float | None, intrinsics: Path | No
     if scale_m is None and tum:
         scale_m = UNITS_M["tum"]
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
-    colours = _matched_colours(root, depths, TUM_MATCH_S if tum else 0.0)
-    return _open(folder.name, depths, colours, scale_m, intrinsics, lens, root)
+    pictures = _colour_pictures(root, depths)
+    colours = _matched_colours(pictures, depths, TUM_MATCH_S if tum else 0.0)
+    recording = _open(folder.name, depths, colours, scale_m, intrinsics, lens, root)
+    if pictures and not any(colours):
+        what = "time stamp" if tum else "number"
+        note = f"none of {len(pictures)} colour pictures has the {what} of a depth picture in its name: no colour"
+        return replace(recording, notes=(*recording.notes, note))
+    return recording
 
 
 def open_depth_list(
@@ -184,14 +190,17 @@ def _common_size(depths: tuple[Path, ...]) -> tuple[int, int]:
     return first
 
 
-def _matched_colours(root: Path, depths: tuple[Path, ...], within_s: float) -> tuple[Path | None, ...]:
-    """The colour picture of each depth picture: the same number in its name, or the nearest time stamp."""
+def _colour_pictures(root: Path, depths: tuple[Path, ...]) -> list[Path]:
+    """The pictures in a folder for colour, or beside the depth pictures with the word in their names."""
     folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
-    if folder is None:
-        words = [p for p in root.iterdir() if re.search("colou?r|rgb", p.stem.lower())]
-        pictures = [p for p in words if p.suffix.lower() in COLOUR_SUFFIXES and p not in depths]
-    else:
-        pictures = [path for path in folder.iterdir() if path.suffix.lower() in COLOUR_SUFFIXES]
+    if folder is not None:
+        return [path for path in folder.iterdir() if path.suffix.lower() in COLOUR_SUFFIXES]
+    words = [path for path in root.iterdir() if re.search("colou?r|rgb", path.stem.lower())]
+    return [path for path in words if path.suffix.lower() in COLOUR_SUFFIXES and path not in depths]
+
+
+def _matched_colours(pictures: Sequence[Path], depths: tuple[Path, ...], within_s: float) -> tuple[Path | None, ...]:
+    """The colour picture of each depth picture: the same number in its name, or the nearest time stamp."""
     stamps = {number: path for path in pictures if (number := _last_number(path.stem)) is not None}
     return tuple(_nearest(stamps, _last_number(path.stem), within_s) for path in depths)
 

@@ -20,6 +20,8 @@ from harness.vocabulary.lens import Lens
 
 STACKS = {".npy": load_npy, ".npz": load_npz, ".mat": load_mat}
 CLOUDS = (".ply", ".pcd")
+HELD = 6
+"""Names of a folder's contents that a message lists."""
 LEGAL_FORMATS = (
     "a folder or list of 16-bit depth .png, a folder or list of .ply or .pcd, a ROS 2 bag (folder, .mcap, .db3), "
     "or one .npy, .npz, .mat or .mkv file"
@@ -99,7 +101,25 @@ def _open_folder(folder: Path, scale_m: float | None, intrinsics: Path | None, l
         clouds = [path for path in inside if path.suffix.lower() == suffix]
         if clouds:
             return open_clouds(clouds, scale_m, folder.name)
+    if not (folder / "depth").is_dir() and not any(path.suffix.lower() == ".png" for path in inside):
+        raise _nothing_in(folder, inside)
     return open_depth_folder(folder, scale_m, intrinsics, lens)
+
+
+def _nothing_in(folder: Path, inside: list[Path]) -> UserError:
+    """Of a folder that is no capture: what it holds, and which of it could be one."""
+    held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
+    captures = [path for path in inside if _is_capture(path)]
+    one = f"name {'one of ' if len(captures) > 1 else ''}{', '.join(map(str, captures[:HELD]))}" if captures else None
+    what = f"no capture in it; it holds {held}" if held else "is empty"
+    return UserError(f"{folder}: {what}", legal=LEGAL_FORMATS, fix=one)
+
+
+def _is_capture(path: Path) -> bool:
+    """Whether what lies in a folder looks like a capture of its own."""
+    if path.is_file():
+        return path.suffix.lower() in (*STACKS, ".mkv")
+    return _is_bag(path) or (path / "depth").is_dir()
 
 
 def _list_name(paths: list[Path]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Protocol
@@ -49,15 +49,7 @@ class Recording:
     @cached_property
     def slopes(self) -> np.ndarray | None:
         """(h, w, 2) x/z and y/z per pixel; NaN where the distortion has no inverse. None where frames carry points."""
-        if self.lens is None:
-            return None
-        slopes = self.lens.region_slopes(self.region)
-        if any(self.lens.distortion):
-            rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-            v, u = np.mgrid[self.region.row0 : self.region.row1, self.region.col0 : self.region.col1]
-            missed_px = np.abs(self.lens.project(rays) - np.stack([u, v], axis=-1)).max(axis=-1)
-            slopes[~(missed_px < ROUND_TRIP_PX)] = np.nan
-        return slopes
+        return None if self.lens is None else _returning_slopes(self.lens, self.region)
 
     def frames(self) -> Iterator[Frame]:
         """The selected frames. Raises UserError on differing sizes, a wrong unit, or when no pixel is ever valid."""
@@ -109,6 +101,25 @@ class Recording:
                 legal="depth above 0 and finite in some pixels",
                 fix="check that these are depth images and that the target was within the camera's range",
             )
+
+
+@lru_cache(maxsize=2)
+def slopes_of(lens: Lens, region: Region) -> np.ndarray:
+    """(h, w, 2) x/z and y/z per pixel, not to be written to: kept, because captures that are views of one target share
+    their lens, and undistorting a sensor takes longer than averaging a frame of it."""
+    return lens.region_slopes(region)
+
+
+@lru_cache(maxsize=2)
+def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
+    """The same with NaN where the ray does not come back to its pixel."""
+    slopes = slopes_of(lens, region)
+    if not any(lens.distortion):
+        return slopes
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
+    missed_px = np.abs(lens.project(rays) - np.stack([u, v], axis=-1)).max(axis=-1)
+    return np.where((missed_px < ROUND_TRIP_PX)[..., None], slopes, np.nan)
 
 
 def _size(shape: tuple[int, ...]) -> str:

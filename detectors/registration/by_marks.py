@@ -16,9 +16,10 @@ from detectors.marks.mark import Mark
 from detectors.marks.pairing import SHARED_M, Pairing, pair_marks
 from detectors.marks.placing import Placement, place
 from detectors.marks.sufficient import off_line_problem
+from detectors.registration.points import guess_of, unplaced
 from detectors.registration.registered import Registration
 from detectors.views import PreparedView
-from harness.vocabulary.geometry import invert, transform_points
+from harness.vocabulary.geometry import transform_points
 from harness.vocabulary.units import MM
 
 WIDEN_BELOW = 0.01
@@ -35,19 +36,20 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> Registrati
     best known, or else the guess, or else the identity.
     """
     started = perf_counter()
+    guess = guess_of(reference, view)
     problem = _problem_of_sets(reference, view)
     if problem:
-        return _failed(view, _guess(reference, view), problem, started)
+        return unplaced(view.view.name, "marks", guess, problem, started)
     ours, theirs = reference.marks.trusted, view.marks.trusted
-    pairing = pair_marks(ours, theirs, _guess(reference, view))
+    pairing = pair_marks(ours, theirs, guess)
     if len(pairing.pairs) < 3:
-        return _failed(view, _guess(reference, view), pairing.problem, started, pairing.notes)
+        return unplaced(view.view.name, "marks", guess, pairing.problem, started, *pairing.notes)
     ours, theirs = _matched(ours, theirs, pairing)
     problem = pairing.problem or off_line_problem(ours) or off_line_problem(theirs)
     try:
         placement = _placed(ours, theirs, 0.0)
     except np.linalg.LinAlgError:
-        return _failed(view, _guess(reference, view), problem or "the matched marks do not fix a turn", started)
+        return unplaced(view.view.name, "marks", guess, problem or "the matched marks do not fix a turn", started)
     return _registration(view, ours, theirs, placement, pairing, problem, started)
 
 
@@ -58,7 +60,7 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
     """
     if _problem_of_sets(reference, view):
         return None
-    pairing = pair_marks(reference.marks.trusted, view.marks.trusted, _guess(reference, view))
+    pairing = pair_marks(reference.marks.trusted, view.marks.trusted, guess_of(reference, view))
     if pairing.problem or len(pairing.pairs) < 4:
         return None
     ours, theirs = _matched(reference.marks.trusted, view.marks.trusted, pairing)
@@ -79,12 +81,6 @@ def _problem_of_sets(reference: PreparedView, view: PreparedView) -> str:
         f"{prepared.view.name}: {prepared.marks.problem}" for prepared in (reference, view) if prepared.marks.problem
     ]
     return "; ".join(problems)
-
-
-def _guess(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
-    """The reference's frame from the view's, as far as guesses tell."""
-    ours, theirs = reference.view.T_reference_view_guess, view.view.T_reference_view_guess
-    return None if ours is None or theirs is None else invert(ours) @ theirs
 
 
 def _matched(
@@ -136,26 +132,6 @@ def _registration(
         pairs=len(ours),
         iterations=placement.iterations,
         converged=placement.converged,
-        seconds=perf_counter() - started,
-        failure=problem,
-        notes=notes,
-    )
-
-
-def _failed(
-    view: PreparedView, guess: np.ndarray | None, problem: str, started: float, notes: tuple[str, ...] = ()
-) -> Registration:
-    return Registration(
-        view=view.view.name,
-        method="marks",
-        T_reference_view=np.eye(4) if guess is None else guess,
-        covariance=np.full((6, 6), np.nan),
-        centre_m=np.zeros(3),
-        residual_m=float("nan"),
-        overlap=float("nan"),
-        pairs=0,
-        iterations=0,
-        converged=False,
         seconds=perf_counter() - started,
         failure=problem,
         notes=notes,

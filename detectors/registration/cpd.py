@@ -39,7 +39,7 @@ FLAT_LIKELIHOOD = (
 class Drift:
     """What coherent point drift found. ``T_fixed_moving`` (4, 4); ``sigma_m`` the Gaussians' width; ``matched`` the
     expected number of fixed points that are no outliers; ``step_m`` how far the last iteration moved the points, root
-    mean square; ``background`` as `cpd_kernels.expectation` takes it in metres."""
+    mean square; ``background`` as `cpd_kernels.expectation` takes it: a share, without unit."""
 
     T_fixed_moving: np.ndarray
     sigma_m: float
@@ -76,7 +76,7 @@ def coherent_point_drift(
         step = float(np.sqrt(np.mean(np.sum((moved - moving) ** 2, axis=0)))) * scale
         moving, turn, shift = moved, d_turn @ turn, d_turn @ shift + d_shift
     T_fixed_moving = _in_metres(turn, shift, centre, turned.mean(axis=0), scale) @ start
-    background = outliers * (2 * np.pi * variance * scale**2) ** 1.5
+    background = outliers * (2 * np.pi * variance) ** 1.5
     converged = bool(change <= config.tolerance or variance <= LEAST_VARIANCE)
     return Drift(T_fixed_moving, float(np.sqrt(variance)) * scale, matched, iterations, converged, step, background)
 

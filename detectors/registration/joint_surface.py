@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from detectors.marks.mark import Mark
+from detectors.marks.pairing import SHARED_M
 from detectors.registration.registered import displacement_jacobian
 from detectors.registration.sampling import MEDIAN_TO_SIGMA, independent, sampling_of, thinned
 from detectors.surface import BISQUARE_TUNING
@@ -20,8 +21,6 @@ TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
 POSE_TERMS = 3
 MARK_GATE = 16.3
 """Of a mark's place, three degrees of freedom: a true one is passed over once in a thousand."""
-SHARED_MARK_M = 1e-3
-"""Error of a mark's place that is not in its covariance, allowed for when it is decided which mark it is."""
 START_STEPS = 10
 
 
@@ -138,7 +137,7 @@ def _labelled(
             if mark.code != other.code:
                 continue
             apart = transform_points(T_reference_view, mark.centre_m) - other.centre_m
-            spread = turn @ mark.covariance_m2 @ turn.T + other.covariance_m2 + SHARED_MARK_M**2 * np.eye(3)
+            spread = turn @ mark.covariance_m2 @ turn.T + other.covariance_m2 + 2 * SHARED_M**2 * np.eye(3)
             fits.append((float(apart @ np.linalg.solve(spread, apart)), i, j))
     chosen: dict[int, int] = {}
     for chi2, i, j in sorted(fits):

@@ -108,6 +108,7 @@ def _example(maps: MapMaker, point: Point, threshold: float, placed: tuple[Place
             for number, (place, one) in enumerate(zip(places, measured, strict=True))
         ),
         placed=placed,
+        is_variation=point.is_variation,
     )
 
 

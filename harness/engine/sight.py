@@ -125,6 +125,8 @@ def face_errors_m(sight: Sight, places_m: np.ndarray) -> np.ndarray:
     points = transform_points(sight.T_board_cloud, sight.cloud.points_m[sight.cloud.valid])
     # the undamaged face only: what lies behind a rim is nearest to no place on the face
     points = points[np.abs(points[:, 2]) < 50 * MM]
+    if not len(points):
+        return np.full(len(places_m), np.nan)
     tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
     distance, nearest = tree.query(places_m)
     spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))

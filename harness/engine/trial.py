@@ -107,7 +107,6 @@ class _Judged:
 
     def rows(self, point: PointTask, seconds_frames: float) -> Record:
         """The rows of one point, by table."""
-        began = time.perf_counter()
         common = {"variant": point.variant, "frames": point.frames, "repeat": self._task.repeat}
         extra: dict[str, Any] = {}
         registrations: list[dict[str, Any]] = []
@@ -120,6 +119,7 @@ class _Judged:
                 "seconds_map": self._maps.seconds(point.mapping, point.frames),
             }
             registrations = list(self._maps.registration_rows(point.mapping, point.frames))
+        began = time.perf_counter()
         run, holes, errors = self._judged(point)
         run = {**run, **extra, "seconds_frames": seconds_frames, "seconds_detect": time.perf_counter() - began}
         role = {"role": self._task.role}

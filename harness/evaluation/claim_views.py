@@ -70,7 +70,7 @@ def claim_c7(case: MapCase) -> Verdict:
     evidence = (
         f"With {frames_text(one.frames)}, median error in the plane, across it, and registrations that failed: {said}. "
         f"A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} times the error of "
-        f"ICP ({span(Interval(low, high))}, {n} pairs)."
+        f"ICP ({span(Interval(low, high))}, {n} pairs). {_all_views(rows)}"
     )
     return Verdict("C7", C7, decide([*planes, better]), evidence, C7_RULE)
 
@@ -100,6 +100,16 @@ def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
             where = f"{case.place}: " if len(cases) > 1 else ""
             verdicts.append(replace(verdict, evidence=where + verdict.evidence))
     return verdicts
+
+
+def _all_views(rows: pd.DataFrame) -> str:
+    """What the other views say, which the rule does not judge by: the thesis had one pair."""
+    views = rows["view"].nunique()
+    if views < 2:
+        return ""
+    medians = {method: trusted(rows[rows["method"] == method])["tre_in_plane_mm"].median() for method in ("icp", "cpd")}
+    said = ", ".join(f"{method} {median:.2f}" for method, median in medians.items())
+    return f"Over all {views} further views (not judged): {said} mm in the plane."
 
 
 def _in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:

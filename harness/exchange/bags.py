@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import errno
 import sqlite3
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from harness.exchange.views import BOARD_FRAME, ExportedView, Exposure, quaternion_of
+from harness.vocabulary.lens import Lens
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer
@@ -56,7 +58,7 @@ def _write_messages(writer: Writer, view: ExportedView) -> None:
     from rosbags.typesys import Stores, get_typestore
 
     types = get_typestore(Stores.ROS2_JAZZY)
-    slopes = view.lens.region_slopes(view.lens.whole)
+    slopes = _slopes_of(view.lens)
     topics = {
         topic: writer.add_connection(topic, kind, typestore=types, offered_qos_profiles=_qos(latched))
         for topic, kind, latched in (
@@ -73,6 +75,12 @@ def _write_messages(writer: Writer, view: ExportedView) -> None:
     for exposure in view.exposures():
         write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
         write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
+
+
+@lru_cache(maxsize=1)
+def _slopes_of(lens: Lens) -> np.ndarray:
+    """(h, w, 2) of the whole sensor: the views of an export share their lens."""
+    return lens.region_slopes(lens.whole)
 
 
 def frame_name(view: ExportedView) -> str:

@@ -16,41 +16,70 @@ LEGAL_POSES = (
 )
 RIGID_WITHIN = 1e-4
 """Of R R' = 1 and of the quaternion's length: poses are written with four digits and more."""
+FARTHEST_M = 100.0
+"""Between two views of one target: several times any such camera's range. Poses in millimetres lie beyond."""
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """``T_first_view`` (4, 4) of each view, the first the identity, whatever common frame the file's poses lead to.
 
-    Raises UserError where the file cannot be read, holds another number of poses, or one that is not rigid.
+    Raises UserError where the file cannot be read, holds another number of poses, one that is not rigid, or one
+    farther than `FARTHEST_M` from the first.
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read ({error})", legal=LEGAL_POSES) from error
-    poses = _from_json(path, text) if text.lstrip().startswith("[") else _from_lines(path, text)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_POSES) from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no text", legal=LEGAL_POSES) from error
+    poses = _from_json(path, text) if text.lstrip().startswith(("[", "{")) else _from_lines(path, text)
     if len(poses) != count:
-        raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES)
+        raise UserError(
+            f"{path}: {len(poses)} poses for {count} views",
+            legal=LEGAL_POSES,
+            fix="keep one pose for each PATH, in the same order (of a sequence's groundtruth.txt one line a view)",
+        )
     T_first_common = invert(poses[0])
-    return (np.eye(4), *(T_first_common @ pose for pose in poses[1:]))
+    from_first = [T_first_common @ pose for pose in poses[1:]]
+    for number, pose in enumerate(from_first, start=1):
+        distance_m = float(np.linalg.norm(pose[:3, 3]))
+        if distance_m > FARTHEST_M:
+            raise UserError(
+                f"{path}: pose {number} is {distance_m:.4g} m from pose 0",
+                legal=f"up to {FARTHEST_M:g} m between views of one target",
+                fix="write translations in metres, not millimetres",
+            )
+    return (np.eye(4), *from_first)
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
     try:
         data = json.loads(text)
+        if isinstance(data, dict):
+            raise TypeError(f"an object with the keys {', '.join(data)}")
         poses = [np.array(each, float) for each in data]
-    except (json.JSONDecodeError, TypeError, ValueError) as error:
+    except (json.JSONDecodeError, TypeError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: holds no list of matrices ({error})", legal=LEGAL_POSES) from error
     for number, pose in enumerate(poses):
-        rigid = (
-            pose.shape == (4, 4)
-            and np.isfinite(pose).all()
-            and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=RIGID_WITHIN)
-            and np.linalg.det(pose[:3, :3]) > 0
-            and np.array_equal(pose[3], [0, 0, 0, 1])
-        )
-        if not rigid:
-            raise UserError(f"{path}: pose {number} is no rigid 4x4 transform", legal=LEGAL_POSES)
+        fault = _fault(pose)
+        if fault:
+            raise UserError(f"{path}: pose {number} is no rigid 4x4 transform: {fault}", legal=LEGAL_POSES)
     return poses
+
+
+def _fault(pose: np.ndarray) -> str:
+    """What keeps an array from being a rigid 4x4 transform; empty where nothing does."""
+    if pose.shape != (4, 4):
+        return f"it has the shape {pose.shape}"
+    if not np.isfinite(pose).all():
+        return "not all of its numbers are finite"
+    if not np.array_equal(pose[3], [0, 0, 0, 1]):
+        return "its last row is not 0 0 0 1"
+    if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=RIGID_WITHIN):
+        return "its upper left 3x3 is no rotation: it scales or shears"
+    if np.linalg.det(pose[:3, :3]) < 0:
+        return "its upper left 3x3 mirrors"
+    return ""
 
 
 def _from_lines(path: Path, text: str) -> list[np.ndarray]:

@@ -58,13 +58,40 @@ def print_view(recording: Recording, prepared: PreparedView, crop: str) -> None:
         print(f"note: {note}")
 
 
+def unit_range_m(evidence: Evidence) -> tuple[float, float] | None:
+    """(least, greatest) length that one unit of score is at the points judged, metres; None where it is the same at
+    all of them. A detector that is told how well each point is known may count in each point's own deviations."""
+    import numpy as np
+
+    known = np.isfinite(evidence.residual_m) & (evidence.score > 0)
+    units = np.abs(evidence.residual_m[known]) / evidence.score[known]
+    if units.size == 0 or np.ptp(units) <= 1e-6 * units.max():
+        return None
+    return float(units.min()), float(units.max())
+
+
+def beyond_text(threshold: float, evidence: Evidence) -> str:
+    """The threshold as a length, or in words where it is another length at each point."""
+    if unit_range_m(evidence) is None:
+        return mm(threshold * evidence.scale_m)
+    return f"{threshold:.4g} of each point's own deviations"
+
+
+def threshold_text(threshold: float, evidence: Evidence, origin: str) -> str:
+    """The threshold, what it is in millimetres, and where it comes from."""
+    at = "" if unit_range_m(evidence) is None else " at the median point"
+    return f"threshold: {threshold:.4g} x {mm(evidence.scale_m)} = {mm(threshold * evidence.scale_m)}{at} ({origin})"
+
+
 def surface_text(cloud: Cloud, evidence: Evidence) -> str:
     """The surface, what a unit of score is, and one frame's noise where it is known."""
     import numpy as np
 
     within = cloud.variance_m2[np.isfinite(evidence.residual_m) & np.isfinite(cloud.variance_m2)]
     temporal = f"; one frame's noise {mm(float(np.sqrt(np.median(within))))}" if within.size else ""
-    return f"surface: {evidence.notes.get('surface', '')}; one unit of score is {mm(evidence.scale_m)}{temporal}"
+    varied = unit_range_m(evidence)
+    own = f" at the median point, each point's own deviation: {mm(varied[0])} to {mm(varied[1])}" if varied else ""
+    return f"surface: {evidence.notes.get('surface', '')}; one unit of score is {mm(evidence.scale_m)}{own}{temporal}"
 
 
 def _print_frames_used(recording: Recording, cloud: Cloud, name: str) -> None:
@@ -85,15 +112,15 @@ def _print_kept(cloud: Cloud, kept: np.ndarray, crop: str) -> None:
     print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points{where}")
 
 
-def print_findings(findings: Sequence[Finding]) -> None:
-    """The findings, strongest first."""
+def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
+    """The findings, strongest first. ``grid``: what u and v count."""
     if not findings:
         print("no findings")
         return
     titles = (
         "id",
-        "u px",
-        "v px",
+        f"u {grid}",
+        f"v {grid}",
         "x mm",
         "y mm",
         "z mm",

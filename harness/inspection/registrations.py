@@ -125,6 +125,12 @@ def registration_rows(mapped: Mapped, checks: Checks) -> dict[str, Any]:
     ]
     return {
         "reference": mapped.views[0].view.name,
+        "frames": {
+            "T_reference_view": "from a view's camera to the first view's camera (x right, y down, z away), metres",
+            "T_reference_cloud": "from the merged cloud's frame to the first view's camera, metres",
+            "covariance": "of the error of T_reference_view: turn about covariance_about_mm, rad, then shift, metres,"
+            " both in the first view's frame",
+        },
         "T_reference_cloud": np.asarray(mapped.merged.T_reference_cloud).tolist(),
         "merge_seconds": round(mapped.merged.seconds, 4),
         "views": rows,

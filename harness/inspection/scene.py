@@ -79,10 +79,10 @@ def _to_view(points_m: np.ndarray, view_points_m: np.ndarray, T_reference_view: 
 
 
 def _circles(judged: Judged) -> tuple[Circle3d, ...]:
-    """A ring around each finding of known size, facing the viewer."""
+    """A ring around each finding of known size, facing the viewer, with its number in the table and its diameter."""
     towards = np.array([0.0, 0.0, -1.0])
     return tuple(
-        Circle3d(np.array([f.x_mm, f.y_mm, f.z_mm]), towards, f.diameter_mm, str(f.id), "finding")
+        Circle3d(np.array([f.x_mm, f.y_mm, f.z_mm]), towards, f.diameter_mm, f"{f.id}: {f.diameter_mm:.1f}", "finding")
         for f in judged.findings
         if np.isfinite([f.x_mm, f.y_mm, f.z_mm, f.diameter_mm]).all()
     )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
 MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
+WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat")
 PREFIX = "mapping."
 """Of the --set keys that concern the way from views to one cloud; all others are the detector's."""
 
@@ -25,7 +26,8 @@ def add_to(parser: argparse.ArgumentParser) -> None:
         "several views of one target",
         "Each PATH is then one view. --crop cuts the target out of each; the detector judges all that is merged, unless"
         " --set crop.kind=.. says otherwise. --set mapping.KEY=VALUE sets what the arguments below do not name, such as"
-        " mapping.registration.max_iterations=50, mapping.merge.cell_mm=1 or mapping.marks.dictionary=DICT_4X4_50.",
+        " mapping.merge.cell_mm=1, mapping.marks.dictionary=DICT_4X4_50 or mapping.registration.points=target (icp and"
+        " cpd then use the whole target; else the points of the marks, which need colour).",
     ).add_argument
     add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
     add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
@@ -46,13 +48,21 @@ def add_to(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_without_register(arguments: argparse.Namespace) -> None:
-    """Raise UserError where an argument for several views is given to a run of one capture."""
+    """Raise UserError where an argument for several views is given to a run of one capture, and where several whole
+    captures are."""
     given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
     given += [f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)]
     if given:
         raise UserError(
             f"--{given[0]}: concerns several views, and without --register all PATHs are one capture",
             legal=f"--register {'|'.join(METHODS)}",
+        )
+    whole = [path for path in arguments.paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
+    if len(arguments.paths) > 1 and whole:
+        raise UserError(
+            f"{len(arguments.paths)} PATHs, and {whole[0]} is a capture of its own",
+            legal="one capture: a folder, a file of many frames, or a list of .png, .ply or .pcd",
+            fix=f"run each alone, or, as views of one target, together: --register {'|'.join(METHODS)}",
         )
 
 

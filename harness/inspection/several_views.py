@@ -14,6 +14,7 @@ from harness.inspection.poses import read_poses
 from harness.inspection.registrations import Checks, checks_of, print_registrations, registration_rows
 from harness.inspection.several_arguments import mapping_config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.units import MM
 
 if TYPE_CHECKING:
     from detectors.interface import Detector
@@ -43,8 +44,8 @@ class Inspection:
 
     @property
     def beyond(self) -> str:
-        """The threshold in millimetres, in words."""
-        return printed.mm(self.threshold * self.judged.evidence.scale_m)
+        """The threshold in words."""
+        return printed.beyond_text(self.threshold, self.judged.evidence)
 
 
 def inspect_views(arguments: argparse.Namespace) -> int:
@@ -59,9 +60,10 @@ def inspect_views(arguments: argparse.Namespace) -> int:
     guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = tuple(steps.opened(arguments, [path]) for path in paths)
     views = tuple(_view(arguments, *each) for each in zip(_names(paths), recordings, guesses, strict=True))
-    mapped = _mapped(views, config)
+    prepared = tuple(_prepared(*each, config, arguments.crop) for each in zip(recordings, views, strict=True))
+    mapped = _mapped(prepared, config, has_poses=arguments.poses is not None)
     inspection = _judge(arguments, recordings, mapped, checks_of(mapped, config), detector)
-    _print(arguments, inspection)
+    _print(inspection)
     if arguments.out is not None:
         _write(arguments, inspection, config, settings)
     return 0
@@ -76,6 +78,13 @@ def _refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             f"{len(paths)} view to register: there is nothing to register it to",
             legal="two or more PATHs, each a capture of its own",
             fix="name the other views, or leave out --register",
+        )
+    places = [path.resolve() for path in paths]
+    twice = next((path for path, place in zip(paths, places, strict=True) if places.count(place) > 1), None)
+    if twice is not None:
+        raise UserError(
+            f"{twice}: is named twice; the same noise counted twice would pass for less noise",
+            legal="captures from different places, each named once",
         )
     if arguments.register == "nominal" and arguments.poses is None:
         raise UserError("--register nominal takes the poses as they are, and there are none", fix="give --poses FILE")
@@ -101,27 +110,32 @@ def _view(arguments: argparse.Namespace, name: str, recording: Recording, guess:
     return View(name, steps.averaged(arguments, recording), guess)
 
 
-def _mapped(views: tuple[View, ...], config: MappingConfig) -> Mapped:
-    """Prepare, register and merge. Raises UserError where a view has no target or its registration failed."""
+def _mapped(prepared: tuple[PreparedView, ...], config: MappingConfig, has_poses: bool) -> Mapped:
+    """Register and merge. Raises UserError where a view's registration failed."""
     from detectors.mapping.map_views import Mapped
     from detectors.mapping.merge import merge
     from detectors.registration.register import register
 
-    prepared = tuple(_prepared(view, config) for view in views)
-    if config.registration.method in START_FROM_MARKS and views[0].T_reference_view_guess is None:
+    if config.registration.method in START_FROM_MARKS and not has_poses:
         prepared = _started_from_marks(prepared)
     registrations = register(prepared, config.registration)
-    _refuse_failures(registrations)
+    _refuse_failures(registrations, has_poses)
     return Mapped(prepared, registrations, merge(prepared, registrations, config.merge))
 
 
-def _prepared(view: View, config: MappingConfig) -> PreparedView:
+def _prepared(recording: Recording, view: View, config: MappingConfig, crop: str) -> PreparedView:
+    """One view with its target and marks, which are told at once: they explain a registration that fails later.
+
+    Raises UserError where it has no target.
+    """
     from detectors.mapping.map_views import prepare
 
     try:
-        return prepare(view, config)
+        prepared = prepare(view, config)
     except UserError as mistake:
         raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
+    printed.print_view(recording, prepared, crop)
+    return prepared
 
 
 def _started_from_marks(prepared: tuple[PreparedView, ...]) -> tuple[PreparedView, ...]:
@@ -141,15 +155,16 @@ def _with_guess(prepared: PreparedView, T_reference_view: np.ndarray) -> Prepare
     return replace(prepared, view=replace(prepared.view, T_reference_view_guess=T_reference_view))
 
 
-def _refuse_failures(registrations: tuple[Registration, ...]) -> None:
+def _refuse_failures(registrations: tuple[Registration, ...], has_poses: bool) -> None:
     """Raise UserError that names each view that cannot be placed, and why."""
     failed = [each for each in registrations if each.failure]
     if failed:
-        told = "\n  ".join(f"{each.view}: {each.failure}" for each in failed)
+        told = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
+        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
         raise UserError(
             f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {told}",
-            fix="leave such views out, state where they stand (--poses), or choose another --register or --marks",
+            fix=f"leave such views out, {pose}, or choose another --register or --marks",
         )
 
 
@@ -174,22 +189,20 @@ def _judge(
 # ---- what is told ----------------------------------------------------------------------------------------------------
 
 
-def _print(arguments: argparse.Namespace, inspection: Inspection) -> None:
+def _print(inspection: Inspection) -> None:
     mapped, judged = inspection.mapped, inspection.judged
-    for recording, prepared in zip(inspection.recordings, mapped.views, strict=True):
-        printed.print_view(recording, prepared, arguments.crop)
     print_registrations(mapped, inspection.checks)
     cloud, merged = judged.cloud, mapped.merged
     for note in merged.notes:
         print(f"note: {note}")
     kept = np.isfinite(judged.evidence.residual_m)
     height, width = cloud.valid.shape
-    grid = f", a map of {width} x {height} cells, which u and v count" if cloud.projection == "parallel" else ""
+    cell_m = None if merged.surface_map is None else merged.surface_map.cell_m
+    grid = f", a map of {width} x {height} cells of {printed.mm(cell_m)}" if cell_m is not None else ""
     print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
     print(printed.surface_text(cloud, judged.evidence))
-    scale = printed.mm(judged.evidence.scale_m)
-    print(f"threshold: {inspection.threshold:.4g} x {scale} = {inspection.beyond} ({inspection.origin})")
-    printed.print_findings(judged.findings)
+    print(printed.threshold_text(inspection.threshold, judged.evidence, inspection.origin))
+    printed.print_findings(judged.findings, grid="px" if cell_m is None else "cell")
 
 
 def _write(
@@ -224,7 +237,11 @@ def _about(
             {"view": prepared.view.name, **steps.capture_facts(recording, prepared.view.cloud)}
             for recording, prepared in pairs
         ],
-        "merged": {"views": mapped.merged.views_used, "notes": mapped.merged.notes},
+        "merged": {
+            "views": mapped.merged.views_used,
+            "cell_mm": None if mapped.merged.surface_map is None else mapped.merged.surface_map.cell_m / MM,
+            "notes": mapped.merged.notes,
+        },
         "threshold": {
             "k": inspection.threshold,
             "mm": 1e3 * inspection.threshold * evidence.scale_m,
@@ -237,5 +254,5 @@ def _about(
             "mapping": config.to_data(),
             "detector": {"name": detector.name, "version": detector.version, "settings": settings},
         },
-        "provenance": steps.provenance(inspection.recordings),
+        "provenance": steps.provenance(inspection.recordings, *([arguments.poses] if arguments.poses else [])),
     }

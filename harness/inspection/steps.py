@@ -117,14 +117,15 @@ def threshold_of(
     return DEFAULT_K, "default, not calibrated: without an undamaged capture the rate of false calls is unknown"
 
 
-def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Command, code, versions, and the content of every file that can change a number."""
+def provenance(recordings: Sequence[Recording], *further: Path) -> dict[str, Any]:
+    """Command, code, versions, and the content of every file that can change a number: those of the recordings, and
+    ``further`` ones."""
     import hashlib
 
     from harness.vocabulary.provenance import record
 
     files = []
-    for path in (path for recording in recordings for path in recording.files):
+    for path in (*(path for recording in recordings for path in recording.files), *further):
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
     return {**record("python -m harness.detect " + shlex.join(sys.argv[1:])), "files": files}

@@ -119,6 +119,7 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
     files: dict[str, MappedExample] = {}
     for example in _in_order(examples):
         words = f"map {example.views} views {example.registration} {example.merge} {example.frames} frames"
+        words += f" {example.variant}" if example.is_variation else ""
         name = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
         number = sum(file.startswith(name) for file in files)
         files[f"{name}{f'-{number + 1}' if number else ''}.html"] = example
@@ -130,7 +131,7 @@ def map_text(example: MappedExample) -> str:
     way = ", ".join(part for part in (method_text(example.registration), example.merge) if part)
     return (
         f"{example.views} view{'s' if example.views > 1 else ''} ({way}), {example.frames} "
-        f"frame{'s' if example.frames > 1 else ''} a view"
+        f"frame{'s' if example.frames > 1 else ''} a view{f': {example.variant}' if example.is_variation else ''}"
     )
 
 

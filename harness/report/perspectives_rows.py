@@ -159,7 +159,7 @@ def variation_rows(tables: ResultTables, compared: pd.DataFrame) -> list[dict[st
                 "name": name,
                 "reason": variant["reason"],
                 "settings": variant["settings"],
-                "reference": reference or "none of the set-ups",
+                "reference": reference,
                 "lines": lines,
                 "registered": _registered(tables.registrations, name),
             }

@@ -57,7 +57,8 @@ class MappedExample:
 
     ``views``, ``registration``, ``merge``: the set-up in words. ``points_mm`` (k, 3), ``rgb`` (k, 3) uint8,
     ``residual_mm`` (k,) behind (+) or before (-) the fitted surface (NaN where not judged), ``detected`` (k,) bool.
-    ``view_of`` (k,): index of the view that a point came from, -1 where it is of several.
+    ``view_of`` (k,): index of the view that a point came from, -1 where it is of several. ``is_variation``: whether
+    ``variant`` is the label of a variation.
     """
 
     variant: str
@@ -73,3 +74,4 @@ class MappedExample:
     holes: tuple[HoleSeen, ...]
     findings: tuple[FindingSeen, ...]
     placed: tuple[PlacedView, ...]
+    is_variation: bool = False

@@ -137,14 +137,14 @@ def merged_figure(examples: Sequence[MappedExample]) -> str:
     """Merged clouds from the front, coloured by the view that each point came from, with rings at the true holes."""
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(len(examples), 1, squeeze=False)[:, 0]
+        panels = figure.subplots(len(examples), 1, squeeze=False, sharex=True)[:, 0]
         for axes, example in zip(panels, examples, strict=True):
             _cloud(axes, example)
         panels[-1].set_xlabel("x along the face (mm)")
         most = max(example.views for example in examples)
-        for view in range(most):
-            colour = VIEW_COLOURS[view % len(VIEW_COLOURS)]
-            panels[0].plot([], [], "o", ms=5, color=colour, label=f"view {view + 1}")
+        for view, colour in enumerate(VIEW_COLOURS[:most]):
+            again = " and on" if view + len(VIEW_COLOURS) < most else ""
+            panels[0].plot([], [], "o", ms=5, color=colour, label=f"view {view + 1}{again}")
         panels[0].plot([], [], "o", ms=5, color=SEVERAL, label="several views")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(most + 1, 6))
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 from collections.abc import Callable
+
+CLOSED_PIPE = 141
+"""What a shell reports of a program that SIGPIPE ended: 128 + 13."""
 
 
 class UserError(Exception):
@@ -36,12 +41,36 @@ def _rebuild(message: str, legal: str | None, fix: str | None) -> UserError:
 
 
 def exit_code_of(program: Callable[[], int]) -> int:
-    """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130."""
+    """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
+    that nobody reads to its end (``| head``) ends it silently with 141."""
     try:
-        return program()
+        code = program()
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        if not _nobody_reads():
+            raise
+        return CLOSED_PIPE
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _nobody_reads() -> bool:
+    """Whether it is the standard output whose pipe is closed; if so, what is still to be written goes nowhere, so that
+    the interpreter does not complain when it ends."""
+    try:
+        output = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return False
+    poll = select.poll()
+    poll.register(output, 0)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, output)
+    os.close(nowhere)
+    return True
