@@ -41,13 +41,14 @@ class DepthNoise:
         return self.slope * _regressor(cloud) / self.typical + self.constant
 
     def mean_variance(self, cloud: Cloud) -> np.ndarray:
-        """(h, w) of the average's z: one frame's over the number of samples, and what rounding leaves in it."""
+        """(h, w) of the average's z: the scatter of frames over their number, and what rounding leaves in any average,
+        which no scatter shows: where frames repeat each other exactly it is all there is."""
         variance = self.frame_variance(cloud)
         left = 0.0
         if cloud.z_step_m > 0 and self.source == "frames":
             left = rounding_left_m2(cloud.z_step_m, max(self.slope + self.constant - cloud.z_step_m**2 / 12.0, 0.0))
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean: np.ndarray = variance / cloud.count + left * (1.0 - 1.0 / cloud.count)
+            mean: np.ndarray = variance / cloud.count + left
         return np.maximum(mean, LEAST_M2)
 
 

@@ -173,8 +173,8 @@ def registration_error_m(
     """Root mean square target registration error over points (n, 3) of the reference frame, metres: in the plane
     across ``normal`` (3,), and along it (Fitzpatrick, West and Maurer 1998).
 
-    Against the true poses, so an error that a whole view shares counts: a camera that ranges d too far displaces what it
-    sees under an angle a by d sin(a) in the plane, marks and holes alike, though they still coincide in the map.
+    Against the true poses, so an error that a whole view shares counts: a camera that ranges d too far displaces what
+    it sees under an angle a by d sin(a) in the plane, marks and holes alike, though they still coincide in the map.
     """
     moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
     across = moved @ normal
