@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDTH_IN, DPI = 11.0, 150
+LABEL_IN = 3.4
+"""Length of the colour bar's label on one line."""
 FONT_PT = 7.0
 CIRCLE = "#ff00ff"
 OUTSIDE_GREY = 0.82
@@ -51,13 +53,16 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
     if panels == 2:
         axes[0].imshow(_colours(cloud), extent=_edges(cloud), interpolation="nearest")
     shown = _draw_residual(axes[-1], cloud, evidence)
-    figure.colorbar(
-        shown, ax=list(axes), label="behind (+) or before (-) the fitted surface, mm", shrink=0.6, extend="both"
-    )
+    # a low picture has no room for the whole of it on one line
+    label = "behind (+) or before (-) the fitted surface, mm"
+    low = height_in * 0.6 < LABEL_IN
+    bar = figure.colorbar(shown, ax=list(axes), shrink=1.0 if low else 0.6, extend="both")
+    bar.set_label("behind (+) or\nbefore (-) the\nsurface, mm" if low else label, fontsize=8 if low else None)
     marks = _marks(cloud, detections)
     for axis in axes:
-        axis.set_xlabel("u, px" if cloud.organised else "x, mm", fontsize=8)
-        axis.set_ylabel("v, px" if cloud.organised else "y, mm", fontsize=8)
+        unit = "cell" if cloud.projection == "parallel" else "px"
+        axis.set_xlabel(f"u, {unit}" if cloud.organised else "x, mm", fontsize=8)
+        axis.set_ylabel(f"v, {unit}" if cloud.organised else "y, mm", fontsize=8)
         axis.tick_params(labelsize=7)
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
     canvas.draw()  # the layout is known only now, and with it what a letter measures in the axes' units
