@@ -154,3 +154,24 @@ def test_views_and_mappings_are_axes_like_any_other(tmp_path: Path):
     assert len(experiment.points) == 8
     assert len({point.frames_key for point in experiment.points}) == 2
     assert experiment.points[0].variant == "views=1, registration=icp, spread=20 °"
+
+
+def test_another_kind_leaves_out_what_only_the_former_has(tmp_path: Path):
+    path = tmp_path / "views.yaml"
+    mapping = "mapping: {merge: {kind: fusion, cell_mm: 1.0}, registration: {method: cpd, max_iterations: 9}}"
+    axes = "sweep:\n  mapping.merge.kind: [fusion, grid]\n  mapping.registration.method: [cpd, marks]\n"
+    path.write_text(BASE.replace("VIEWS", ARC).replace("MAPPING", mapping) + axes)
+    points = {point.variant: point.config.mapping for point in load_experiment(path).points}
+    assert points["merge=fusion, registration=cpd"].merge.cell_mm == 1.0
+    assert points["merge=fusion, registration=cpd"].registration.max_iterations == 9
+    assert points["merge=grid, registration=marks"].merge.to_data() == {"kind": "grid", "step_mm": 0.1}
+    assert points["merge=grid, registration=marks"].registration.to_data() == {"method": "marks"}
+
+
+def test_a_key_that_no_kind_has_is_still_told(tmp_path: Path):
+    path = tmp_path / "views.yaml"
+    mapping = "mapping: {merge: {kind: fusion, cell_mmm: 1.0}}"
+    axes = "sweep:\n  mapping.merge.kind: [fusion, grid]\n"
+    path.write_text(BASE.replace("VIEWS", ARC).replace("MAPPING", mapping) + axes)
+    with pytest.raises(DeclarationError, match="did you mean: cell_mm"):
+        load_experiment(path)

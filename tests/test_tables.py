@@ -23,8 +23,20 @@ def probe(repeat: int, errors: list[int | None]) -> dict[str, object]:
 def test_order_of_records_does_not_matter_and_none_is_nan():
     experiment = load_experiment(ROOT / "experiments" / "smoke.yaml")
     records = [
-        {"holes": [hole(1, "1", None)], "runs": [], "probes": [probe(1, [1000, None, 2000, 1500])], "noise": []},
-        {"holes": [hole(0, "1", 2.0)], "runs": [], "probes": [probe(0, [3000, 10, 2000, 2500])], "noise": []},
+        {
+            "holes": [hole(1, "1", None)],
+            "runs": [],
+            "probes": [probe(1, [1000, None, 2000, 1500])],
+            "noise": [],
+            "registrations": [],
+        },
+        {
+            "holes": [hole(0, "1", 2.0)],
+            "runs": [],
+            "probes": [probe(0, [3000, 10, 2000, 2500])],
+            "noise": [],
+            "registrations": [],
+        },
     ]
     tables = tables_of(records, experiment)
     again = tables_of(records[::-1], experiment)
@@ -52,7 +64,13 @@ def test_every_variant_has_the_reason_that_stands_beside_it():
 def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
     several = load_experiment(ROOT / "experiments" / "cameras.yaml")
     variant = "camera=kinect_v2, distance=0.75 m"
-    record = {"holes": [hole(0, "1", 2.0) | {"variant": variant}], "runs": [], "probes": [], "noise": []}
+    record = {
+        "holes": [hole(0, "1", 2.0) | {"variant": variant}],
+        "runs": [],
+        "probes": [],
+        "noise": [],
+        "registrations": [],
+    }
     tables = tables_of([record], several)
     assert list(tables.axes.path) == ["source.camera.name", "source.target.distance_m"]
     assert list(tables.axes.unit) == ["", "m"]

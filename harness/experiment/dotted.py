@@ -52,7 +52,9 @@ def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | No
     """``data`` with the value at ``path`` replaced or added; the argument itself and all off the path stay unchanged.
 
     A mapping that is missing on the way is filled with its declared defaults where ``declared`` is given, so that
-    setting one key of it leaves the others at what they would have been. Raises PathError where the way is barred.
+    setting one key of it leaves the others at what they would have been. Likewise a key that says which of several
+    kinds a mapping is (``merge.kind``) leaves out what only the former kind has. Raises PathError where the way is
+    barred.
     """
     return _with(data, path, value, declared, ())
 
@@ -72,7 +74,20 @@ def _with(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None,
         inner = default_at(declared, here)
         if inner is _ABSENT:
             raise PathError(f"there is no `{key}`", here)
-    return {**data, key: _with(inner, rest, value, declared, here)}
+    kept = data if rest else _of_kind(data, key, value, declared, above)
+    return {**kept, key: _with(inner, rest, value, declared, here)}
+
+
+def _of_kind(data: Any, key: Any, value: Any, declared: shape.Declared | None, path: KeyPath) -> Any:
+    """The mapping at ``path`` without keys of its kind that the kind which ``value`` chooses does not know."""
+    annotation = declared.at(path) if declared else None
+    if annotation is None or shape.bare(annotation)[1] != key:
+        return data
+    old, new = (shape.model_for(annotation, one) for one in (data, {**data, key: value}))
+    if old is None or new is None:
+        return data
+    gone = set(old.model_fields) - set(new.model_fields)
+    return {name: one for name, one in data.items() if name not in gone}
 
 
 def _index(data: Any, key: str | int, above: KeyPath) -> Any:
