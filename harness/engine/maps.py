@@ -90,8 +90,7 @@ class MapMaker:
             views = self.prepared(mapping, frames)
             if method not in PAIRWISE:
                 return register(views, mapping.registration)
-            first = register(views[:1], mapping.registration)
-            return (*first, *(self._pair(number, mapping, frames) for number in range(1, len(views))))
+            return self._to_the_first(mapping, frames)[: len(views)]
 
         return self._once(make, "registrations", self._registration_key(mapping, frames))
 
@@ -125,13 +124,16 @@ class MapMaker:
         key = canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()])
         return self._once(make, "prepared", key)
 
-    def _pair(self, number: int, mapping: MappingConfig, frames: int) -> Registration:
-        def make() -> Registration:
-            pair = (self._prepared(0, mapping, frames), self._prepared(number, mapping, frames))
-            return register(pair, mapping.registration)[1]
+    def _to_the_first(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
+        """Every view that has such an average, registered to the first by itself: fewer views are the first of more."""
 
-        parts = [number, frames, mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
-        return self._once(make, "pair", canonical_json(parts))
+        def make() -> tuple[Registration, ...]:
+            numbers = [number for number, clouds in enumerate(self._clouds) if frames in clouds]
+            views = [self._prepared(number, mapping, frames) for number in numbers]
+            return register(views, mapping.registration)
+
+        parts = [frames, mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
+        return self._once(make, "to the first", canonical_json(parts))
 
     def _once(self, make: Callable[[], Made], what: str, key: str) -> Made:
         if what + key not in self._made:

@@ -89,12 +89,13 @@ def sight_of_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, h
     with np.errstate(invalid="ignore"):
         bare = (np.abs(place) < half).all(axis=-1)
     outlines, intact = {}, bare.copy()
+    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
     for damage in first.truth:
-        distance = np.linalg.norm(place - damage.centre_board_m[:2], axis=-1)
+        apart_m2 = (x - damage.centre_board_m[0]) ** 2 + (y - damage.centre_board_m[1]) ** 2
         with np.errstate(invalid="ignore"):
-            intact &= distance > damage.diameter_m / 2 + margin_m
-            within = np.flatnonzero(distance.ravel() < damage.diameter_m / 2)
-        outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(distance))])
+            intact &= apart_m2 > (damage.diameter_m / 2 + margin_m) ** 2
+            within = np.flatnonzero(apart_m2.ravel() < (damage.diameter_m / 2) ** 2)
+        outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(apart_m2))])
     return Sight(
         cloud=cloud,
         T_board_cloud=T_board_cloud,
