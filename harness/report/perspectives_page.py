@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from harness.evaluation.claim_maps import equal_exposures, equal_frames
@@ -121,9 +122,13 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
         words = f"map {example.views} views {example.registration} {example.merge} {example.frames} frames"
         words += f" {example.variant}" if example.is_variation else ""
         name = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
-        number = sum(file.startswith(name) for file in files)
-        files[f"{name}{f'-{number + 1}' if number else ''}.html"] = example
+        number = next(n for n in count(1) if _file(name, n) not in files)
+        files[_file(name, number)] = example
     return files
+
+
+def _file(name: str, number: int) -> str:
+    return f"{name}{f'-{number}' if number > 1 else ''}.html"
 
 
 def map_text(example: MappedExample) -> str:
