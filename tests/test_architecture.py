@@ -60,7 +60,7 @@ def test_no_further_code_folder():
     assert folders <= {*ROOMS, "tests"}
 
 
-@pytest.mark.parametrize("program", ["sweep", "detect", "export", "target", "validate", "prepare"])
+@pytest.mark.parametrize("program", ["sweep", "detect", "export", "target", "validate", "prepare", "pod"])
 def test_help_loads_nothing_heavy(program):
     code = (
         f"import sys; sys.argv = ['x', '--help']\n"

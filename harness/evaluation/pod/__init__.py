@@ -1,0 +1,3 @@
+"""Probability of detection by the field's standard (MIL-HDBK-1823A): pure statistics of anybody's inspection data."""
+
+from __future__ import annotations

@@ -1,0 +1,175 @@
+"""Confidence bounds of a hit/miss curve: on a size such as a90, and on the POD at every size.
+
+- "likelihood ratio" (default): the set 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 in (mu, sigma), MIL-HDBK-1823A
+  G.3; a90/95 is the largest a90 in it, which equals the profile likelihood of a90 at that criterion.
+- "profile": the same at the one-sided criterion chi2(2 confidence - 1, 1) = 2.706.
+- "wald": the size at which the pointwise lower Wald band of the linear predictor crosses the wanted POD (Fieller).
+
+All are one-sided upper bounds on size. Coverage at 60 targets is measured by ``tests/validation/pod_coverage.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import optimize, stats
+
+from harness.evaluation.pod.curve import Bound, link_cdf, link_ppf
+from harness.evaluation.pod.floor_ceiling import Bounded, bounded_profile, most_likely_below
+from harness.evaluation.pod.hit_miss import HitMissFit
+from harness.evaluation.pod.likelihood import flat_maximum, profile
+from harness.vocabulary.errors import UserError
+
+METHODS = ("likelihood ratio", "wald", "profile")
+FARTHEST = 2.0**40
+"""Largest distance from the estimate, in spreads of the sizes, at which a bound is looked for."""
+DIRECTIONS = 720
+"""Points on the outline of the likelihood ratio set from which a band is drawn."""
+
+
+def bound(
+    fit: HitMissFit,
+    pod: float = 0.9,
+    confidence: float = 0.95,
+    method: str = "likelihood ratio",
+    *,
+    rows_are_targets: bool = False,
+) -> Bound:
+    """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
+
+    ``rows_are_targets`` ignores that rows repeat targets: the wrong number, to be shown beside the right one.
+    """
+    _check(pod, confidence, method)
+    if pod <= fit.curve.floor:
+        raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
+    repeats = 1.0 if rows_are_targets else fit.repeats
+    if method == "wald":
+        x, why = _wald_bound(fit, pod, confidence, repeats)
+    else:
+        x, why = _likelihood_bound(fit, pod, criterion(method, confidence) * repeats)
+    with np.errstate(over="ignore"):
+        value = float(np.exp(x)) if fit.curve.log_size else x
+    if not np.isfinite(value):
+        why = f"not demonstrated: {why or 'the bound is beyond all numbers'}"
+        return Bound(pod, confidence, method, float("inf"), why)
+    return Bound(pod, confidence, method, value)
+
+
+def band(
+    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95, method: str = "likelihood ratio"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper POD at ``sizes`` (n,), each one-sided at ``confidence`` as in `bound`, for drawing: the lower one
+    crosses 90 % at a90/95 to a part in 1e4. A fitted floor and ceiling are held at their estimates."""
+    _check(0.5, confidence, method)
+    x = np.log(sizes) if fit.curve.log_size else np.asarray(sizes, float)
+    if method == "wald":
+        middle = fit.b0 + fit.b1 * x
+        reach = _normal(confidence) * np.sqrt(_variance(fit.covariance, x))
+        low, high = middle - reach, middle + reach
+    else:
+        outline = _outline(fit, criterion(method, confidence) * fit.repeats)
+        predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
+        low, high = predictors.min(axis=0), predictors.max(axis=0)
+    between = fit.curve.ceiling - fit.curve.floor
+    low, high = (fit.curve.floor + between * link_cdf(fit.curve.link, edge) for edge in (low, high))
+    return low, high
+
+
+def criterion(method: str, confidence: float) -> float:
+    """What 2 (llmax - ll) may reach: 3.841 for the likelihood ratio, 2.706 for the one-sided profile, at 95 %."""
+    share = confidence if method == "likelihood ratio" else 2.0 * confidence - 1.0
+    return float(stats.chi2.ppf(share, 1))
+
+
+def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
+    """The largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and why."""
+    data, z_best = fit.data, (_x_at(fit, pod) - fit.centre) / fit.spread
+    place = Bounded(
+        fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread, fit.curve.floor, fit.curve.ceiling, fit.log_likelihood
+    )
+    top = float(data.value(place.b0, place.b1))
+    level = float(link_ppf(fit.curve.link, np.array(pod)))
+    plain = replace(data, floor=0.0, ceiling=1.0)
+    flat = 2.0 * (top - flat_maximum(plain, level))
+    if flat <= allowed:
+        return float("inf"), f"a chance that does not grow with size fits too (ratio {flat:.2f} <= {allowed:.2f})"
+    low = 2.0 * (top - most_likely_below(data, place, fit.bounded, pod))
+    if low <= allowed:
+        return float("inf"), f"a ceiling of {pod:.0%} or less fits too (ratio {low:.2f} <= {allowed:.2f})"
+
+    def excess(z: float) -> float:
+        if fit.bounded == "none":
+            return 2.0 * (top - profile(plain, z, level)) - allowed
+        return 2.0 * (top - bounded_profile(data, place, fit.bounded, z, pod)) - allowed
+
+    reach = 0.25
+    while excess(z_best + reach) <= 0:
+        reach *= 2.0
+        if reach > FARTHEST:
+            return float("inf"), "the likelihood ratio set has no end"
+    exactness = 1e-10 if fit.bounded == "none" else 1e-6
+    z = optimize.brentq(excess, z_best, z_best + reach, xtol=exactness)
+    return fit.centre + fit.spread * float(z), ""
+
+
+def _wald_bound(fit: HitMissFit, pod: float, confidence: float, repeats: float) -> tuple[float, str]:
+    """The root of (b0 + b1 x - t)^2 = z^2 Var(b0 + b1 x) above the estimate; none where the slope may be 0."""
+    if fit.bounded != "none":
+        raise UserError("no Wald bound with a floor or a ceiling", legal="likelihood ratio, profile")
+    level, z2 = float(link_ppf(fit.curve.link, np.array(pod))), _normal(confidence) ** 2
+    v = fit.covariance / fit.repeats * repeats
+    square = fit.b1**2 - z2 * v[1, 1]
+    if square <= 0:
+        return float("inf"), f"the slope is within {np.sqrt(z2):.3f} standard errors of 0"
+    half = fit.b1 * (fit.b0 - level) - z2 * v[0, 1]
+    constant = (fit.b0 - level) ** 2 - z2 * v[0, 0]
+    return float((-half + np.sqrt(max(half**2 - square * constant, 0.0))) / square), ""
+
+
+def _x_at(fit: HitMissFit, pod: float) -> float:
+    """x (size or ln size) of this POD on the fitted curve; its middle where floor or ceiling keep it from that."""
+    share = (pod - fit.curve.floor) / (fit.curve.ceiling - fit.curve.floor)
+    if not 0 < share < 1:
+        return fit.curve.mu
+    return fit.curve.mu + fit.curve.sigma * float(link_ppf(fit.curve.link, np.array(share)))
+
+
+def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
+    """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0.
+
+    Along directions evenly spread in the metric of the covariance, by bisection of the distance, which a concave
+    likelihood makes exact.
+    """
+    data = fit.data
+    best = np.array([fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread])
+    scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
+    root = np.linalg.cholesky(scale @ fit.covariance_of_rows @ scale.T)
+    angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
+    step = np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T
+    with np.errstate(divide="ignore"):
+        farthest = np.where(step[:, 1] < 0, -best[1] / step[:, 1], np.inf)
+    lowest = float(data.value(*best)) - 0.5 * allowed
+    inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 1e3 * np.sqrt(allowed))
+    for _ in range(34):
+        middle = 0.5 * (inside + outside)
+        within = data.value(best[0] + middle * step[:, 0], best[1] + middle * step[:, 1]) >= lowest
+        inside, outside = np.where(within, middle, inside), np.where(within, outside, middle)
+    return np.asarray(best + inside[:, None] * step)
+
+
+def _variance(covariance: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.asarray(covariance[0, 0] + 2.0 * x * covariance[0, 1] + x**2 * covariance[1, 1])
+
+
+def _normal(confidence: float) -> float:
+    return float(stats.norm.ppf(confidence))
+
+
+def _check(pod: float, confidence: float, method: str) -> None:
+    if method not in METHODS:
+        raise UserError(f"bound by {method!r} is not known", legal=", ".join(METHODS))
+    if not 0 < pod < 1:
+        raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
+    if not 0.5 < confidence < 1:
+        raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")

@@ -1,0 +1,152 @@
+"""``python -m harness.pod``: the probability of detection of anybody's inspections, by the field's standard."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.evaluation.pod.statement import PodStatement
+
+LINKS = ("logit", "probit", "cloglog", "loglog")
+BOUNDED = ("none", "floor", "ceiling", "both")
+BOUNDS = ("likelihood-ratio", "profile", "wald")
+FILES = ("pod.json", "pod.png", "pod.html")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.pod " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.pod",
+        description="Fit a probability of detection curve to inspections, one a row of a CSV file, and state the size "
+        "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
+        epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
+    )
+    add = parser.add_argument
+    add("file", type=Path, metavar="FILE.csv", help="a header row, then one row an inspection; comma, semicolon or tab")
+    add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
+    add("--hit", metavar="COL", help="column of 1 (found) and 0 (missed)")
+    add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
+    add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
+    add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
+    add("--out", type=Path, default=Path("results/pod"), metavar="DIR", help="default: results/pod")
+    add(
+        "--log",
+        action=argparse.BooleanOptionalAction,
+        help="the curve against the sizes' logarithm, or not (default: what gives less deviance)",
+    )
+    hits = parser.add_argument_group("with --hit")
+    put = hits.add_argument
+    put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
+    put("--bound", choices=BOUNDS, help="how a90/95 is found (default: likelihood-ratio, 3.841)")
+    put("--bounded", choices=BOUNDED, help="fit hits by chance (floor), misses at any size (ceiling) or both as well")
+    signals = parser.add_argument_group("with --ahat")
+    put = signals.add_argument
+    put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
+    put("--left", type=float, metavar="Y", help="signals at or below this are known to be no more than that (noise)")
+    put("--right", type=float, metavar="Y", help="signals at or above this are known to be no less (saturation)")
+    put(
+        "--log-signal",
+        action=argparse.BooleanOptionalAction,
+        help="the straight line is of the signals' logarithm, or not (default: what gives less deviance)",
+    )
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    _refuse_what_does_not_belong(options)
+    statement = _hits(options) if options.hit is not None else _signals(options)
+    from harness.report.pod_page import pod_text
+
+    print(pod_text(statement))
+    _write(statement, options.out, command)
+    return 0
+
+
+def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
+    if (options.hit is None) == (options.ahat is None):
+        both = options.hit is not None
+        raise UserError(
+            "--hit and --ahat: " + ("one of them, not both" if both else "which column tells what was found?"),
+            legal="--hit COL with 0 and 1, or --ahat COL with signals and --decision Y",
+            fix="leave one out" if both else "name the column; none is guessed",
+        )
+    foreign = ("decision", "left", "right", "log_signal") if options.hit is not None else ("link", "bound", "bounded")
+    for name in foreign:
+        if getattr(options, name) is not None:
+            other = "--ahat" if options.hit is not None else "--hit"
+            raise UserError(f"--{name.replace('_', '-')} belongs to {other}", fix="leave it out")
+    if options.ahat is not None and options.decision is None:
+        raise UserError(
+            "--ahat needs --decision: the POD is that of a signal above it",
+            legal="a signal, in the column's unit",
+            fix="add --decision Y; a value for a wanted rate of false calls comes from hole-free runs",
+        )
+
+
+def _hits(options: argparse.Namespace) -> PodStatement:
+    from harness.evaluation.pod.inspection_file import read_inspections, require_hits, require_positive
+    from harness.evaluation.pod.state_hits import state_hits
+
+    read = read_inspections(options.file, options.size, options.hit, options.target)
+    require_hits(read)
+    if options.log:
+        require_positive(read, response=False, why="--log")
+    method = (options.bound or BOUNDS[0]).replace("-", " ")
+    return state_hits(
+        read,
+        link=options.link,
+        log_size=options.log,
+        bounded=options.bounded or "none",
+        method=method,
+        unit=options.unit,
+    )
+
+
+def _signals(options: argparse.Namespace) -> PodStatement:
+    from harness.evaluation.pod.inspection_file import read_inspections, require_positive
+    from harness.evaluation.pod.state_signals import state_signals
+
+    read = read_inspections(options.file, options.size, options.ahat, options.target)
+    if options.log:
+        require_positive(read, response=False, why="--log")
+    if options.log_signal and options.left is None:
+        require_positive(read, response=True, why="--log-signal")
+    return state_signals(
+        read,
+        decision=options.decision,
+        left=options.left,
+        right=options.right,
+        log_size=options.log,
+        log_signal=options.log_signal,
+        unit=options.unit,
+    )
+
+
+def _write(statement: PodStatement, out: Path, command: str) -> None:
+    import json
+
+    from harness.report.pod_figure import save_pod_png
+    from harness.report.pod_page import pod_html
+    from harness.vocabulary.files import write_text
+
+    data, picture, page = (out / name for name in FILES)
+    write_text(data, json.dumps({**statement.to_data(), "command": command}, indent=2, allow_nan=False) + "\n")
+    save_pod_png(picture, statement)
+    write_text(page, pod_html(statement, command))
+    print(f"wrote {data}, {picture.name}, {page.name}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,188 @@
+"""Figure: a probability of detection curve with its band, the inspections behind it, and the sizes read off it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.evaluation.pod.statement import POD, PodStatement
+from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, STYLE, svg
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STRIPE = 0.10
+"""Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
+
+
+def pod_svg(statement: PodStatement) -> str:
+    """The figure as text of an inline ``<svg>``."""
+    size_in, draw = _plan(statement)
+    return svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
+
+
+def save_pod_png(path: Path, statement: PodStatement) -> None:
+    """The figure as a PNG of 160 dots an inch at ``path``; the same bytes for the same statement."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from harness.vocabulary.files import atomic_path
+
+    size_in, draw = _plan(statement)
+    style: Any = STYLE
+    with rc_context(style), atomic_path(path) as temporary:
+        figure = Figure(figsize=size_in, layout="constrained", dpi=160)
+        canvas = FigureCanvasAgg(figure)
+        draw(figure)
+        canvas.print_png(str(temporary), metadata={"Software": None})
+
+
+def answer(statement: PodStatement) -> str:
+    """The limit in one sentence."""
+    size = f"{statement.bound.confidence:.0%} confidence".replace("%", " %")
+    if statement.bound.demonstrated:
+        limit = sized(statement.bound.value, statement.unit)
+        return f"A flaw of {limit} is found 90 % of the time, with {size} (a90/95, {statement.bound.method})."
+    return f"a90/95 is not demonstrated: {statement.bound.why.removeprefix('not demonstrated: ')}."
+
+
+def sized(value: float, unit: str) -> str:
+    """A size with four significant digits and its unit; a word where it is no size."""
+    if not np.isfinite(value):
+        return "not reached"
+    return f"{value:#.4g}".rstrip(".") + (f" {unit}" if unit else "")
+
+
+def limit_text(statement: PodStatement) -> str:
+    """a90/95 for a table or a legend."""
+    return sized(statement.bound.value, statement.unit) if statement.bound.demonstrated else "not demonstrated"
+
+
+def axis_text(column: str, unit: str) -> str:
+    """``column`` with its unit in brackets, where one was told."""
+    return plain(f"{column} ({unit})" if unit else column)
+
+
+def plain(text: str) -> str:
+    """The user's words for a figure, whose library would typeset what stands between dollar signs."""
+    return text.replace("$", r"\$")
+
+
+def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figure], None]]:
+    """Size in inches, and what draws it: one panel, or two where there are signals to see."""
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
+        if statement.signal:
+            _signals(panels[0], statement)
+        _curve(panels[-1], statement)
+
+    return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
+
+
+def _curve(axes: Axes, statement: PodStatement) -> None:
+    curve, sizes = statement.curve, statement.sizes
+    confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
+    axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
+    axes.plot(sizes, statement.lower, color=BLUE, lw=0.9, ls="--", label=f"{confidence} band, {statement.bound.method}")
+    axes.plot(sizes, statement.upper, color=BLUE, lw=0.9, ls="--")
+    axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
+    axes.axhline(POD, color=GREY, lw=0.8, ls=":")
+    if statement.signal is None:
+        _hits(axes, statement)
+    for name, value, pod, colour in (
+        ("a50", statement.a50, 0.5, GREEN),
+        ("a90", statement.a90, POD, ORANGE),
+        ("a90/95", statement.bound.value, POD, RED),
+    ):
+        _mark(axes, statement, name, value, pod, colour)
+    beside = STRIPE + 0.06 if statement.signal is None else 0.03
+    axes.set_ylim(-beside, 1 + beside)
+    if curve.log_size:
+        _log_sizes(axes, sizes)
+    axes.set_xlim(sizes[0], sizes[-1])
+    axes.set_yticks(np.linspace(0, 1, 6))
+    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+    axes.set_ylabel("probability of detection")
+    axes.set_title(f"Probability of detection, {statement.targets} targets")
+    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+
+
+def _hits(axes: Axes, statement: PodStatement) -> None:
+    """Each inspection as a stroke: hits above 1, misses below 0, spread in height so that equal sizes stay apart."""
+    spread = STRIPE * _spread(len(statement.size))
+    hit = statement.response == 1
+    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": 0.6, "clip_on": False}
+    axes.scatter(statement.size[hit], 1.03 + spread[hit], **style)
+    label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"
+    axes.scatter(statement.size[~hit], -0.03 - spread[~hit], label=label, **style)
+
+
+def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: float, colour: str) -> None:
+    text = limit_text(statement) if name == "a90/95" else sized(value, statement.unit)
+    label = plain(f"{name}: {text}")
+    if np.isfinite(value) and statement.sizes[0] <= value <= statement.sizes[-1]:
+        axes.plot([value, value], [0, pod], color=colour, lw=1.1)
+        axes.plot([value], [pod], "o", color=colour, ms=6, mec="white", mew=0.8, label=label, zorder=5)
+    else:
+        axes.plot(
+            [], [], "o", color=colour, ms=6, label=label if not np.isfinite(value) else f"{label}, off this figure"
+        )
+
+
+def _signals(axes: Axes, statement: PodStatement) -> None:
+    """Signals against sizes with the fitted line, one deviation beside it, the decision and where signals end."""
+    model = statement.signal
+    assert model is not None
+    sizes = statement.sizes
+    x = np.log(sizes) if statement.curve.log_size else sizes
+    line = model.b0 + model.b1 * x
+    back = np.exp if model.log_signal else np.asarray
+    axes.fill_between(sizes, back(line - model.tau), back(line + model.tau), color=BLUE, alpha=0.14, lw=0)
+    axes.plot(sizes, back(line), color=BLUE, label="fit ± one deviation")
+    axes.axhline(model.decision, color=RED, lw=1.2, label=f"decision {model.decision:g}")
+    ends = [f"{sign} {value:g}" for sign, value in (("≤", model.left), ("≥", model.right)) if value is not None]
+    for value in (model.left, model.right):
+        if value is not None:
+            axes.axhline(value, color=GREY, lw=1.0, ls="--")
+    kept = np.ones(len(statement.size), bool)
+    if model.left is not None:
+        kept &= statement.response > model.left
+    if model.right is not None:
+        kept &= statement.response < model.right
+    axes.scatter(statement.size[kept], statement.response[kept], s=14, color=INK, alpha=0.7, lw=0, label="signals")
+    if ends:
+        label = f"censored, {' or '.join(ends)}"
+        axes.scatter(
+            statement.size[~kept], statement.response[~kept], s=18, marker="x", color=PURPLE, lw=1, label=label
+        )
+    if model.log_signal:
+        axes.set_yscale("log")
+    if statement.curve.log_size:
+        _log_sizes(axes, sizes)
+    axes.set_xlim(sizes[0], sizes[-1])
+    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+    axes.set_ylabel(plain(statement.response_column))
+    axes.set_title("Signals")
+    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+
+
+def _log_sizes(axes: Axes, sizes: np.ndarray) -> None:
+    """A logarithmic axis whose numbers are written out."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if sizes[-1] / sizes[0] < 1000 else (1,)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _spread(n: int) -> np.ndarray:
+    """(n,) numbers in [0, 1) that keep apart without chance: multiples of the golden ratio."""
+    return np.asarray((np.arange(n) * 0.6180339887498949) % 1.0)

@@ -1,0 +1,181 @@
+"""False calls against exact laws and by simulation; planning a study; repeats beside targets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from harness.evaluation.pod.curve import PodCurve
+from harness.evaluation.pod.design import design, guess_with_frames, place_sizes, repeats_are_not_targets
+from harness.evaluation.pod.false_calls import (
+    false_call_probability,
+    false_call_probability_of_noise,
+    false_call_rate,
+    threshold_for_rate,
+)
+from harness.vocabulary.errors import UserError
+
+GUESS = PodCurve("logit", False, 10.0, 2.0, np.zeros((2, 2)))
+
+
+def test_no_false_call_on_59_sites() -> None:
+    """By hand: (1 - p)^59 = 0.05."""
+    none = false_call_probability(0, 59)
+    assert none.probability == 0
+    assert none.upper == pytest.approx(1 - 0.05 ** (1 / 59), rel=1e-12)
+    assert false_call_probability(4, 4).upper == 1.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(sites=st.integers(1, 400), share=st.floats(0, 0.99), confidence=st.floats(0.6, 0.99))
+def test_upper_bound_of_the_probability_inverts_the_binomial(sites: int, share: float, confidence: float) -> None:
+    calls = int(share * sites)
+    found = false_call_probability(calls, sites, confidence)
+    assert stats.binom.cdf(calls, sites, found.upper) == pytest.approx(1 - confidence, rel=1e-8)
+
+
+def test_bound_of_the_noise_covers_by_simulation() -> None:
+    """400 samples of 25 normal values, decision at 2 deviations (PFP 2.3 %): the non-central t bound is exact, so the
+    count is binomial with 0.95; limits at alpha = 0.001, seed fixed."""
+    noise = np.random.default_rng(1).normal(3.0, 0.5, (400, 25))
+    covered = sum(false_call_probability_of_noise(one, 4.0).upper >= stats.norm.sf(2.0) for one in noise)
+    low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
+    assert low <= covered <= high
+
+
+def test_bound_of_the_noise_is_the_one_sided_tolerance_factor() -> None:
+    """Printed factor of 10 normal values, 95 % content at 95 % confidence: 2.911 (Natrella 1963, table A-7)."""
+    values = np.random.default_rng(6).normal(size=10)
+    values = (values - values.mean()) / values.std(ddof=1)
+    assert false_call_probability_of_noise(values, 2.911).upper == pytest.approx(0.05, rel=1e-3)
+
+
+def test_noise_of_a_logarithmic_signal_and_of_a_censored_one() -> None:
+    noise = np.exp(np.random.default_rng(2).normal(0.0, 0.4, 300))
+    plain = false_call_probability_of_noise(noise, 2.0, log_signal=True)
+    logs = np.log(noise)
+    assert plain.probability == pytest.approx(stats.norm.sf((np.log(2.0) - logs.mean()) / logs.std()), rel=1e-9)
+    floor = float(np.median(noise))
+    censored = false_call_probability_of_noise(np.maximum(noise, floor), 2.0, left=floor, log_signal=True)
+    assert censored.probability == pytest.approx(plain.probability, rel=0.4)
+    assert censored.upper > plain.upper, "half of the signals hold less"
+
+
+def test_rate_per_area_by_poisson() -> None:
+    three = false_call_rate(3, 1.5)
+    assert three.rate_per_m2 == 2.0
+    assert stats.poisson.cdf(3, three.upper_per_m2 * 1.5) == pytest.approx(0.05, rel=1e-9)
+    assert stats.poisson.cdf(3, three.interval_per_m2.high * 1.5) == pytest.approx(0.025, rel=1e-9)
+    assert stats.poisson.sf(2, three.interval_per_m2.low * 1.5) == pytest.approx(0.025, rel=1e-9)
+    assert false_call_rate(0, 2.0).upper_per_m2 == pytest.approx(-np.log(0.05) / 2, rel=1e-9)
+
+
+def test_threshold_of_a_hundred_runs_by_hand() -> None:
+    """99 runs, wanted P(call) = 1 - exp(-0.07) = 0.0676: six of a hundred may lie above, so five of the 99 do."""
+    found = threshold_for_rate(np.random.default_rng(3).permutation(99.0 * np.arange(99)), 0.07, 1.0)
+    assert (found.value, found.calling_runs, found.runs) == (99.0 * 93, 5, 99)
+    assert found.rate_per_m2 == pytest.approx(-np.log(0.94) / 0.07)
+    assert found.upper_per_m2 == pytest.approx(-np.log1p(-stats.beta.ppf(0.95, 6, 94)) / 0.07)
+
+
+def test_threshold_keeps_the_rate_on_new_runs() -> None:
+    """Calls on boards are Poisson with rate 6 per m2 at score > 0 and exponential scores: rate(t) = 6 exp(-t). Over
+    300 calibrations the mean probability of a call on a new run is (k + 1) / (n + 1); normal limits, alpha = 0.001."""
+    rng = np.random.default_rng(4)
+    area, runs = 0.07, 40
+    probability, wanted = [], []
+    for _ in range(300):
+        highest = [rng.exponential(size=count).max(initial=-np.inf) for count in rng.poisson(6 * area, runs)]
+        found = threshold_for_rate(highest, area, 1.0)
+        probability.append(-np.expm1(-6 * np.exp(-max(found.value, 0.0)) * area))
+        wanted.append(-np.expm1(-found.rate_per_m2 * area))
+    assert np.allclose(wanted, 2 / 41)
+    error = np.std(probability) / np.sqrt(300)
+    assert abs(np.mean(probability) - 2 / 41) < 3.3 * error
+
+
+def test_runs_without_findings_and_ties() -> None:
+    silent = threshold_for_rate([-np.inf] * 95 + [1.0] * 5, 0.07, 1.0)
+    assert (silent.value, silent.calling_runs) == (-np.inf, 5)
+    tied = threshold_for_rate([2.0] * 100, 0.07, 1.0)
+    assert (tied.value, tied.calling_runs) == (2.0, 0)
+
+
+def test_too_few_runs_says_how_many() -> None:
+    with pytest.raises(UserError, match="at least 14 runs"):
+        threshold_for_rate(np.arange(13.0), 0.07, 1.0)
+    assert threshold_for_rate(np.arange(14.0), 0.07, 1.0).calling_runs == 0
+
+
+def test_places_of_sizes() -> None:
+    assert place_sizes(GUESS, 4, (0, 40), "uniform").tolist() == [5.0, 15.0, 25.0, 35.0]
+    sizes = place_sizes(GUESS, 60, (1, 40), "concentrated")
+    start, end = GUESS.size_at(0.03), GUESS.size_at(0.97)
+    rising = (sizes >= start) & (sizes <= end)
+    assert len(sizes) == 60 and np.all(np.diff(sizes) >= 0)
+    assert rising.sum() == 40 + round(20 * (end - start) / 39)
+    with pytest.raises(UserError, match="does not rise"):
+        place_sizes(GUESS, 60, (30, 40), "concentrated")
+
+
+def test_more_targets_and_better_places_demonstrate_smaller_sizes() -> None:
+    plans = {(plan.targets, plan.placement): plan for plan in design(GUESS, (30, 120), (1, 80), studies=60)}
+    assert all(plan.true_size == pytest.approx(10 + 2 * np.log(9)) for plan in plans.values())
+    assert plans[120, "uniform"].bound < plans[30, "uniform"].bound
+    assert plans[120, "concentrated"].bound < plans[120, "uniform"].bound
+    assert plans[120, "concentrated"].low <= plans[120, "concentrated"].bound <= plans[120, "concentrated"].high
+    assert any("at least 60" in note for note in plans[30, "uniform"].notes)
+    assert plans[120, "uniform"].notes == ()
+
+
+def test_a_plan_is_repeatable_and_independent_of_its_company() -> None:
+    alone = design(GUESS, (20,), (1, 40), placements=("uniform",), studies=10, seed=3)[0]
+    among = design(GUESS, (16, 20), (1, 40), studies=10, seed=3)[2]
+    assert (alone.bound, alone.low, alone.high) == (among.bound, among.low, among.high)
+
+
+def test_studies_far_from_the_rise_demonstrate_nothing() -> None:
+    plan = design(GUESS, (20,), (30, 60), placements=("uniform",), studies=20)[0]
+    assert plan.bound == np.inf and plan.demonstrated < 0.5
+    assert any("outside the range" in note for note in plan.notes)
+
+
+def test_frames_shrink_the_guess_as_they_shrink_the_noise() -> None:
+    white = guess_with_frames(GUESS, 100, guessed_with=25, fixed_share=0.0)
+    assert white.size_at(0.9) == pytest.approx(GUESS.size_at(0.9) / 2)
+    fixed = guess_with_frames(GUESS, 10**9, guessed_with=25, fixed_share=0.36)
+    assert fixed.size_at(0.9) == pytest.approx(GUESS.size_at(0.9) * 0.6, rel=1e-6)
+    log = PodCurve("probit", True, 1.0, 0.3, np.zeros((2, 2)))
+    assert guess_with_frames(log, 4, guessed_with=1, fixed_share=0.0).size_at(0.3) == pytest.approx(
+        log.size_at(0.3) / 2
+    )
+
+
+def test_fifty_repeats_of_eight_holes_are_eight_targets() -> None:
+    size = np.repeat(2.5 * np.arange(1, 9), 50)
+    hit = np.random.default_rng(5).random(400) < GUESS.pod(size)
+    check = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 50))
+    assert (check.targets, check.inspections, check.fit.repeats) == (8, 400, 50)
+    assert check.fit.curve.size_at(0.9) < check.wrong.value < check.right.value
+    assert "400 inspections of 8 targets are 8 targets" in check.text
+    assert f"{check.right.value:.4g}" in check.text and f"{check.wrong.value:.4g}" in check.text
+
+
+def test_mistakes_of_the_user() -> None:
+    with pytest.raises(UserError, match="5 false calls on 4"):
+        false_call_probability(5, 4)
+    with pytest.raises(UserError, match="three finite"):
+        false_call_probability_of_noise([1.0, np.nan, 2.0, 3.0], 2.0)
+    with pytest.raises(UserError, match="area above 0"):
+        false_call_rate(1, 0.0)
+    with pytest.raises(UserError, match="no numbers"):
+        threshold_for_rate([np.nan, 1.0], 1.0, 1.0)
+    with pytest.raises(UserError, match="range of sizes"):
+        design(GUESS, (60,), (5, 5))
+    with pytest.raises(UserError, match="two targets"):
+        design(GUESS, (1,), (1, 5))
+    with pytest.raises(UserError, match="fixed share"):
+        guess_with_frames(GUESS, 10, guessed_with=1, fixed_share=1.5)
