@@ -7,14 +7,14 @@ import pytest
 from synthetic_perspectives import MapWorld, name_of, perspectives, with_variation
 
 from harness.evaluation.claim_maps import rms_gap
-from harness.evaluation.claim_views import VIEW_CLAIMS, verdicts_of
-from harness.evaluation.map_case import LARGE_MM
+from harness.evaluation.claim_views import VIEW_CLAIMS, score_views
+from harness.evaluation.map_case import LARGE_MM, map_cases
 from harness.evaluation.summary import summarise_holes
 
 
 def verdict(claim, found):
     summary = summarise_holes(found.holes, list(found.axes["path"]))
-    verdicts = {one.claim: one for one in verdicts_of(found, summary)}
+    verdicts = {one.claim: one for one in score_views(map_cases(found, summary))}
     assert list(verdicts) == list(VIEW_CLAIMS)
     return verdicts[claim]
 

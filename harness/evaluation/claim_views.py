@@ -21,7 +21,6 @@ from harness.evaluation.map_case import (
     AgainstOne,
     MapCase,
     against_one,
-    map_cases,
 )
 from harness.evaluation.map_text import change_text, frames_text, ratio_text, span
 from harness.evaluation.registration import of_map, paired_ratio, per_unit, trusted
@@ -29,7 +28,6 @@ from harness.evaluation.registration import of_map, paired_ratio, per_unit, trus
 if TYPE_CHECKING:
     import pandas as pd
 
-    from harness.evaluation.summary import ResultTables
 
 C7 = "ICP and CPD both bring the fiducials of two views into one plane; CPD aligns them better within it."
 C7_RULE = (
@@ -149,8 +147,3 @@ def _against_text(found: AgainstOne) -> str:
     parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
     parts += [f"Found by two views only: {hole_list(found.gained)}."] if found.gained else []
     return " ".join(parts)
-
-
-def verdicts_of(tables: ResultTables, summary: pd.DataFrame) -> list[Verdict]:
-    """`score_views` of all places of an experiment."""
-    return score_views(map_cases(tables, summary))

@@ -35,11 +35,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files (0600); results are meant to be shared under the user's umask.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        os.replace(temporary, path)
+        _move_shared(temporary, path, 0o666)
     except OSError as error:
         raise _explained(error, path) from error
     finally:
@@ -64,15 +60,19 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         raise _explained(error, path) from error
     try:
         yield temporary
-        # mkdtemp makes private folders (0700), as mkstemp does files
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o777 & ~umask)
-        os.replace(temporary, path)
+        _move_shared(temporary, path, 0o777)
     except OSError as error:
         raise _explained(error, path) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _move_shared(temporary: Path, path: Path, mode: int) -> None:
+    """Rename, with the permissions that the user's umask leaves: tempfile makes everything private."""
+    umask = os.umask(0)
+    os.umask(umask)
+    temporary.chmod(mode & ~umask)
+    os.replace(temporary, path)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
