@@ -3,12 +3,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sweep test lint smoke validate benchmarks lock clean
+.PHONY: sweep test lint smoke validate check benchmarks lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
 test: .venv/.ready
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: .venv/.ready
 	$(BIN)/ruff check .
@@ -20,6 +20,9 @@ smoke: .venv/.ready
 
 validate: .venv/.ready
 	$(BIN)/python -m harness.validate
+
+check: .venv/.ready
+	$(BIN)/python -m harness.check experiments/regression.yaml
 
 benchmarks: .venv/.ready
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only -o python_files='bench_*.py' -o addopts=''

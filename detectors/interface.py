@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -28,11 +28,13 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Detection:
-    """One cluster of damaged pixels. ``score``: the highest threshold at which it would still be found."""
+    """One finding. ``score``: the lowest threshold at which it is found no more. ``pixels`` (n,): flat indices into the
+    cloud's (h, w) grid, ascending; ``centre_m`` (3,): where it is, in the cloud's frame: what decides which damage it
+    counts for."""
 
     score: float
     pixels: np.ndarray
-    """(n,) flat indices into the cloud's (h, w) grid, ascending."""
+    centre_m: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,25 @@ class Measurement:
     model_centre_se_m: float
     volume_m3: float
     model_note: str = ""
+
+
+@dataclass(frozen=True)
+class TrueDamage:
+    """One damage as a detector is told of it that tests the harness: centre (3,) on the face in the cloud's frame,
+    diameter, and the flat indices of the pixels that see into it."""
+
+    centre_m: np.ndarray
+    diameter_m: float
+    pixels: np.ndarray
+
+
+@runtime_checkable
+class ToldTheTruth(Protocol):
+    """A detector that is handed the truth, and by it tests the harness: no detector of damage is one."""
+
+    def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
+        """The detector for one cloud with this truth; empty on a hole-free board."""
+        ...
 
 
 class Detector(Protocol):

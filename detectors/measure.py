@@ -83,11 +83,11 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     return diameter, (west + east + north + south) / 4.0
 
 
-def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig) -> Measurement:
-    """Both measures of one detection; NaN and a note where one cannot be made."""
+def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
+    """The thesis' extents alone; ``note`` says why there is no more."""
     points = cloud.points_m.reshape(-1, 3)[detection.pixels]
     diameter, centre = extents(points)
-    blank = Measurement(
+    return Measurement(
         u_px=np.nan,
         v_px=np.nan,
         points=len(points),
@@ -101,12 +101,17 @@ def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, co
         model_centre_m=NOWHERE,
         model_centre_se_m=np.nan,
         volume_m3=np.nan,
-        model_note="no pixel grid: extents only",
+        model_note=note,
     )
+
+
+def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig) -> Measurement:
+    """Both measures of one detection; NaN and a note where one cannot be made."""
+    blank = measure_extents(cloud, detection, "no pixel grid: extents only")
     if not cloud.organised:
         return blank
     rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
-    placed = replace(blank, u_px=float(columns.mean()) + cloud.region.col0, v_px=float(rows.mean()) + cloud.region.row0)
+    placed = on_pixels(cloud, detection, blank)
     around = _Surroundings.of(cloud, evidence, rows, columns, config)
     if around is None:
         return replace(placed, model_note="too few valid pixels around for a model")
@@ -114,6 +119,13 @@ def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, co
     if fit is None or doubt:
         return _by_contour(placed, around, doubt)
     return _by_model(placed, around, fit)
+
+
+def on_pixels(cloud: Cloud, detection: Detection, measured: Measurement) -> Measurement:
+    """A measurement with the mean of the detection's pixels as its place on the sensor."""
+    rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+    u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
+    return replace(measured, u_px=u, v_px=v)
 
 
 # ---------------------------------------------------------------- the neighbourhood

@@ -7,21 +7,17 @@ script's (``variant: script``): least squares without cross terms, 1.2 standard 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from detectors.crop import BoxCrop, CropConfig, crop
-from detectors.interface import Detection, Evidence, Measurement
-from detectors.measure import HoleModelConfig, measure_detection
+from detectors.interface import Evidence
 from detectors.rounding import rounding_left_m2
-from detectors.segment import euclidean_clusters
+from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.capture import Cloud
-from harness.vocabulary.config import Config
-from harness.vocabulary.units import MM
 
 SCRIPT_VARIANT: dict[str, Any] = {
     "surface": {"degree": 3, "method": "least_squares", "drop_cross_terms": True},
@@ -31,14 +27,13 @@ SCRIPT_THRESHOLD = 1.2
 """The script's k, in standard deviations of the raw z."""
 
 
-class ThesisConfig(Config):
+class ThesisConfig(ScoreMapConfig):
     """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
 
     ``scale``: the standard deviation that one unit of score means: ``mad`` (median |residual| / 0.6745),
     ``residual_std`` or ``raw_z_std``. ``use_variance``: where the cloud's maker states each point's variance, as a map
     does, one unit of score is a multiple of each point's own deviation, and the scale is taken of residuals over
-    deviations (``raw_z_std`` knows no residual and leaves the variances alone). ``min_points``: clusters with fewer
-    points are no detections.
+    deviations (``raw_z_std`` knows no residual and leaves the variances alone).
     """
 
     variant: Literal["text", "script"] = "text"
@@ -46,9 +41,6 @@ class ThesisConfig(Config):
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
     scale: Literal["mad", "residual_std", "raw_z_std"] = "mad"
     use_variance: bool = True
-    min_points: int = Field(default=1, ge=1)
-    cluster_distance_mm: float = Field(default=10.0, gt=0)
-    hole_model: HoleModelConfig = Field(default_factory=HoleModelConfig)
 
     @model_validator(mode="before")
     @classmethod
@@ -61,15 +53,12 @@ class ThesisConfig(Config):
         return filled
 
 
-class ThesisDetector:
-    """Implements `detectors.interface.Detector`."""
+class ThesisDetector(ScoreMapDetector[ThesisConfig]):
+    """A surface through the cropped cloud; whatever lies k deviations off it, clustered: the thesis' way."""
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
     version = 3
-
-    def __init__(self, settings: ThesisConfig) -> None:
-        self.settings = settings
 
     @property
     def default_threshold(self) -> float | None:
@@ -99,9 +88,9 @@ class ThesisDetector:
             "floor_m": floor,
         }
         return Evidence(
-            score=_spread_out(np.abs(residual) / scale, mask),
-            residual_m=_spread_out(residual, mask),
-            surface_z_m=_spread_out(fitted, mask),
+            score=on_grid(np.abs(residual) / scale, mask),
+            residual_m=on_grid(residual, mask),
+            surface_z_m=on_grid(fitted, mask),
             scale_m=float(np.median(scale)),
             notes=notes,
         )
@@ -114,45 +103,6 @@ class ThesisDetector:
             return np.ones(int(mask.sum()))
         deviation: np.ndarray = np.sqrt(cloud.mean_variance_m2[mask])
         return deviation
-
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        """Clusters of pixels whose score is above the threshold, strongest first."""
-        pixels = _above(evidence, threshold)
-        labels = self._clusters(cloud, pixels)
-        clusters = [pixels[labels == label] for label in range(labels.max(initial=-1) + 1)]
-        found = [Detection(self._strength(cloud, evidence, cluster), cluster) for cluster in clusters]
-        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
-
-    def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """The lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
-        return self._strength(cloud, evidence, _above(evidence, 0.0))
-
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-        """The thesis' extents, and the model of a blurred hole."""
-        return measure_detection(cloud, evidence, detection, self.settings.hole_model)
-
-    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        points = cloud.points_m.reshape(-1, 3)[pixels]
-        return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
-
-    def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
-        """The lowest threshold at which no cluster of ``min_points`` is left among these pixels.
-
-        Raising the threshold only takes points away and only splits clusters, so the answer is the score of the point,
-        in falling order, that completes the first cluster: found by doubling and bisection.
-        """
-        if len(pixels) < self.settings.min_points:
-            return 0.0
-        scores = evidence.score.reshape(-1)[pixels]
-        if self.settings.min_points == 1:
-            return float(scores.max())
-        falling = np.argsort(-scores, kind="stable")
-
-        def completes(count: int) -> bool:
-            return bool((self._clusters(cloud, pixels[falling[:count]]) >= 0).any())
-
-        count = _first_true(completes, self.settings.min_points, len(pixels))
-        return 0.0 if count is None else float(scores[falling[count - 1]])
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
@@ -189,28 +139,3 @@ def _spread(residual: np.ndarray, z: np.ndarray, scale: str) -> float:
     values = z if scale == "raw_z_std" else residual
     # MATLAB's std divides by n - 1
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-
-def _spread_out(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    image = np.full(mask.shape, np.nan)
-    image[mask] = values
-    return image
-
-
-def _above(evidence: Evidence, threshold: float) -> np.ndarray:
-    """Flat indices, ascending, of the pixels whose score exceeds the threshold."""
-    with np.errstate(invalid="ignore"):
-        return np.flatnonzero(evidence.score.reshape(-1) > threshold)
-
-
-def _first_true(test: Callable[[int], bool], low: int, high: int) -> int | None:
-    """The least n in low..high at which a test that never turns false again is true; None if it never is."""
-    trial = low
-    while not test(trial):
-        if trial == high:
-            return None
-        low, trial = trial + 1, min(2 * trial, high)
-    while low < trial:
-        middle = (low + trial) // 2
-        low, trial = (low, middle) if test(middle) else (middle + 1, trial)
-    return trial

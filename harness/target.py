@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from scenes.target.declaration import TargetConfig
+    from scenes.target.declaration import AnyTargetConfig, TargetConfig
     from scenes.target.mesh import Target
 
 NAMED_TARGETS = ("thesis",)
@@ -33,12 +33,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
     parser.add_argument("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
+    parser.add_argument(
+        "--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)"
+    )
     parser.add_argument("--hole-free", action="store_true", help="leave out holes and dents")
     return parser
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    config = _declared(arguments.target)
+    config = _declared(arguments.target, arguments.board)
 
     from scenes.target.export import write_mesh, write_truth
     from scenes.target.mesh import build_target
@@ -69,14 +72,27 @@ def _summary(target: Target) -> str:
 # ---- reading a declaration -------------------------------------------------------------------------------------------
 
 
-def _declared(name_or_path: str) -> TargetConfig:
+def _declared(name_or_path: str, board: int) -> TargetConfig:
+    from scenes.target.declaration import DrawnTargetConfig
+
+    config = _target(name_or_path)
+    if isinstance(config, DrawnTargetConfig):
+        if board < 0:
+            raise UserError(f"--board {board}: boards are numbered from 0")
+        return config.drawn("damaged", board)
+    if board:
+        raise UserError(f"--board {board}: {name_or_path} declares one board, not a family", legal="--board 0")
+    return config.declare()
+
+
+def _target(name_or_path: str) -> AnyTargetConfig:
     from harness.vocabulary.declaration.diagnose import validated, wrong_choice
     from harness.vocabulary.declaration.problems import DeclarationError, Problem
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.declaration import TARGETS
 
     if name_or_path in NAMED_TARGETS:
-        return TARGETS[name_or_path].from_data({"name": name_or_path}).declare()
+        return TARGETS[name_or_path].from_data({"name": name_or_path})
     if not Path(name_or_path).exists():
         raise UserError(
             f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
@@ -90,7 +106,7 @@ def _declared(name_or_path: str) -> TargetConfig:
     config, problems = validated(TARGETS[name], source, {})
     if problems or config is None:
         raise DeclarationError(name_or_path, problems)
-    return config.declare()
+    return config
 
 
 if __name__ == "__main__":

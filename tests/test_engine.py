@@ -234,7 +234,7 @@ def test_seeds_change_the_frames_but_not_the_render(finished):
     assert first.digest != second.digest
     assert dict((what, there) for what, _, there in pending_counts(b, Journal(finished / "none"))) == {
         "renders": 2,
-        "hole-free trials": 0,
+        "hole-free trials that set thresholds": 0,
     }
 
 
@@ -321,9 +321,10 @@ def test_changed_code_is_not_served_old_trials(finished, monkeypatch):
 
     experiment = load_experiment(finished.parent / "tiny.yaml")
     (group,) = plan_of(experiment, finished / ".cache" / "renders").groups
-    before = [key for key, _ in group.trials("hole_free", {})]
+    (hole_free,) = group.first
+    before = [key for key, _ in group.trials(hole_free, {})]
     monkeypatch.setattr(plan, "source_digest", lambda folders, packages: "other code")
-    assert set(before).isdisjoint(key for key, _ in group.trials("hole_free", {}))
+    assert set(before).isdisjoint(key for key, _ in group.trials(hole_free, {}))
 
 
 def test_matching_places_findings_on_a_curved_face():
@@ -343,9 +344,9 @@ def test_matching_places_findings_on_a_curved_face():
     T_camera_board = T_camera_board_of(target.pose)
     (damage,) = truth_of(target, T_camera_board)
     unit = cast("SimulatedUnit", None)
-    set_up = SetUp(unit, unit, (damage,), target, T_camera_board)
+    set_up = SetUp(unit, True, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
     one, pixels = np.ones((1, 1)), {1: np.array([0])}
-    vars(set_up).update({"outlines": pixels, "intact": one > 0, "seen_z_m": one, "true_z_m": one})
+    vars(set_up).update({"outlines": pixels, "intact": one > 0, "seen_z_m": one, "face_z_m": one, "on_face_m": one})
     sight = sight_of_view(set_up, cast("Cloud", SimpleNamespace(projection="central")), hole_free=False)
     assert sight.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

@@ -53,9 +53,9 @@ def map_of(height_m: float, *, step_m: float = 2e-3, missing: bool = False) -> t
 
 def first_view() -> SetUp:
     unit = cast("SimulatedUnit", None)
-    set_up = SetUp(unit, unit, truth_of(TARGET, T_CAMERA_BOARD), TARGET, T_CAMERA_BOARD)
+    set_up = SetUp(unit, True, truth_of(TARGET, T_CAMERA_BOARD), TARGET, T_CAMERA_BOARD)
     one, pixels = np.ones((1, 1)), {7: np.array([0])}
-    vars(set_up).update({"pitch_mm": (1.4, 1.4), "outlines": pixels, "seen_z_m": one, "true_z_m": one})
+    vars(set_up).update({"pitch_mm": (1.4, 1.4), "outlines": pixels, "seen_z_m": one, "face_z_m": one})
     return set_up
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +14,7 @@ from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.points import MAIN, Experiment, Point
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.problems import DeclarationError
+from tests.plug_in_packages import offer
 
 
 class TrialSettings(Config):
@@ -66,9 +66,8 @@ sensitivity:
 
 
 @pytest.fixture(autouse=True)
-def trial_detector(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("trial", f"{__name__}:TrialDetector", detectors.GROUP)
-    monkeypatch.setattr(detectors, "_plug_ins", lambda: (entry,))
+def trial_detector(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    offer(monkeypatch, tmp_path / "packages", "trials", detectors.GROUP, {"trial": f"{__name__}:TrialDetector"})
 
 
 @pytest.fixture

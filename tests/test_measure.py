@@ -139,7 +139,11 @@ def strongest(cloud: Cloud, evidence: Evidence, threshold: float) -> Detection:
     above = (np.nan_to_num(evidence.score) > threshold).astype(np.uint8)
     _, labels = cv2.connectedComponents(above)
     peak = np.nanargmax(evidence.score)
-    return Detection(float(np.nanmax(evidence.score)), np.flatnonzero(labels.ravel() == labels.ravel()[peak]))
+    return detection_of(cloud, float(np.nanmax(evidence.score)), np.flatnonzero(labels.ravel() == labels.ravel()[peak]))
+
+
+def detection_of(cloud: Cloud, score: float, pixels: np.ndarray) -> Detection:
+    return Detection(score, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1])
 
 
 def measured(board: Board, sigma_mm: float, seed: int, threshold: float = 5.0) -> Measurement:
@@ -262,7 +266,7 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
     cloud.points_m[inside] = np.nan
     evidence.residual_m[inside] = np.nan
     rim = np.setdiff1d(detection.pixels, np.flatnonzero(inside))
-    m = measure_detection(cloud, evidence, Detection(9.0, rim), HoleModelConfig())
+    m = measure_detection(cloud, evidence, detection_of(cloud, 9.0, rim), HoleModelConfig())
     assert "no range" in m.model_note
     assert m.model_diameter_m == pytest.approx(19.0e-3, abs=1.0e-3)
     assert np.isnan(m.model_depth_m) and np.isnan(m.model_diameter_se_m)
@@ -293,7 +297,7 @@ def test_without_a_grid_only_extents_are_given() -> None:
 
 def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     cloud, evidence = Board(12.7, 0.0).seen(0.2, 7)
-    m = measure_detection(cloud, evidence, Detection(4.0, np.array([17])), HoleModelConfig())
+    m = measure_detection(cloud, evidence, detection_of(cloud, 4.0, np.array([17])), HoleModelConfig())
     assert m.points == 1 and m.extent_diameter_m == 0.0 and m.model_note != ""
 
 

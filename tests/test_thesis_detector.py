@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import detectors
 from detectors import detector_names, detector_type, load_detector
 from detectors.interface import Detector, Evidence
 from detectors.thesis import ThesisConfig, ThesisDetector, rounding_floor
@@ -189,17 +186,3 @@ def test_an_unknown_name_and_wrong_settings_are_clear_mistakes() -> None:
         load_detector("thesis", {"surface": {"degree": 99}, "scael": "mad"})
     assert "surface.degree" in str(caught.value) and "scael" in str(caught.value)
     assert "thesis" in detector_names() and detector_type("thesis") is ThesisDetector
-
-
-def test_plug_ins_are_found_and_names_taken_twice_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def offer(name: str, value: str) -> EntryPoint:
-        return EntryPoint(name, value, detectors.GROUP)
-
-    monkeypatch.setattr(detectors, "_plug_ins", lambda: (offer("mine", "detectors.thesis:ThesisDetector"),))
-    assert isinstance(load_detector("mine", {}), ThesisDetector)
-    monkeypatch.setattr(detectors, "_plug_ins", lambda: (offer("thesis", "other.package:Detector"),))
-    with pytest.raises(UserError, match=r"detectors.thesis:ThesisDetector.*other.package:Detector"):
-        load_detector("thesis", {})
-    monkeypatch.setattr(detectors, "_plug_ins", lambda: (offer("broken", "no_such_package:Detector"),))
-    with pytest.raises(UserError, match="cannot be loaded"):
-        load_detector("broken", {})

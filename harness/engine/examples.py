@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from detectors import load_detector
 from detectors.average import prefix_averages
+from harness.engine.judge import detector_for
 from harness.engine.plan import Group
 from harness.engine.setup import SetUp, load_set_up
+from harness.engine.sight import sight_of_view
 from harness.evaluation.profile import HoleInView
 from harness.experiment.points import Point
 from harness.report.example import ExampleCloud
@@ -24,9 +25,9 @@ def examples_of(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCl
     chosen = _ends([point for point in group.points if point.digest in thresholds])
     if not chosen:
         return []
-    set_up = load_set_up(group.set_ups[0])
+    set_up = load_set_up(group.damaged.set_ups[0])
     counts = sorted({point.config.capture.frames for point in chosen})
-    capture = set_up.damaged.capture(counts[-1], group.seed, "damaged", 0)
+    capture = set_up.unit.capture(counts[-1], group.seed, "damaged", 0)
     averages = {canonical_json(point.config.capture.average.to_data()): point for point in chosen}
     clouds = {text: prefix_averages(capture, counts, point.config.capture.average) for text, point in averages.items()}
     return [
@@ -51,7 +52,9 @@ def _ends(points: Sequence[Point]) -> list[Point]:
 
 
 def _example(set_up: SetUp, cloud: Cloud, point: Point, threshold: float) -> ExampleCloud:
-    detector = load_detector(point.config.detector.name, dict(point.config.detector.settings))
+    sight = sight_of_view(set_up, cloud, hole_free=False)
+    settings = canonical_json(point.config.detector.settings)
+    detector = detector_for(sight, point.config.detector.name, settings, hole_free=False)
     evidence = detector.analyse(cloud)
     detected = np.zeros(cloud.valid.size, bool)
     for detection in detector.find(cloud, evidence, threshold):
@@ -66,16 +69,16 @@ def _example(set_up: SetUp, cloud: Cloud, point: Point, threshold: float) -> Exa
         inside=np.isfinite(evidence.score),
         truth=_marks(set_up),
         z_truth_mm=set_up.seen_z_m / MM,
-        outlines_px=tuple(_outline_px(set_up, damage) for damage in set_up.truth),
+        outlines_px=tuple(outline_px(set_up, damage) for damage in set_up.truth),
     )
 
 
-def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
+def outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
     """(64, 2) columns and rows of a damage's rim on the cloud's grid, through the lens with its distortion.
 
     The rim is taken as a circle in the face's tangent plane at the damage's centre: exact on a flat face.
     """
-    region, lens = set_up.damaged.region, set_up.damaged.camera.nominal_lens
+    region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     along = np.cross(damage.axis_camera, across)
@@ -86,7 +89,7 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
 
 def _marks(set_up: SetUp) -> tuple[HoleInView, ...]:
     """Each damage as a circle in pixels of the cloud's grid."""
-    region, lens = set_up.damaged.region, set_up.damaged.camera.nominal_lens
+    region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     marks = []
     for damage in set_up.truth:
         u, v = lens.project(damage.centre_camera_m[None])[0]

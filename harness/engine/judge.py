@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from detectors import load_detector
-from detectors.interface import Detector, Evidence, Measurement
+from detectors.interface import Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
 from harness.engine.sight import Sight
 from harness.evaluation.match import match
 from harness.vocabulary.units import MM
@@ -23,15 +24,29 @@ def _detector(name: str, settings_json: str) -> Detector:
     return load_detector(name, json.loads(settings_json))
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """One detector on one cloud. ``run``: its row; ``holes``: one row per damage where there is any.
+
+    ``places_m`` (m, 2): where the findings lie on the face; ``pairs``: which finding counts for which damage, index
+    into ``sight.truth`` -> index into ``detections``, on a hole-free board those at places without damage.
+    """
+
+    run: dict[str, Any]
+    holes: list[dict[str, Any]]
+    detector: Detector
+    evidence: Evidence
+    detections: tuple[Detection, ...] = ()
+    places_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    pairs: Mapping[int, int] = field(default_factory=dict)
+
+
 def judge(
     sight: Sight, detector_name: str, settings_json: str, threshold: float | None, radius_m: float, *, hole_free: bool
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """One detector on one cloud: the run's row, and one row per damage where there is any.
-
-    Without a threshold only the quiet one is found.
-    """
+) -> Judgement:
+    """One detector on one cloud. Without a threshold only the quiet one is found."""
     cloud = sight.cloud
-    detector = _detector(detector_name, settings_json)
+    detector = detector_for(sight, detector_name, settings_json, hole_free=hole_free)
     evidence = detector.analyse(cloud)
     run: dict[str, Any] = {
         "threshold": threshold if threshold is not None else np.nan,
@@ -44,27 +59,44 @@ def judge(
         "false_calls": 0,
     }
     if threshold is None:
-        return run, []
+        return Judgement(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
-    measured = [detector.measure(cloud, evidence, detection) for detection in detections]
-    pairs = {} if hole_free else matched(sight, measured, radius_m)
-    run |= {"detections": len(detections), "false_calls": len(detections) - len(pairs)}
+    places_m = places_of(sight, detections)
+    pairs = match(centres_m(sight), places_m, radius_m)
+    true = 0 if hole_free else len(pairs)
+    run |= {"detections": len(detections), "false_calls": len(detections) - true}
     if hole_free:
-        return run, []
+        return Judgement(run, [], detector, evidence, detections, places_m, pairs)
+    measured = [detector.measure(cloud, evidence, detection) for detection in detections]
     largest = max(measured, key=lambda m: m.points, default=None)
     holes = [
         _hole_row(sight, evidence, damage, measured[pairs[i]] if i in pairs else None, largest)
         | {"threshold": threshold}
         for i, damage in enumerate(sight.truth)
     ]
-    return run, holes
+    return Judgement(run, holes, detector, evidence, detections, places_m, pairs)
 
 
-def matched(sight: Sight, measured: Sequence[Measurement], radius_m: float) -> dict[int, int]:
-    """Which finding counts for which damage: index into ``sight.truth`` -> index into ``measured``."""
-    damages = np.array([damage.centre_board_m[:2] for damage in sight.truth]).reshape(-1, 2)
-    centres = np.array([m.extent_centre_m for m in measured]).reshape(-1, 3)
-    return match(damages, sight.on_board(centres), radius_m)
+def detector_for(sight: Sight, name: str, settings_json: str, *, hole_free: bool) -> Detector:
+    """The detector that is to see a cloud; one that tests the harness is handed the truth."""
+    detector = _detector(name, settings_json)
+    if not isinstance(detector, ToldTheTruth):
+        return detector
+    truth = (
+        TrueDamage(sight.centre_in_cloud_m(damage), damage.diameter_m, sight.outlines[damage.id])
+        for damage in sight.truth
+    )
+    return detector.told(() if hole_free else tuple(truth))
+
+
+def places_of(sight: Sight, detections: Sequence[Detection]) -> np.ndarray:
+    """(m, 2) places of findings on the face."""
+    return sight.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
+
+
+def centres_m(sight: Sight) -> np.ndarray:
+    """(n, 2) true centres of the damage on the face."""
+    return np.array([damage.centre_board_m[:2] for damage in sight.truth]).reshape(-1, 2)
 
 
 def _hole_row(

@@ -7,20 +7,21 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from detectors import load_detector
 from detectors.average import prefix_averages
 from detectors.interface import Measurement
 from detectors.mapping.settings import MappingConfig
 from detectors.views import PreparedView
-from harness.engine.judge import matched
+from harness.engine.judge import centres_m, detector_for, places_of
 from harness.engine.maps import MapMaker
 from harness.engine.plan import Group
 from harness.engine.setup import load_set_up
 from harness.engine.sight import Sight
 from harness.engine.trial import capture_of
+from harness.evaluation.match import match
 from harness.experiment.points import Point
 from harness.report.views_example import FindingSeen, HoleSeen, MappedExample, PlacedView
 from harness.vocabulary.geometry import invert, transform_points
+from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM
 from scenes.target.truth import Damage
 
@@ -35,11 +36,12 @@ def map_examples_of(group: Group, thresholds: Mapping[str, float]) -> list[Mappe
     """Of two views and of all, one map by each way of merging, with the greatest number of frames and the method of
     registration that the experiment names last."""
     points = [point for point in group.points if point.digest in thresholds and point.config.mapping is not None]
-    chosen = _chosen(points, len(group.views))
+    batch = group.damaged
+    chosen = _chosen(points, len(batch.views))
     if not chosen or group.poses is None:
         return []
-    set_ups = [load_set_up(ref) for ref in group.set_ups]
-    _, task = next(group.trials("damaged", thresholds))
+    set_ups = [load_set_up(ref) for ref in batch.set_ups]
+    _, task = next(group.trials(batch, thresholds))
     frames = chosen[0].config.capture.frames
     average = chosen[0].config.capture.average
     captures = [capture_of(set_up, number, task, frames) for number, set_up in enumerate(set_ups)]
@@ -78,18 +80,19 @@ def _example(maps: MapMaker, point: Point, threshold: float, placed: tuple[Place
     mapping, frames = _mapping(point), point.config.capture.frames
     sight = maps.sight(mapping, frames)
     cloud = sight.cloud
-    detector = load_detector(point.config.detector.name, dict(point.config.detector.settings))
+    settings = canonical_json(point.config.detector.settings)
+    detector = detector_for(sight, point.config.detector.name, settings, hole_free=False)
     evidence = detector.analyse(cloud)
     detections = detector.find(cloud, evidence, threshold)
     measured = [detector.measure(cloud, evidence, detection) for detection in detections]
-    pairs = matched(sight, measured, point.config.matching.radius_mm * MM)
+    places = places_of(sight, detections)
+    pairs = match(centres_m(sight), places, point.config.matching.radius_mm * MM)
     detected = np.zeros(cloud.valid.size, bool)
     for detection in detections:
         detected[detection.pixels] = True
     shown = _thinned(np.flatnonzero(cloud.valid.ravel()), MOST_POINTS)
     points_m = transform_points(sight.T_board_cloud, cloud.points_m.reshape(-1, 3)[shown])
     rgb = np.full((cloud.valid.size, 3), 160, np.uint8) if cloud.rgb is None else cloud.rgb.reshape(-1, 3)
-    places = sight.on_board(np.array([m.extent_centre_m for m in measured]).reshape(-1, 3))
     names = {finding: str(sight.truth[hole].id) for hole, finding in pairs.items()}
     return MappedExample(
         variant=point.variant,

@@ -21,6 +21,7 @@ from scenes.render.cache import render_key
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
+from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.wavelength import at_wavelength
 
 CODE = ("detectors", "harness/engine", "harness/evaluation", "harness/vocabulary", "scenes")
@@ -45,65 +46,98 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class PlannedView:
-    """One pose of the target: both its renders, and what names them to a worker."""
+    """One pose of a target, with its damage or without: the render, and what names it to a worker."""
 
-    damaged: RenderJob
-    hole_free: RenderJob
+    render: RenderJob
     set_up: SetUpRef
 
 
 @dataclass(frozen=True)
-class Group:
-    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them.
+class Batch:
+    """Trials of one role before one target: what shares its renders. ``views``: one, or those from which maps are made.
 
-    ``views``: one, or those from which the points' maps are made, of which ``poses`` is the declaration.
+    ``board``: its number among a study's boards of this role; None for the one target of any other experiment.
     """
 
-    points: tuple[Point, ...]
+    role: Role
     views: tuple[PlannedView, ...]
-    seed: int
-    poses: AnyViews | None = None
+    board: int | None = None
 
     @property
     def renders(self) -> tuple[RenderJob, ...]:
-        """All renders, hole-free ones first."""
-        return (*(view.hole_free for view in self.views), *(view.damaged for view in self.views))
+        """Of all views."""
+        return tuple(view.render for view in self.views)
 
     @property
     def set_ups(self) -> tuple[SetUpRef, ...]:
         """Of each view."""
         return tuple(view.set_up for view in self.views)
 
-    def repeats(self, role: Role, point: Point) -> int:
-        """How many trials of a role a point wants. With a given threshold, as many hole-free ones as damaged ones."""
+
+@dataclass(frozen=True)
+class Group:
+    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them.
+
+    The batches that come ``first`` are hole-free and set the points' thresholds; ``then`` those that are judged by
+    them. ``poses``: the declaration of the views, where there are several.
+    """
+
+    points: tuple[Point, ...]
+    first: tuple[Batch, ...]
+    then: tuple[Batch, ...]
+    seed: int
+    poses: AnyViews | None = None
+
+    @property
+    def batches(self) -> tuple[Batch, ...]:
+        """All, in the order in which they run."""
+        return (*self.first, *self.then)
+
+    @property
+    def is_study(self) -> bool:
+        """Whether its boards are drawn at random."""
+        return self.then[0].board is not None
+
+    @property
+    def damaged(self) -> Batch:
+        """The first batch before a damaged target."""
+        return next(batch for batch in self.then if batch.role == "damaged")
+
+    def repeats(self, batch: Batch, point: Point) -> int:
+        """How many trials of a batch a point wants: with a given threshold, as many hole-free ones as damaged ones; one
+        of each board that sets a study's threshold."""
         calibrate = point.config.threshold.calibrate
-        if role == "hole_free" and calibrate is not None:
+        if batch.role == "calibration":
+            return 0 if calibrate is None else 1
+        if batch.role == "hole_free" and calibrate is not None and calibrate.repeats is not None:
             return calibrate.repeats
         return point.config.repeats
 
-    def trials(self, role: Role, thresholds: Mapping[str, float]) -> Iterator[tuple[str, TrialTask]]:
-        """(journal key, task) of each trial of a role. ``thresholds`` by point digest, empty while calibrating."""
-        for repeat in range(max(self.repeats(role, point) for point in self.points)):
+    def trials(self, batch: Batch, thresholds: Mapping[str, float]) -> Iterator[tuple[str, TrialTask]]:
+        """(journal key, task) of each trial of a batch. ``thresholds`` by point digest, empty while calibrating."""
+        for repeat in range(max(self.repeats(batch, point) for point in self.points)):
             wanted = tuple(
                 _point_task(point, thresholds.get(point.digest, point.config.threshold.k))
                 for point in self.points
-                if repeat < self.repeats(role, point)
+                if repeat < self.repeats(batch, point)
             )
-            task = TrialTask(self.set_ups, self.seed, role, repeat, wanted, self.poses)
-            yield self._key(task), task
+            task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
+            yield self._key(batch, task), task
 
-    def _key(self, task: TrialTask) -> str:
+    def _key(self, batch: Batch, task: TrialTask) -> str:
         asked = [[point.digest, point.variant, point.threshold] for point in task.points]
         content = [
             JOURNAL_VERSION,
             source_digest(CODE, PACKAGES),
-            *(render.path.stem for render in self.renders),
+            *(render.path.stem for render in batch.renders),
             None if self.poses is None else self.poses.to_data(),
             task.role,
+            task.board,
             task.repeat,
             asked,
         ]
-        return f"{task.role}-{task.repeat:05d}-{digest(content)}"
+        number = task.repeat if task.board is None else task.board
+        return f"{task.role}-{number:05d}-{digest(content)}"
 
 
 def _point_task(point: Point, threshold: float | None) -> PointTask:
@@ -130,14 +164,13 @@ class Plan:
     @property
     def renders(self) -> tuple[RenderJob, ...]:
         """The distinct views, in the order in which trials need them."""
-        jobs = {job.path: job for group in self.groups for job in group.renders}
+        jobs = {job.path: job for group in self.groups for batch in group.batches for job in batch.renders}
         return tuple(jobs.values())
 
     @property
     def trial_count(self) -> int:
-        """Trials of both roles."""
-        roles: tuple[Role, ...] = ("hole_free", "damaged")
-        return sum(max(g.repeats(role, p) for p in g.points) for g in self.groups for role in roles)
+        """Trials of all roles."""
+        return sum(max(g.repeats(batch, p) for p in g.points) for g in self.groups for batch in g.batches)
 
 
 def plan_of(experiment: Experiment, cache: Path) -> Plan:
@@ -149,22 +182,40 @@ def plan_of(experiment: Experiment, cache: Path) -> Plan:
 
 
 def _group(points: tuple[Point, ...], cache: Path) -> Group:
-    source = points[0].config.source
+    source, study = points[0].config.source, points[0].config.study
     assert isinstance(source, SimulatedSource)
-    target = at_wavelength(source.target.declare(), camera_of(source.camera).optics.wavelength_nm)
-    if not target.damages:
+    target, seed = source.target, points[0].config.seed
+    if study is not None and isinstance(target, DrawnTargetConfig):
+        calibrate = points[0].config.threshold.calibrate
+        counts: dict[Role, int] = {
+            "calibration": 0 if calibrate is None else calibrate.boards or 0,
+            "hole_free": study.hole_free_boards,
+            "damaged": study.boards,
+        }
+        first, hole_free, damaged = (
+            tuple(_batch(target.drawn(role, n), role, source, cache, n) for n in range(count))
+            for role, count in counts.items()
+        )
+        return Group(points, first, (*damaged, *hole_free), seed, source.views)
+    declared = target.declare()
+    if not declared.damages:
         raise UserError(
             "the target has neither holes nor dents, so that there is nothing to find",
             legal="at least one hole or dent",
             fix="declare source.target.holes or source.target.dents",
         )
+    batches = [_batch(declared, role, source, cache) for role in ("hole_free", "damaged")]
+    return Group(points, (batches[0],), (batches[1],), seed, source.views)
+
+
+def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None) -> Batch:
+    target = at_wavelength(declared, camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
-    views = tuple(_view(target.model_copy(update={"pose": pose}), source, cache) for pose in poses)
-    return Group(points, views, points[0].config.seed, source.views)
+    placed = [target.model_copy(update={"pose": pose}) for pose in poses]
+    return Batch(role, tuple(_view(one, role == "damaged", source, cache) for one in placed), board)
 
 
-def _view(target: TargetConfig, source: SimulatedSource, cache: Path) -> PlannedView:
-    damaged, hole_free = (
-        RenderJob(declared, source.camera, source.render, cache) for declared in (target, target.hole_free())
-    )
-    return PlannedView(damaged, hole_free, SetUpRef(str(damaged.path), str(hole_free.path), source.camera, target))
+def _view(target: TargetConfig, damaged: bool, source: SimulatedSource, cache: Path) -> PlannedView:
+    shown = target if damaged else target.hole_free()
+    render = RenderJob(shown, source.camera, source.render, cache)
+    return PlannedView(render, SetUpRef(str(render.path), source.camera, target, damaged))

@@ -1,5 +1,5 @@
-"""Running a plan: renders feed trials, hole-free trials calibrate thresholds, damaged trials use them. What is
-finished is in the journal; what the journal holds is not run again."""
+"""Running a plan: renders feed trials, hole-free trials calibrate thresholds, the trials that are judged use them. What
+is finished is in the journal; what the journal holds is not run again."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from harness.engine.journal import Journal, without_nan
 from harness.engine.map_examples import map_examples_of
 from harness.engine.plan import Group, Plan, RenderJob
 from harness.engine.trial import Record, Role, TrialTask, run_trial
+from harness.evaluation.pod.false_calls import threshold_for_rate
+from harness.experiment.points import Point
 from harness.report.example import ExampleCloud
 from harness.report.views_example import MappedExample
 from harness.vocabulary.errors import UserError
@@ -75,14 +78,19 @@ class _Examples:
 class _Trial:
     key: str
     group: int
+    batch: int
     role: Role
+
+
+MOST_RENDERERS = 2
+"""Processes that render, of 2 GB each."""
 
 
 def run_plan(plan: Plan, journal: Journal, jobs: int, report: Callable[[Progress], None]) -> Outcome:
     """Run what is not finished. Raises UserError where nothing can be rendered or written; a single trial's error
     becomes a `Failure`. KeyboardInterrupt passes through: finished trials are in the journal."""
     began = time.perf_counter()
-    with workers.pool(1) as renderer, workers.pool(jobs) as trial_pool:
+    with workers.pool(min(jobs, MOST_RENDERERS)) as renderer, workers.pool(jobs) as trial_pool:
         state = _Run(plan, journal, renderer, trial_pool, report)
         state.start()
         while state.pending:
@@ -111,15 +119,29 @@ class _Run:
         self.report = report
         self.outcome = Outcome()
         self.pending: dict[Future[Any], _Render | _Trial | _Examples] = {}
-        self._views_missing = [{job.path for job in g.renders} for g in plan.groups]
-        self._trials_missing: list[set[str]] = [set() for _ in plan.groups]
-        self._quiet: dict[str, list[float]] = {}
+        self._waiting: dict[Path, list[tuple[int, int]]] = {}
+        """Which batches, as (group, batch), wait for a render."""
+        self._renders_missing: dict[tuple[int, int], set[Path]] = {}
+        self._trials_missing: dict[tuple[int, int], set[str]] = {}
+        """Of batches that have begun."""
+        self._calibrated = [False for _ in plan.groups]
+        self._quiet: dict[str, list[tuple[float, float]]] = {}
+        """Of each point, the quiet threshold and the judged area of its hole-free runs."""
+        for number, group in enumerate(plan.groups):
+            for place, batch in enumerate(group.batches):
+                paths = {job.path for job in batch.renders}
+                self._renders_missing[number, place] = paths
+                for path in paths:
+                    self._waiting.setdefault(path, []).append((number, place))
 
     def start(self) -> None:
         """Submit every render; a group's trials follow when all its views are there."""
         for job in self.plan.renders:
             arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
             self.pending[self.renderer.submit(workers.render, *arguments)] = _Render(job)
+        for number, group in enumerate(self.plan.groups):
+            if not group.first:
+                self._calibrate(number)
         self._tell()
 
     def finish(self, future: Future[Any]) -> None:
@@ -165,22 +187,30 @@ class _Run:
         self.outcome.renders_cached += found
         self.outcome.renders_done += not found
         self.outcome.render_seconds += 0.0 if found else seconds
-        for number, group in enumerate(self.plan.groups):
-            waiting = self._views_missing[number]
-            if job.path in waiting:
-                waiting.discard(job.path)
-                if not waiting:
-                    self._begin(number, group, "hole_free")
+        for number, place in self._waiting.pop(job.path, ()):
+            self._renders_missing[number, place].discard(job.path)
+            self._begin_if_ready(number, place)
         self._tell()
 
-    def _begin(self, number: int, group: Group, role: Role) -> None:
-        """Submit a group's trials of a role, or take them from the journal."""
+    def _begin_if_ready(self, number: int, place: int) -> None:
+        """A batch begins once, when its views are there and, where it is judged, its points have their thresholds."""
+        judged = place >= len(self.plan.groups[number].first)
+        if self._renders_missing[number, place] or (number, place) in self._trials_missing:
+            return
+        if not judged or self._calibrated[number]:
+            self._begin(number, place)
+
+    def _begin(self, number: int, place: int) -> None:
+        """Submit a batch's trials, or take them from the journal."""
+        group = self.plan.groups[number]
+        batch = group.batches[place]
+        missing = self._trials_missing[number, place] = set()
         todo: list[tuple[_Trial, TrialTask]] = []
-        for key, task in group.trials(role, self.outcome.thresholds):
-            work = _Trial(key, number, role)
+        for key, task in group.trials(batch, self.outcome.thresholds):
+            work = _Trial(key, number, place, batch.role)
             stored = self.journal.read(key)
             if stored is None:
-                self._trials_missing[number].add(key)
+                missing.add(key)
                 todo.append((work, task))
             else:
                 self.outcome.trials_resumed += 1
@@ -188,43 +218,69 @@ class _Run:
         for work, task in todo:
             self.pending[self.trial_pool.submit(run_trial, task)] = work
         if not todo:
-            self._role_over(number, role)
+            self._batch_over(number, place)
 
     def _keep(self, work: _Trial, record: Record) -> None:
         self.outcome.records[work.key] = record
-        if work.role == "hole_free":
+        if work.batch < len(self.plan.groups[work.group].first):
             for run in record["runs"]:
-                self._quiet.setdefault(run["point"], []).append(run["quiet_threshold"])
+                if run["quiet_threshold"] is not None:
+                    known = (run["quiet_threshold"], run.get("inspected_m2", np.nan))
+                    self._quiet.setdefault(run["point"], []).append(known)
 
     def _trial_over(self, work: _Trial) -> None:
-        missing = self._trials_missing[work.group]
+        missing = self._trials_missing[work.group, work.batch]
         missing.discard(work.key)
         self._tell()
         if not missing:
-            self._role_over(work.group, work.role)
+            self._batch_over(work.group, work.batch)
 
-    def _role_over(self, number: int, role: Role) -> None:
-        """After the hole-free trials each point has its threshold; then the damaged ones begin."""
+    def _batch_over(self, number: int, place: int) -> None:
+        """After the batches that set thresholds the judged ones begin; after those there are pictures to make."""
         group = self.plan.groups[number]
-        if role == "damaged":
+        if place < len(group.first):
+            if self._over(number, range(len(group.first))):
+                self._calibrate(number)
+        elif not group.is_study and self._over(number, range(len(group.first), len(group.batches))):
             future = self.trial_pool.submit(_examples_of, group, self.outcome.thresholds)
             self.pending[future] = _Examples(number)
-            return
+
+    def _over(self, number: int, places: range) -> bool:
+        """Whether all trials of these batches have ended."""
+        return all(self._trials_missing.get((number, place)) == set() for place in places)
+
+    def _calibrate(self, number: int) -> None:
+        """Each point's threshold; then what is judged by it begins."""
+        group = self.plan.groups[number]
         for point in group.points:
-            given = point.config.threshold.k
-            quiet = [value for value in self._quiet.get(point.digest, []) if value is not None]
-            if given is not None:
-                self.outcome.thresholds[point.digest] = given
-            elif quiet:
-                self.outcome.thresholds[point.digest] = float(np.max(quiet))
+            found = threshold_of(point, self._quiet.get(point.digest, []))
+            if found is not None:
+                self.outcome.thresholds[point.digest] = found
         if all(point.digest in self.outcome.thresholds for point in group.points):
-            self._begin(number, group, "damaged")
+            self._calibrated[number] = True
+            for place in range(len(group.first), len(group.batches)):
+                self._begin_if_ready(number, place)
 
     def _tell(self) -> None:
         o = self.outcome
         renders = o.renders_done + o.renders_cached
         trials = o.trials_done + o.trials_resumed + len(o.failures)
         self.report(Progress(renders, len(self.plan.renders), trials, self.plan.trial_count))
+
+
+def threshold_of(point: Point, quiet: Sequence[tuple[float, float]]) -> float | None:
+    """A point's threshold: given, or by its hole-free runs, (quiet threshold, judged area in m2) each: the highest of
+    them, or in a study the one for the wanted rate of false calls. None where there is nothing to go by.
+
+    Raises UserError as `threshold_for_rate` does.
+    """
+    given, calibrate = point.config.threshold.k, point.config.threshold.calibrate
+    if given is not None or not quiet:
+        return given
+    thresholds, areas_m2 = np.array(quiet).T
+    if calibrate is None or calibrate.false_calls_per_m2 is None:
+        return float(thresholds.max())
+    return threshold_for_rate(thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2).value
 
 
 def _examples_of(group: Group, thresholds: dict[str, float]) -> Sequence[ExampleCloud | MappedExample]:
@@ -235,5 +291,5 @@ def pending_counts(plan: Plan, journal: Journal) -> Iterator[tuple[str, int, int
     """For a dry run: (what, planned, already there) for renders and hole-free trials."""
     renders = plan.renders
     yield "renders", len(renders), sum(job.path.exists() for job in renders)
-    keys = [key for group in plan.groups for key, _ in group.trials("hole_free", {})]
-    yield "hole-free trials", len(keys), sum(journal.read(key) is not None for key in keys)
+    keys = [key for group in plan.groups for batch in group.first for key, _ in group.trials(batch, {})]
+    yield "hole-free trials that set thresholds", len(keys), sum(journal.read(key) is not None for key in keys)

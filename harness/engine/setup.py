@@ -1,4 +1,4 @@
-"""A simulated set-up as a trial needs it: both views, the camera's unit, and which pixels see which part of the truth.
+"""A simulated set-up as a trial needs it: the view, the camera's unit, and which pixels see which part of the truth.
 
 The truth stays on this side: a detector is handed clouds only.
 """
@@ -13,13 +13,13 @@ import numpy as np
 from scipy import ndimage
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import invert, transform_points
+from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
 from harness.vocabulary.units import MM
 from scenes.render.cache import read_view
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
-from scenes.target.face import face_of
+from scenes.target.face import Face, face_of
 from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import Damage, truth_of
 from scenes.view import NoiseFreeView
@@ -31,48 +31,65 @@ PROBES = 500
 """Pixels on which temporal noise and systematic error are followed over repeats: known to 0.5 % with 50 repeats."""
 
 
+FACE_STEPS = 8
+"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
+
+
 @dataclass(frozen=True)
 class SetUpRef:
-    """Names a set-up in few bytes, for sending to a worker: stored views, camera and target."""
+    """Names a set-up in few bytes, for sending to a worker: a stored view, camera and target.
 
-    damaged_path: str
-    hole_free_path: str
+    ``target`` has its damage in any case; ``damaged`` tells whether the view shows it.
+    """
+
+    view_path: str
     camera: CameraConfig
     target: TargetConfig
+    damaged: bool
 
 
 @dataclass(frozen=True)
 class SetUp:
-    """One target before one unit, with and without its damage. Arrays cover ``damaged.region``, (h, w)."""
+    """One target before one unit. ``truth`` is the target's damage, also where ``unit``'s view was rendered without it
+    (``damaged`` False): the same places on a hole-free board. Arrays cover ``unit.region``, (h, w)."""
 
-    damaged: SimulatedUnit
-    hole_free: SimulatedUnit
+    unit: SimulatedUnit
+    damaged: bool
     truth: tuple[Damage, ...]
     target: TargetConfig
     T_camera_board: np.ndarray
 
     @cached_property
-    def board_xy_m(self) -> np.ndarray:
-        """(h, w, 2): where each pixel's central ray meets the undamaged face, board frame; NaN off the board."""
-        view, cut = self.hole_free.view, self.hole_free.cut
-        rays = np.concatenate([view.slopes[cut], np.ones((*self.hole_free.region.shape, 1))], axis=-1)
-        points = rays * (view.range_m[cut] / np.linalg.norm(rays, axis=-1))[..., None]
-        board = transform_points(invert(self.T_camera_board), points)
-        x, y, z = np.moveaxis(board, -1, 0)
+    def on_face_m(self) -> np.ndarray:
+        """(h, w, 3): where each pixel's central ray meets the undamaged face, board frame; NaN off the board."""
+        slopes = self.unit.view.slopes[self.unit.cut]
+        T_board_camera = invert(self.T_camera_board)
+        rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+        origin = np.broadcast_to(T_board_camera[:3, 3], rays.shape)
         size = self.target.board
-        over = (np.abs(x) < size.width_mm / 2 * MM) & (np.abs(y) < size.height_mm / 2 * MM)
-        on_face = over & (np.abs(z - face_of(size).height_m(x, y)) < 0.5 * MM)
-        return np.where(on_face[..., None], board[..., :2], np.nan)
+        met = met_on_face(origin, rotate_vectors(T_board_camera, rays), face_of(size))
+        x, y, z = np.moveaxis(met, -1, 0)
+        with np.errstate(invalid="ignore"):
+            over = (np.abs(x) < size.width_mm / 2 * MM) & (np.abs(y) < size.height_mm / 2 * MM)
+        return np.where((over & np.isfinite(z))[..., None], met, np.nan)
+
+    @property
+    def board_xy_m(self) -> np.ndarray:
+        """(h, w, 2): the same, along the face in plan."""
+        return self.on_face_m[..., :2]
 
     @cached_property
-    def true_z_m(self) -> np.ndarray:
-        """(h, w): z of the undamaged face along each pixel's central ray."""
-        return _z_m(self.hole_free)
+    def face_z_m(self) -> np.ndarray:
+        """(h, w): z in the camera's frame of the undamaged face along each pixel's central ray; strips of tape count
+        as face."""
+        return np.asarray(transform_points(self.T_camera_board, self.on_face_m)[..., 2])
 
     @cached_property
     def seen_z_m(self) -> np.ndarray:
-        """(h, w): z of what each pixel's central ray meets on the damaged target, floors and backing of holes too."""
-        return _z_m(self.damaged)
+        """(h, w): z of what each pixel's central ray meets in the rendered view; where that is damaged, floors and
+        backing of holes too."""
+        view, cut = self.unit.view, self.unit.cut
+        return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
@@ -128,10 +145,13 @@ def _eroded(mask: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.binary_erosion(mask, square, border_value=0))
 
 
-def _z_m(unit: SimulatedUnit) -> np.ndarray:
-    """(h, w): true z along the central rays of a unit's pixels."""
-    view, cut = unit.view, unit.cut
-    return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
+def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
+    """(..., 3): where the lines through points along directions (both (..., 3), board frame) meet a face."""
+    place = points_m
+    for _ in range(FACE_STEPS):
+        height = np.nan_to_num(face.height_m(place[..., 0], place[..., 1]))
+        place = points_m + ((height - points_m[..., 2]) / directions[..., 2])[..., None] * directions
+    return np.asarray(place)
 
 
 @lru_cache(maxsize=32)
@@ -140,8 +160,8 @@ def load_set_up(ref: SetUpRef) -> SetUp:
     camera = camera_of(ref.camera)
     T_camera_board = T_camera_board_of(ref.target.pose)
     return SetUp(
-        damaged=SimulatedUnit(camera, ref.camera, _stored_view(ref.damaged_path)),
-        hole_free=SimulatedUnit(camera, ref.camera, _stored_view(ref.hole_free_path)),
+        unit=SimulatedUnit(camera, ref.camera, _stored_view(ref.view_path)),
+        damaged=ref.damaged,
         truth=truth_of(ref.target, T_camera_board),
         target=ref.target,
         T_camera_board=T_camera_board,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.engine.setup import INTACT_MARGIN_PX, SetUp
+from harness.engine.setup import INTACT_MARGIN_PX, SetUp, met_on_face
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.units import MM
@@ -15,17 +15,15 @@ from scenes.target.custom import TargetConfig
 from scenes.target.face import face_of
 from scenes.target.truth import Damage
 
-SIGHT_STEPS = 8
-"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
-
 
 @dataclass(frozen=True)
 class Sight:
     """A cloud and where the truth lies in it.
 
     ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true. ``outlines``: by damage the flat indices of the
-    pixels (cells, points) that see into it, at least one. ``undamaged`` (h, w) bool: face well away from damage and
-    rim. ``seen_depth_m``: by damage, how far behind the face a view of it ends.
+    pixels (cells, points) that see into it, at least one. ``places_m`` (h, w, 2): where each lies on the face in plan,
+    NaN off the board. ``undamaged`` (h, w) bool: face well away from damage and rim. ``seen_depth_m``: by damage, how
+    far behind the face a view of it ends.
     """
 
     cloud: Cloud
@@ -33,6 +31,7 @@ class Sight:
     target: TargetConfig
     truth: tuple[Damage, ...]
     outlines: Mapping[int, np.ndarray]
+    places_m: np.ndarray
     undamaged: np.ndarray
     seen_depth_m: Mapping[int, float]
 
@@ -44,20 +43,29 @@ class Sight:
         map the line of sight is its z axis.
         """
         board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
-        face = face_of(self.target.board)
         if self.cloud.projection == "parallel":
             direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
         else:
             direction = board - self.T_board_cloud[:3, 3]
-        place = board
-        for _ in range(SIGHT_STEPS):
-            height = np.nan_to_num(face.height_m(place[:, 0], place[:, 1]))
-            place = board + ((height - board[:, 2]) / direction[:, 2])[:, None] * direction
-        return np.asarray(place[:, :2])
+        return met_on_face(board, direction, face_of(self.target.board))[:, :2]
 
     def centre_in_cloud_m(self, damage: Damage) -> np.ndarray:
         """(3,) true centre of a damage on the face, in the cloud's frame."""
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
+
+    def area_m2(self, pixels: np.ndarray) -> float:
+        """The face's area that the pixels (h, w) bool cover, tilt and perspective included; of a cloud without a grid
+        the whole face's, in the share of its points."""
+        there = pixels & np.isfinite(self.places_m[..., 0])
+        if not self.cloud.organised:
+            size = self.target.board
+            return size.width_mm * size.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
+        down, across = np.gradient(self.places_m, axis=(0, 1))
+        each = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+        known = np.isfinite(each)
+        # at the outline a neighbour is off the board: such a pixel is taken for one like the others
+        each = np.where(known, each, np.median(each[known]) if known.any() else 0.0)
+        return float(each[there].sum())
 
 
 def sight_of_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> Sight:
@@ -70,6 +78,7 @@ def sight_of_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> Sight:
         target=set_up.target,
         truth=set_up.truth,
         outlines=set_up.outlines,
+        places_m=set_up.board_xy_m,
         undamaged=undamaged,
         seen_depth_m={damage.id: _seen_depth_m(set_up, damage) for damage in set_up.truth},
     )
@@ -102,6 +111,7 @@ def sight_of_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, h
         target=first.target,
         truth=first.truth,
         outlines=outlines,
+        places_m=place,
         undamaged=bare if hole_free and not intact.any() else intact,
         seen_depth_m={damage.id: _seen_depth_m(first, damage) for damage in first.truth},
     )
@@ -150,6 +160,6 @@ def _seen_depth_m(set_up: SetUp, damage: Damage) -> float:
     """How far behind the face the central rays through a hole end, along the optical axis: the median of those that
     come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the backing."""
     inside = set_up.outlines[damage.id]
-    depth = set_up.seen_z_m.ravel()[inside] - set_up.true_z_m.ravel()[inside]
+    depth = set_up.seen_z_m.ravel()[inside] - set_up.face_z_m.ravel()[inside]
     depth = depth[np.isfinite(depth)]
     return float(np.median(depth[depth > depth.max() - 1 * MM])) if depth.size else float("nan")

@@ -16,14 +16,15 @@ from harness.engine.console import progress_display
 from harness.engine.journal import Journal
 from harness.engine.plan import Plan, plan_of
 from harness.engine.run import Outcome, pending_counts, run_plan
-from harness.engine.tables import Tables, tables_of
+from harness.engine.tables import STUDY_ORDERS, Tables, tables_of
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, write_text
 from harness.vocabulary.provenance import record
-from harness.vocabulary.units import MM
+from harness.vocabulary.units import INCH, MM
 from scenes.render.cache import read_view
+from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
 
 if TYPE_CHECKING:
@@ -64,9 +65,37 @@ def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int
     tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
     provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
     _write_tables(folder, tables, provenance)
-    _write_report(folder, experiment, outcome, tables, provenance)
-    _conclude(folder, tables, outcome)
+    if experiment.config.study is None:
+        _write_report(folder, experiment, outcome, tables, provenance)
+        table, text = _final_table(tables)
+    else:
+        table, text = _write_study(folder, experiment, plan, outcome, tables, provenance)
+    _conclude(folder, table, text, outcome)
     return 1 if outcome.failures else 0
+
+
+def _write_study(
+    folder: Path, experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
+) -> tuple[Table, str]:
+    """A study's record and report; its limits as a table and as text."""
+    from harness.engine.study_examples import study_examples
+    from harness.engine.study_record import failed_by_point, record_of
+    from harness.evaluation.study.record import record_text
+    from harness.evaluation.study.result import evaluate_study
+    from harness.report.study_page import write_study_report
+    from harness.report.study_terminal import study_table, study_text
+
+    failed = failed_by_point(plan, (failure.what for failure in outcome.failures), outcome.thresholds)
+    study = record_of(experiment, plan, tables, failed, provenance)
+    if not study.set_ups:
+        raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
+    write_text(folder / "study.json", record_text(study))
+    table_one_mm = [size_in * INCH / MM for size_in in DIAMETERS_IN]
+    result = evaluate_study(study, tables, experiment.data, diameters_mm=table_one_mm)
+    examples = study_examples(plan, result.limits, outcome.thresholds)
+    title = experiment.config.title or experiment.config.name
+    write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
+    return study_table(result), study_text(result)
 
 
 def _cache(out: Path) -> Path:
@@ -108,7 +137,8 @@ def _provenance(
 def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
     """The damaged views of all set-ups, variations left out."""
     set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    views = (read_view(view.damaged.path) for group in set_ups or plan.groups[:1] for view in group.views)
+    jobs = (job for group in set_ups or plan.groups[:1] for job in group.damaged.renders)
+    views = (read_view(job.path) for job in jobs)
     return [view for view in views if view is not None]
 
 
@@ -135,16 +165,18 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> N
     note = json.dumps({**numbers, "versions": provenance["versions"]}, sort_keys=True)
     stored_tables = {"trials": tables.holes, "runs": tables.runs, "probes": tables.probes, "noise": tables.noise}
     stored_tables |= {"registrations": tables.registrations, "walls": tables.walls}
+    stored_tables |= {name: getattr(tables, name) for name in STUDY_ORDERS}
     for name, table in stored_tables.items():
-        if table.empty and name in ("registrations", "walls"):
+        if table.empty and name not in ("trials", "runs"):
             continue
         stored = pa.Table.from_pandas(table, preserve_index=False)
         stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
         with atomic_path(folder / f"{name}.parquet") as path:
             pq.write_table(stored, path)
-    buffer = io.StringIO()
-    summarise_holes(tables.holes, list(tables.axes["path"])).to_csv(buffer, index=False, float_format="%.6g")
-    write_text(folder / "summary.csv", buffer.getvalue())
+    if tables.sites.empty:
+        buffer = io.StringIO()
+        summarise_holes(tables.holes, list(tables.axes["path"])).to_csv(buffer, index=False, float_format="%.6g")
+        write_text(folder / "summary.csv", buffer.getvalue())
     write_text(folder / "provenance.json", json.dumps(provenance, indent=2) + "\n")
 
 
@@ -157,11 +189,10 @@ def _write_report(
     write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title)
 
 
-def _conclude(folder: Path, tables: Tables, outcome: Outcome) -> None:
+def _conclude(folder: Path, table: Table, text: str, outcome: Outcome) -> None:
     """The final table, the failures, and where to look."""
     from rich.console import Console
 
-    table, text = _final_table(tables)
     if sys.stdout.isatty():
         Console().print(table)
     else:

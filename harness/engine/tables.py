@@ -17,9 +17,15 @@ from harness.experiment.set_ups import FRAMES
 from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.units import MM
 
+STUDY_ORDERS = {
+    "sites": ["variant", "frames", "board", "repeat", "true_diameter_mm", "hole"],
+    "findings": ["variant", "frames", "role", "board", "repeat"],
+    "operating": ["variant", "frames", "role", "board", "repeat"],
+    "pixels": ["variant", "frames", "board", "repeat"],
+}
 ORDERS = {
-    "holes": ["variant", "frames", "repeat", "true_diameter_mm", "hole"],
-    "runs": ["variant", "role", "frames", "repeat"],
+    "holes": ["variant", "frames", "board", "repeat", "true_diameter_mm", "hole"],
+    "runs": ["variant", "role", "frames", "board", "repeat"],
     "noise": ["variant", "frames", "repeat"],
     "registrations": ["variant", "role", "frames", "repeat", "view"],
 }
@@ -37,6 +43,8 @@ class Tables:
     then per variation: variant, reason, settings, is_variation, reference (the set-up to compare with, or empty),
     switches (JSON, or empty), and the axes. ``axes``: path, name, unit of each of those axes, in their order.
     ``walls``: what of each hole's wall is shadowed, by number of views (`harness.evaluation.walls`); empty likewise.
+    Of a study all have a column ``board``, probes and noise are empty, and ``sites``, ``findings``, ``operating``,
+    ``pixels`` are those of `harness.evaluation.study.tables.StudyTables`; of any other experiment these are empty.
     """
 
     holes: pd.DataFrame
@@ -47,14 +55,18 @@ class Tables:
     axes: pd.DataFrame
     registrations: pd.DataFrame = field(default_factory=pd.DataFrame)
     walls: pd.DataFrame = field(default_factory=pd.DataFrame)
+    sites: pd.DataFrame = field(default_factory=pd.DataFrame)
+    findings: pd.DataFrame = field(default_factory=pd.DataFrame)
+    operating: pd.DataFrame = field(default_factory=pd.DataFrame)
+    pixels: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> Tables:
     """Collect records, in any order, into tables in a fixed order."""
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ("probes", *ORDERS)}
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ("probes", *ORDERS, *STUDY_ORDERS)}
     for record in records:
         for name, collected in rows.items():
-            collected.extend(record[name])
+            collected.extend(record.get(name, ()))
     axes, variants = _axes(experiment), _variants(experiment)
     placed = variants.set_index("variant")[list(axes["path"])]
 
@@ -62,12 +74,23 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> T
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
     ordered = {name: with_axes(_ordered(rows[name], order)) for name, order in ORDERS.items()}
+    of_study = {name: _ordered(_one_a_threshold(rows[name]), order) for name, order in STUDY_ORDERS.items()}
     probes = with_axes(_probes(rows["probes"]))
-    return Tables(**ordered, probes=probes, variants=variants, axes=axes, walls=wall_rows(experiment))
+    walls = wall_rows(experiment) if experiment.config.study is None else pd.DataFrame()
+    return Tables(**ordered, **of_study, probes=probes, variants=variants, axes=axes, walls=walls)
+
+
+def _one_a_threshold(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with lists over thresholds, as one row for each threshold."""
+    if not rows or not isinstance(rows[0].get("threshold"), list):
+        return rows
+    lists = [name for name, value in rows[0].items() if isinstance(value, list)]
+    return [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
 
 
 def _ordered(rows: list[dict[str, Any]], order: list[str]) -> pd.DataFrame:
     table = pd.DataFrame(rows)
+    order = [name for name in order if name in table]
     return _numbers(table if table.empty else table.sort_values(order, kind="stable", ignore_index=True))
 
 

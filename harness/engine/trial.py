@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from detectors.average import AverageConfig, prefix_averages
 from detectors.mapping.settings import MappingConfig
 from harness.engine.board_noise import board_noise_rows
+from harness.engine.boards import STUDY_TABLES, Judged, study_rows
 from harness.engine.judge import judge
 from harness.engine.maps import MapMaker
 from harness.engine.setup import SetUp, SetUpRef, load_set_up
@@ -22,9 +23,11 @@ from harness.vocabulary.seeds import canonical_json
 from scenes.perspectives import AnyViews
 from scenes.sensor.source import SimulatedCapture
 
-Role = Literal["hole_free", "damaged"]
+Role = Literal["calibration", "hole_free", "damaged"]
+"""What a trial's target is for. Only in a study do boards that set a threshold ("calibration") differ from those on
+which false calls are counted at it ("hole_free")."""
 Record = dict[str, list[dict[str, Any]]]
-TABLES = ("runs", "holes", "probes", "noise", "registrations")
+TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class PointTask:
 @dataclass(frozen=True)
 class TrialTask:
     """Frames of one set-up, drawn once, judged by all points that share them. ``poses`` declares the views, if there
-    are several."""
+    are several. ``board``: its number among a study's boards of this role; None where the target is the only one."""
 
     set_ups: tuple[SetUpRef, ...]
     seed: int
@@ -53,6 +56,7 @@ class TrialTask:
     repeat: int
     points: tuple[PointTask, ...]
     poses: AnyViews | None = None
+    board: int | None = None
 
 
 def run_trial(task: TrialTask) -> Record:
@@ -63,7 +67,7 @@ def run_trial(task: TrialTask) -> Record:
         began = time.perf_counter()
         clouds = [_clouds(set_up, number, task, points, config) for number, set_up in enumerate(set_ups)]
         seconds_frames = (time.perf_counter() - began) / len(points)
-        if task.role == "hole_free" and task.poses is None:
+        if task.role == "hole_free" and task.poses is None and task.board is None:
             variants = {(point.variant, point.frames) for point in points}
             record["probes"] += list(_probe_rows(set_ups[0], clouds[0], task.repeat, variants))
             pair = capture_of(set_ups[0], 0, task, 2)
@@ -86,9 +90,9 @@ def _clouds(
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
     """The frames of one view in one trial. The first view's are those of an experiment that has no other."""
-    unit = set_up.damaged if task.role == "damaged" else set_up.hole_free
-    further = () if number == 0 else ("view", number)
-    return unit.capture(frames, task.seed, task.role, task.repeat, *further)
+    board = () if task.board is None else ("board", task.board)
+    view = () if number == 0 else ("view", number)
+    return set_up.unit.capture(frames, task.seed, task.role, task.repeat, *board, *view)
 
 
 class _Judged:
@@ -96,10 +100,10 @@ class _Judged:
 
     def __init__(self, task: TrialTask, set_ups: Sequence[SetUp], clouds: Sequence[dict[int, Cloud]]) -> None:
         self._task = task
-        self._hole_free = task.role == "hole_free"
+        self._hole_free = task.role != "damaged"
         self._set_ups = set_ups
         self._clouds = clouds
-        self._done: dict[str, tuple[dict[str, Any], list[dict[str, Any]], list[int | None] | None]] = {}
+        self._done: dict[str, Judged] = {}
         self._maps = None
         if task.poses is not None:
             labels = (task.role, task.repeat)
@@ -108,6 +112,8 @@ class _Judged:
     def rows(self, point: PointTask, seconds_frames: float) -> Record:
         """The rows of one point, by table."""
         common = {"variant": point.variant, "frames": point.frames, "repeat": self._task.repeat}
+        if self._task.board is not None:
+            common["board"] = self._task.board
         extra: dict[str, Any] = {}
         registrations: list[dict[str, Any]] = []
         if self._maps is not None and point.mapping is not None:
@@ -120,31 +126,36 @@ class _Judged:
             }
             registrations = list(self._maps.registration_rows(point.mapping, point.frames))
         began = time.perf_counter()
-        run, holes, errors = self._judged(point)
-        run = {**run, **extra, "seconds_frames": seconds_frames, "seconds_detect": time.perf_counter() - began}
+        judged = self._judged(point)
+        run = {**judged.run, **extra, "seconds_frames": seconds_frames, "seconds_detect": time.perf_counter() - began}
         role = {"role": self._task.role}
-        return {
-            "runs": [{"point": point.digest, **common, **role, **run}],
-            "holes": [{"point": point.digest, **common, **hole} for hole in holes],
+        named = {"point": point.digest, **common}
+        rows = {name: [{**common, **role, **row} for row in rows] for name, rows in judged.of_study.items()}
+        return rows | {
+            "runs": [{**named, **role, **run}],
+            "holes": [{**named, **hole} for hole in judged.holes],
             "registrations": [{**common, **role, **row} for row in registrations],
-            "probes": [] if errors is None else [{**common, "error_tenth_um": errors}],
+            "probes": [] if judged.errors is None else [{**common, "error_tenth_um": judged.errors}],
         }
 
-    def _judged(self, point: PointTask) -> tuple[dict[str, Any], list[dict[str, Any]], list[int | None] | None]:
+    def _judged(self, point: PointTask) -> Judged:
         if self._maps is None or point.mapping is None:
             sight = sight_of_view(self._set_ups[0], self._clouds[0][point.frames], hole_free=self._hole_free)
-            return (*self._judge(sight, point), None)
+            return self._judge(sight, point)
         asked = [point.detector, point.settings_json, point.threshold, point.radius_m]
         key = canonical_json([self._maps.key(point.mapping, point.frames), *asked])
         if key not in self._done:
             sight = self._maps.sight(point.mapping, point.frames)
-            errors = self._map_errors(sight) if self._hole_free else None
-            self._done[key] = (*self._judge(sight, point), errors)
+            errors = self._map_errors(sight) if self._hole_free and self._task.board is None else None
+            self._done[key] = replace(self._judge(sight, point), errors=errors)
         return self._done[key]
 
-    def _judge(self, sight: Sight, point: PointTask) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    def _judge(self, sight: Sight, point: PointTask) -> Judged:
         settings, limit = point.settings_json, point.threshold
-        return judge(sight, point.detector, settings, limit, point.radius_m, hole_free=self._hole_free)
+        judgement = judge(sight, point.detector, settings, limit, point.radius_m, hole_free=self._hole_free)
+        if self._task.board is None:
+            return Judged(judgement.run, judgement.holes)
+        return study_rows(sight, judgement, point.radius_m, hole_free=self._hole_free)
 
     def _map_errors(self, sight: Sight) -> list[int | None]:
         first = self._set_ups[0]
@@ -164,7 +175,7 @@ def _probe_rows(
 ) -> Iterator[dict[str, Any]]:
     """Errors of z on the probes, for each variant and number of frames: one row with a list."""
     for variant, frames in sorted(variants):
-        error_m = clouds[frames].points_m[..., 2].ravel()[set_up.probes] - set_up.true_z_m.ravel()[set_up.probes]
+        error_m = clouds[frames].points_m[..., 2].ravel()[set_up.probes] - set_up.seen_z_m.ravel()[set_up.probes]
         yield {"variant": variant, "frames": frames, "repeat": repeat, "error_tenth_um": _tenth_um(error_m)}
 
 

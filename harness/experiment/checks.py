@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
-from math import dist
+from math import ceil, dist, expm1
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -18,11 +19,13 @@ from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
 from harness.vocabulary.declaration.problems import Problem
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.units import MM
 from scenes.field_of_view import check_in_view
 from scenes.perspectives import AnyViews, poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
 from scenes.target.declaration import TargetConfig
+from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.wavelength import at_wavelength
 
 CAMERA_NAME = ("source", "camera", "name")
@@ -47,6 +50,45 @@ def joint_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem
         yield from _mapping_problems(config, config.source, source)
     else:
         yield from _capture_problems(config, config.source, source)
+    yield from _study_problems(config, source)
+
+
+def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
+    """Whether a study, a family of boards and a threshold set on boards come together."""
+    target = config.source.target if isinstance(config.source, SimulatedSource) else None
+    calibrate = config.threshold.calibrate
+    if config.study is None:
+        if isinstance(target, DrawnTargetConfig):
+            fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
+            yield Problem("a family of boards is for a study", source.place_of(("source", "target")), fix=fix)
+        elif calibrate is not None and calibrate.boards is not None:
+            place = source.place_of(("threshold", "calibrate", "boards"))
+            yield Problem("only a study has boards to draw", place, fix="write `repeats` in its place")
+        return
+    if not isinstance(target, DrawnTargetConfig):
+        fix = "write source.target: {name: drawn}"
+        yield Problem("a study needs a family of boards", source.place_of(("source", "target")), fix=fix)
+        return
+    if config.sensitivity is not None:
+        fix = "sweep the key, or run the study once for each value with --set"
+        yield Problem("a study takes no sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
+    if calibrate is not None and calibrate.boards is None:
+        place = source.place_of(("threshold", "calibrate"))
+        yield Problem("a study's threshold is set on boards of their own", place, fix="write `boards: 60`")
+    elif calibrate is not None and calibrate.boards is not None:
+        yield from _too_few_boards(calibrate.boards, calibrate.false_calls_per_m2 or 0.0, target, source)
+
+
+def _too_few_boards(boards: int, rate_per_m2: float, target: DrawnTargetConfig, source: Source) -> Iterator[Problem]:
+    """Whether so few boards can show so low a rate, were all of their face judged: a new run exceeds the highest of n
+    with probability 1 / (n + 1), and calls at all with 1 - exp(-rate * area)."""
+    board = target.board
+    area_m2 = board.width_mm * board.height_mm * MM**2
+    needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
+    if boards < needed:
+        message = f"{boards} hole-free boards of {area_m2:.3g} m2 cannot show {rate_per_m2:g} false calls per m2"
+        fix = "simulate more boards or larger ones, or ask for a higher false_calls_per_m2"
+        yield Problem(message, source.place_of(("threshold", "calibrate", "boards")), f"at least {needed}", fix=fix)
 
 
 def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
@@ -55,11 +97,14 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     if mistake:
         place = source.place_of(("source", "target"))
         yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
+    elif isinstance(simulated.target, DrawnTargetConfig):
+        yield from _drawn_problems(simulated, simulated.target, source)
     elif simulated.views is None:
         yield from _camera_problems(simulated.camera, target, source)
     else:
         yield from _view_problems(simulated, target, simulated.views, source)
-    pitch_mm = _smallest_pitch_mm(target)
+    drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
+    pitch_mm = _smallest_pitch_mm(target) if drawn is None else drawn.apart_mm
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
         yield Problem(
             f"a matching radius of {config.matching.radius_mm:g} mm reaches beyond half the way to the next damage, so "
@@ -77,6 +122,22 @@ def _camera_problems(config: CameraConfig, target: TargetConfig, source: Source)
     if found:
         path, mistake = found
         yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
+
+
+def _drawn_problems(simulated: SimulatedSource, drawn: DrawnTargetConfig, source: Source) -> Iterator[Problem]:
+    """Whether the camera sees every board that can be drawn. The first pose that it does not see whole is told."""
+    for pose in drawn.extreme_poses():
+        target = drawn.declare().model_copy(update={"pose": pose})
+        problems = list(_camera_problems(simulated.camera, target, source))
+        if simulated.views is not None:
+            problems += _view_problems(simulated, target, simulated.views, source)
+        if problems:
+            where = (
+                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
+                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
+            )
+            yield replace(problems[0], message=f"{where}: {problems[0].message}")
+            return
 
 
 def _view_problems(

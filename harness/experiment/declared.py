@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
-import detectors
+from detectors import DETECTORS, detector_names, detector_type
 from harness.experiment.schema import ExperimentConfig
 from harness.vocabulary.declaration import shape
 
 DETECTOR_NAME = ("detector", "name")
 DETECTOR_SETTINGS = ("detector", "settings")
-
-
-@lru_cache(maxsize=1)
-def detector_names() -> tuple[str, ...]:
-    """Every known detector. Remembered, because looking for plug-ins reads every installed package: 7 ms each time."""
-    return detectors.detector_names()
-
-
-@lru_cache
-def detector_type(name: str) -> Any:
-    """The class of a detector, remembered as `detector_names` are."""
-    return detectors.detector_type(name)
-
-
-def forget_detectors() -> None:
-    """Look for plug-ins anew."""
-    detector_names.cache_clear()
-    detector_type.cache_clear()
 
 
 def splices_of(data: Any) -> shape.Splices:
@@ -49,3 +30,10 @@ def detector_version(config: ExperimentConfig) -> int:
     """The version of the experiment's detector."""
     kind = detector_type(config.detector.name)
     return int(kind(kind.settings_type.from_data(config.detector.settings)).version)
+
+
+def detector_content(config: ExperimentConfig) -> dict[str, Any]:
+    """What can change the detector's numbers beside its settings: its version, of a plug-in the package's too."""
+    offer = DETECTORS.offer(config.detector.name)
+    origin = {} if offer.built_in else {"detector_from": offer.origin}
+    return {"detector_version": detector_version(config), **origin}

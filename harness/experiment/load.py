@@ -8,7 +8,7 @@ from typing import Any
 
 from harness.experiment import checks
 from harness.experiment.calibrated import lens_numbers
-from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, forget_detectors, splices_of
+from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, splices_of
 from harness.experiment.dotted import OPTION, overridden, set_path
 from harness.experiment.points import Experiment
 from harness.experiment.recorded import recording_of
@@ -27,7 +27,6 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 
     ``calibration``: a recording whose lens takes the place of the nominal one (`harness.experiment.calibrated`).
     """
-    forget_detectors()
     recording_of.cache_clear()
     source, problems = overridden(read_yaml(Path(path)), overrides, declared_of)
     source = _with_absolute_paths(source, Path(path).resolve().parent)

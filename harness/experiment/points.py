@@ -16,11 +16,13 @@ from harness.experiment.schema import CaptureSource, ExperimentConfig, Simulated
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.seeds import digest
 from scenes.sensor.camera import camera_digest, camera_of
+from scenes.target.declaration import AnyTargetConfig
+from scenes.target.drawn import DrawnTargetConfig
 
 MAIN = "main"
 """The one set-up of an experiment whose only axis, if any, is the number of frames."""
 
-NO_NUMBERS = ("name", "title", "repeats", "sweep", "switches", "sensitivity")
+NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "switches", "sensitivity")
 """Keys that decide which trials are run, not what a trial gives."""
 
 
@@ -59,7 +61,8 @@ class Experiment:
     @property
     def digest(self) -> str:
         """Names the experiment's results: all points with their repeats, in order."""
-        return digest([[point.variant, point.label, point.digest, point.config.repeats] for point in self.points])
+        points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
+        return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
 
     def folder(self, results: Path) -> Path:
         """Where the results go: ``results/<name>/<digest>``; the name's legal letters keep it inside ``results``."""
@@ -67,9 +70,9 @@ class Experiment:
 
 
 def point_of(
-    label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig, detector_version: int
+    label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig, detector: Mapping[str, Any]
 ) -> Point:
-    """A point from its resolved declaration. The detector's version counts, because it can change numbers."""
+    """A point from its resolved declaration. ``detector``: what can change its numbers beside its settings."""
     source = source_content(config.source)
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     return Point(
@@ -77,7 +80,7 @@ def point_of(
         variant,
         values,
         config,
-        digest=digest({**numbers, "source": source, "detector_version": detector_version}),
+        digest=digest({**numbers, "source": source, **detector}),
         render_key=digest(render_content(config.source)),
         frames_key=digest({"source": source, "seed": config.seed}),
     )
@@ -89,7 +92,7 @@ def source_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
         camera = {**source.camera.to_data(), "facts": camera_digest(camera_of(source.camera))}
         return {
             "kind": source.kind,
-            "target": source.target.declare().to_data(),
+            "target": target_content(source.target),
             "camera": camera,
             "render": source.render.to_data(),
             **({} if source.views is None else {"views": source.views.to_data()}),
@@ -97,12 +100,17 @@ def source_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
     return recorded.content_of(source)
 
 
+def target_content(target: AnyTargetConfig) -> dict[str, Any]:
+    """The full declaration of a target; of a family of boards what they are drawn from."""
+    return target.to_data() if isinstance(target, DrawnTargetConfig) else target.declare().to_data()
+
+
 def render_content(source: SimulatedSource | CaptureSource) -> dict[str, Any]:
     """What decides the noise-free render: the target, the lens, the emitter, the modulation and the window's margin."""
     if not isinstance(source, SimulatedSource):
         return source_content(source)
     return {
-        "target": source.target.declare().to_data(),
+        "target": target_content(source.target),
         "optics": camera_of(source.camera).optics.content(),
         "render": source.render.to_data(),
     }

@@ -16,9 +16,13 @@ from scenes.target.declaration import AnyTargetConfig
 
 MAX_FRAMES = 10_000
 MAX_REPEATS = 100_000
+MAX_BOARDS = 10_000
+DEFAULT_RATE_PER_M2 = 1.0
+"""False calls per square metre that a study's threshold is calibrated to."""
 
 Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
+Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
 AxisValues = Annotated[
     tuple[Any, ...],
     Field(min_length=1, max_length=1000),
@@ -72,9 +76,30 @@ class DetectorConfig(Config):
 
 
 class CalibrateConfig(Config):
-    """The threshold is the lowest k that gives no false cluster in so many hole-free repeats of the same set-up."""
+    """A threshold from hole-free runs: the lowest k that gives no false cluster in so many ``repeats`` of the same
+    set-up; or, in a study, the lowest whose rate of false calls on so many ``boards`` of their own is the one wanted
+    (`harness.evaluation.pod.false_calls.threshold_for_rate`)."""
 
-    repeats: Repeats
+    repeats: Repeats | None = None
+    boards: Boards | None = Field(None, description="of a study: boards of their own, never judged")
+    false_calls_per_m2: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        None, description=f"of a study: the rate that is wanted; none: {DEFAULT_RATE_PER_M2:g}"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_rate(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("boards") is None or data.get("false_calls_per_m2") is not None:
+            return data
+        return {**data, "false_calls_per_m2": DEFAULT_RATE_PER_M2}
+
+    @model_validator(mode="after")
+    def _one_of_the_two(self) -> Self:
+        if (self.repeats is None) == (self.boards is None):
+            raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
+        if self.boards is None and self.false_calls_per_m2 is not None:
+            raise ValueError("`false_calls_per_m2` needs `boards`, as repeats of one board say little about a rate")
+        return self
 
 
 class ThresholdConfig(Config):
@@ -125,6 +150,17 @@ class SensitivityConfig(Config):
     vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
 
 
+class StudyConfig(Config):
+    """A study of the probability of detection: the target is a family of boards, each one drawn at random.
+
+    ``boards`` with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the
+    experiment is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each.
+    """
+
+    boards: Boards
+    hole_free_boards: Boards
+
+
 class ExperimentConfig(Config):
     """One complete experiment, and the axes over which it is swept."""
 
@@ -139,6 +175,7 @@ class ExperimentConfig(Config):
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
+    study: StudyConfig | None = Field(None, description="needs a family of boards, such as target: {name: drawn}")
     repeats: Repeats = 1
     sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
     switches: DottedPath | None = Field(

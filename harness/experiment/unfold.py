@@ -9,7 +9,7 @@ from math import prod
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.declared import declared_of, detector_version, splices_of
+from harness.experiment.declared import declared_of, detector_content, splices_of
 from harness.experiment.dotted import PathError, key_path, path_problem, set_path
 from harness.experiment.points import MAIN, Point, point_of
 from harness.experiment.schema import ExperimentConfig
@@ -33,7 +33,7 @@ MAX_POINTS = 10_000
 """More than a machine works through in a week; beyond it an axis was mistyped."""
 MAX_SHOWN = 20
 """Problems of combinations are found one point at a time and look alike."""
-FIXED = ("name", "title", "repeats", "sweep", SWITCHES, "sensitivity")
+FIXED = ("name", "title", "repeats", "study", "sweep", SWITCHES, "sensitivity")
 """Keys that are the same for all points."""
 
 
@@ -226,7 +226,7 @@ def _points(drafts: list[Draft], source: Source) -> tuple[list[Point], list[Prob
                 break
             continue
         values = {one.path: one.value for one in draft.settings}
-        point = point_of(draft.label, draft.variant, values, _with_repeats(config, draft), detector_version(config))
+        point = point_of(draft.label, draft.variant, values, _with_repeats(config, draft), detector_content(config))
         point = replace(point, is_variation=draft.is_variation)
         twin = draft if draft.is_variation else first.setdefault(point.digest, draft)
         if twin is not draft:
@@ -272,7 +272,7 @@ def _with_repeats(config: ExperimentConfig, draft: Draft) -> ExperimentConfig:
         return config
     config = config.model_copy(update={"repeats": draft.repeats})
     calibrate = config.threshold.calibrate
-    if calibrate is None or draft.calibration_repeats is None:
+    if calibrate is None or calibrate.repeats is None or draft.calibration_repeats is None:
         return config
     calibrate = calibrate.model_copy(update={"repeats": draft.calibration_repeats})
     return config.model_copy(update={"threshold": config.threshold.model_copy(update={"calibrate": calibrate})})

@@ -12,6 +12,7 @@ from harness.evaluation.profile import HoleInView, hole_shape, relative_radius, 
 from harness.report.canvas import BLUE, DAMAGE, GREY, INK, ORANGE, svg
 from harness.report.example import ExampleCloud
 from harness.report.measures import inches
+from harness.report.residual_scale import residual_bar, residual_image, residual_norm
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,23 +73,15 @@ def cloud_figure(clouds: Sequence[ExampleCloud]) -> str:
 
 def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
     """Distance behind (+) or before (-) the fitted surface, mm; linear within 1 mm, logarithmic beyond, grey: none."""
-    from matplotlib.colors import SymLogNorm
-
     finite = [np.abs(c.residual_mm[c.inside & np.isfinite(c.residual_mm)]) for c in clouds]
     pooled = np.concatenate(finite) if finite else np.zeros(0)
-    limit = max(10.0, float(np.quantile(pooled, 0.9995)) if pooled.size else 0.0)
+    norm = residual_norm(float(np.quantile(pooled, 0.9995)) if pooled.size else 0.0)
 
     def paint(axes: Axes, cloud: ExampleCloud, frame: _Frame) -> None:
         shown = np.where(cloud.inside, cloud.residual_mm, np.nan)[frame.rows, frame.cols]
-        norm = SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
-        picture = axes.imshow(shown, extent=frame.extent, aspect="equal", norm=norm, cmap="RdBu_r")
-        axes.set_facecolor("#b9bec4")
+        picture = residual_image(axes, shown, norm, extent=frame.extent)
         axes.set_title(f"{_frames(cloud)}: distance behind the fitted surface")
-        bar = axes.figure.colorbar(picture, cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)), extend="both")
-        bar.set_label("mm")
-        ticks = [t for t in (-100, -10, -1, 0, 1, 10, 100) if abs(t) <= limit]
-        bar.set_ticks(ticks, labels=[f"{t:+d}".replace("-", "−") if t else "0" for t in ticks])
-        bar.minorticks_off()
+        residual_bar(axes.figure, picture, "mm", cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)))
 
     alt = "Range residual of each pixel in millimetres: noise and pattern of the face near zero, holes far behind it."
     return _stacked("residual", clouds, alt, paint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,9 +39,14 @@ def template(name: str, folder: Path | None = None) -> Template:
 
 def closing(tables: ResultTables, provenance: Mapping[str, Any], experiment_yaml_text: str) -> dict[str, Any]:
     """What the sections from failures to the resolved experiment need, and the looks of verdicts."""
+    return closing_sections(provenance, experiment_yaml_text, _left_out(tables.runs))
+
+
+def closing_sections(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> dict[str, Any]:
+    """`closing` without tables; ``left_out``: a sentence on frames that were."""
     return {
         "failures": [_failure(failure) for failure in provenance.get("failures", ())],
-        "left_out": _left_out(tables.runs),
+        "left_out": left_out,
         "seconds": _seconds(provenance),
         "provenance": _provenance_rows(provenance),
         "command": provenance.get("command", "not recorded"),
@@ -142,3 +147,14 @@ def _plain(value: Any) -> str:
 def mm(value: float, digits: int = 2) -> str:
     """A number of millimetres, or a dash where there is none."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+
+
+def aligned(lines: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+    """A plain table: columns of one width each, the first ``left`` flush left, the others flush right."""
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))] if lines else []
+    return [
+        "  ".join(
+            f"{text:{'<' if column < left else '>'}{widths[column]}}" for column, text in enumerate(line)
+        ).rstrip()
+        for line in lines
+    ]

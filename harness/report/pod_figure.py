@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.statement import POD, PodStatement
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, STYLE, svg
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 STRIPE = 0.10
@@ -59,11 +61,6 @@ def sized(value: float, unit: str) -> str:
     return f"{value:#.4g}".rstrip(".") + (f" {unit}" if unit else "")
 
 
-def limit_text(statement: PodStatement) -> str:
-    """a90/95 for a table or a legend."""
-    return sized(statement.bound.value, statement.unit) if statement.bound.demonstrated else "not demonstrated"
-
-
 def axis_text(column: str, unit: str) -> str:
     """``column`` with its unit in brackets, where one was told."""
     return plain(f"{column} ({unit})" if unit else column)
@@ -87,6 +84,19 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
 
 
 def _curve(axes: Axes, statement: PodStatement) -> None:
+    draw_pod(axes, statement, statement.bound)
+    if statement.curve.log_size:
+        _log_sizes(axes, statement.sizes)
+    axes.set_xlim(statement.sizes[0], statement.sizes[-1])
+    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+    axes.set_ylabel("probability of detection")
+    axes.set_title(f"Probability of detection, {statement.targets} targets")
+    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+
+
+def draw_pod(axes: Axes, statement: PodStatement, bound: Bound, strength: float = 0.6) -> None:
+    """Curve, band, data (strokes of opacity ``strength``) and the sizes read off, ``bound`` among them, without words
+    at the axes; the height leaves room for the data."""
     curve, sizes = statement.curve, statement.sizes
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
@@ -95,37 +105,34 @@ def _curve(axes: Axes, statement: PodStatement) -> None:
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
     if statement.signal is None:
-        _hits(axes, statement)
+        draw_hits(axes, statement.size, statement.response == 1, strength)
     for name, value, pod, colour in (
         ("a50", statement.a50, 0.5, GREEN),
         ("a90", statement.a90, POD, ORANGE),
-        ("a90/95", statement.bound.value, POD, RED),
+        ("a90/95", bound.value, POD, RED),
     ):
         _mark(axes, statement, name, value, pod, colour)
-    beside = STRIPE + 0.06 if statement.signal is None else 0.03
-    axes.set_ylim(-beside, 1 + beside)
-    if curve.log_size:
-        _log_sizes(axes, sizes)
-    axes.set_xlim(sizes[0], sizes[-1])
-    axes.set_yticks(np.linspace(0, 1, 6))
-    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
-    axes.set_ylabel("probability of detection")
-    axes.set_title(f"Probability of detection, {statement.targets} targets")
-    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+    hits_in_view(axes, STRIPE + 0.06 if statement.signal is None else 0.03)
 
 
-def _hits(axes: Axes, statement: PodStatement) -> None:
-    """Each inspection as a stroke: hits above 1, misses below 0, spread in height so that equal sizes stay apart."""
-    spread = STRIPE * _spread(len(statement.size))
-    hit = statement.response == 1
-    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": 0.6, "clip_on": False}
-    axes.scatter(statement.size[hit], 1.03 + spread[hit], **style)
+def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) -> None:
+    """Each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke: hits above 1, misses below 0, spread in height
+    so that equal sizes stay apart."""
+    spread = STRIPE * _spread(len(size))
+    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": strength, "clip_on": False}
+    axes.scatter(size[hit], 1.03 + spread[hit], **style)
     label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"
-    axes.scatter(statement.size[~hit], -0.03 - spread[~hit], label=label, **style)
+    axes.scatter(size[~hit], -0.03 - spread[~hit], label=label, **style)
+
+
+def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
+    """The axis of POD, with room above and below its 0 and 1."""
+    axes.set_ylim(-beside, 1 + beside)
+    axes.set_yticks(np.linspace(0, 1, 6))
 
 
 def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: float, colour: str) -> None:
-    text = limit_text(statement) if name == "a90/95" else sized(value, statement.unit)
+    text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
     label = plain(f"{name}: {text}")
     if np.isfinite(value) and statement.sizes[0] <= value <= statement.sizes[-1]:
         axes.plot([value, value], [0, pod], color=colour, lw=1.1)
@@ -137,6 +144,14 @@ def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: flo
 
 
 def _signals(axes: Axes, statement: PodStatement) -> None:
+    draw_signals(axes, statement)
+    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+    axes.set_ylabel(plain(statement.response_column))
+    axes.set_title("Signals")
+    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+
+
+def draw_signals(axes: Axes, statement: PodStatement) -> None:
     """Signals against sizes with the fitted line, one deviation beside it, the decision and where signals end."""
     model = statement.signal
     assert model is not None
@@ -146,8 +161,8 @@ def _signals(axes: Axes, statement: PodStatement) -> None:
     back = np.exp if model.log_signal else np.asarray
     axes.fill_between(sizes, back(line - model.tau), back(line + model.tau), color=BLUE, alpha=0.14, lw=0)
     axes.plot(sizes, back(line), color=BLUE, label="fit ± one deviation")
-    axes.axhline(model.decision, color=RED, lw=1.2, label=f"decision {model.decision:g}")
-    ends = [f"{sign} {value:g}" for sign, value in (("≤", model.left), ("≥", model.right)) if value is not None]
+    axes.axhline(model.decision, color=RED, lw=1.2, label=f"decision {model.decision:.4g}")
+    ends = [f"{sign} {value:.4g}" for sign, value in (("≤", model.left), ("≥", model.right)) if value is not None]
     for value in (model.left, model.right):
         if value is not None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
@@ -164,23 +179,25 @@ def _signals(axes: Axes, statement: PodStatement) -> None:
         )
     if model.log_signal:
         axes.set_yscale("log")
+        plain_numbers(axes.yaxis)
     if statement.curve.log_size:
         _log_sizes(axes, sizes)
     axes.set_xlim(sizes[0], sizes[-1])
-    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
-    axes.set_ylabel(plain(statement.response_column))
-    axes.set_title("Signals")
-    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
 
 def _log_sizes(axes: Axes, sizes: np.ndarray) -> None:
     """A logarithmic axis whose numbers are written out."""
+    axes.set_xscale("log")
+    plain_numbers(axes.xaxis, (1, 2, 5) if sizes[-1] / sizes[0] < 1000 else (1,))
+
+
+def plain_numbers(axis: Axis, at: tuple[float, ...] = (1, 2, 5)) -> None:
+    """20, not 2 x 10^1, ``at`` these multiples of each decade."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if sizes[-1] / sizes[0] < 1000 else (1,)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axis.set_major_locator(LogLocator(subs=at))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _spread(n: int) -> np.ndarray:

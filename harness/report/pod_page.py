@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.statement import ModelRow, PodStatement
-from harness.report.page_parts import template
+from harness.report.page_parts import aligned, template
 from harness.report.pod_figure import answer, pod_svg, sized
 
 VALIDITY = (
@@ -36,9 +36,9 @@ def pod_html(statement: PodStatement, command: str) -> str:
 def pod_text(statement: PodStatement) -> str:
     """The same as plain lines, columns aligned."""
     parts = [f"{statement.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}", ""]
-    parts += [*_aligned([["", statement.criterion, "a50", "a90", "a90/95"], *_marked(statement)]), ""]
-    parts += [*_aligned([list(row) for row in size_rows(statement)], left=3), ""]
-    parts += _aligned([[name, f"{value:.5g}"] for name, value in statement.numbers.items()])
+    parts += [*aligned([["", statement.criterion, "a50", "a90", "a90/95"], *_marked(statement)]), ""]
+    parts += [*aligned([list(row) for row in size_rows(statement)], left=3), ""]
+    parts += aligned([[name, f"{value:.5g}"] for name, value in statement.numbers.items()])
     if statement.tests:
         parts += ["", *(f"{what}: p = {p:.3g}, {reads}" for what, p, reads in statement.tests)]
     parts += ["", *(f"note: {note}" for note in statement.notes)] if statement.notes else []
@@ -76,14 +76,3 @@ def _marked(statement: PodStatement) -> list[list[str]]:
     """The models' cells, the chosen one with a star."""
     cells = [(row.chosen, _model_cells(row, statement)) for row in statement.models]
     return [[f"{'*' if chosen else ' '} {first}", *others] for chosen, (first, *others) in cells]
-
-
-def _aligned(lines: list[list[str]], left: int = 1) -> list[str]:
-    """Columns of one width each, the first ``left`` flush left, the others flush right."""
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))] if lines else []
-    return [
-        "  ".join(
-            f"{text:{'<' if column < left else '>'}{widths[column]}}" for column, text in enumerate(line)
-        ).rstrip()
-        for line in lines
-    ]

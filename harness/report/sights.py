@@ -11,9 +11,11 @@ from harness.evaluation.profile import HoleInView
 from harness.report.canvas import DAMAGE, INK, svg
 from harness.report.example import ExampleCloud
 from harness.report.measures import inches
+from harness.report.residual_scale import BOX, residual_bar, residual_image, residual_norm
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import SymLogNorm
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
@@ -53,10 +55,7 @@ def one_hole_figure(rows: Mapping[str, Sequence[ExampleCloud]], columns: Sequenc
 def _grid(
     name: str, grid: Sequence[Sequence[tuple[ExampleCloud, str]]], titles: Sequence[str], sides: Sequence[str], alt: str
 ) -> str:
-    from matplotlib.colors import SymLogNorm
-
-    limit = max([10.0, *(_deepest(cloud, hole) for line in grid for cloud, hole in line)])
-    norm = SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
+    norm = residual_norm(max(_deepest(cloud, hole) for line in grid for cloud, hole in line))
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(len(grid), len(titles), squeeze=False)
@@ -69,17 +68,13 @@ def _grid(
                 if row == len(grid) - 1:
                     axes.set_xlabel("x from the hole (mm)")
             panels[row, 0].set_ylabel(f"{sides[row]}\ny down (mm)")
-        bar = figure.colorbar(picture, ax=panels, extend="both", shrink=0.8, pad=0.02)
-        bar.set_label("distance behind the fitted surface (mm)")
-        ticks = [t for t in (-10, -1, 0, 1, 10, 30) if abs(t) <= limit]
-        bar.set_ticks(ticks, labels=[f"{t:+d}".replace("-", "−") if t else "0" for t in ticks])
-        bar.minorticks_off()
+        residual_bar(figure, picture, "distance behind the fitted surface (mm)", ax=panels, shrink=0.8, pad=0.02)
 
     size = (PANEL_IN * len(titles) + SIDE_IN + 0.8, PANEL_IN * len(grid) + 0.9)
     return svg(name, size, alt, draw)
 
 
-def _panel(axes: Axes, cloud: ExampleCloud, name: str, norm: object) -> AxesImage:
+def _panel(axes: Axes, cloud: ExampleCloud, name: str, norm: SymLogNorm) -> AxesImage:
     """One hole in one cloud: residuals, the true rim, dots on pixels of detected clusters."""
     index = next(i for i, hole in enumerate(cloud.truth) if hole.hole == name)
     hole, rim = cloud.truth[index], cloud.outlines_px[index]
@@ -92,24 +87,13 @@ def _panel(axes: Axes, cloud: ExampleCloud, name: str, norm: object) -> AxesImag
     cut = (slice(low[1], high[1]), slice(low[0], high[0]))
     left, top = (low - 0.5 - centre) * step
     right, bottom = (high - 0.5 - centre) * step
-    picture = axes.imshow(
-        cloud.residual_mm[cut],
-        extent=(left, right, bottom, top),
-        norm=norm,  # type: ignore[arg-type]
-        cmap="RdBu_r",
-        aspect="equal",
-    )
+    picture = residual_image(axes, cloud.residual_mm[cut], norm, extent=(left, right, bottom, top))
     axes.plot(*((rim - centre) * step).T, color=INK, lw=1.1)
     v, u = np.nonzero(cloud.detected[cut])
     axes.plot((u + low[0] - centre[0]) * step[0], (v + low[1] - centre[1]) * step[1], ".", color=DAMAGE, ms=2.2, mew=0)
-    axes.set_facecolor("#b9bec4")
     axes.set(xlim=(-half, half), ylim=(half, -half))
-    axes.grid(visible=False)
-    axes.text(0.03, 0.03, f"{step[0]:.2f} mm/px", transform=axes.transAxes, fontsize=8, bbox=LABEL)
+    axes.text(0.03, 0.03, f"{step[0]:.2f} mm/px", transform=axes.transAxes, fontsize=8, bbox=BOX)
     return picture
-
-
-LABEL = {"facecolor": "#ffffff", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
 
 
 def _deepest(cloud: ExampleCloud, name: str) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from harness.evaluation.summary import MAIN
 from harness.report.measures import inches
+from harness.report.page_parts import aligned
 from harness.report.perspectives_rows import Ways
 from harness.report.set_ups_rows import Layout, count_text, found_text
 
@@ -42,14 +43,7 @@ def terminal_table(summary: pd.DataFrame, variant: str = MAIN) -> Table:
 def terminal_text(summary: pd.DataFrame, variant: str = MAIN) -> str:
     """`terminal_table` as plain lines without colour or boxes, columns aligned."""
     frames, rows = _cells(summary, variant)
-    return _aligned([_heads(frames), *([text for text, _ in row] for row in rows)], ">")
-
-
-def _aligned(lines: list[list[str]], side: str) -> str:
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join(f"{text:{side}{width}}" for text, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+    return "\n".join(aligned([_heads(frames), *([text for text, _ in row] for row in rows)], left=0))
 
 
 def set_ups_table(compared: pd.DataFrame, layout: Layout) -> Table:
@@ -71,7 +65,8 @@ def set_ups_table(compared: pd.DataFrame, layout: Layout) -> Table:
 
 def set_ups_text(compared: pd.DataFrame, layout: Layout) -> str:
     """`set_ups_table` as plain lines."""
-    return _aligned(_set_up_lines(compared, layout), "<")
+    lines = _set_up_lines(compared, layout)
+    return "\n".join(aligned(lines, left=len(lines[0])))
 
 
 def maps_table(compared: pd.DataFrame, ways: Ways) -> Table:
@@ -95,7 +90,8 @@ def maps_table(compared: pd.DataFrame, ways: Ways) -> Table:
 
 def maps_text(compared: pd.DataFrame, ways: Ways) -> str:
     """`maps_table` as plain lines."""
-    return _aligned(_map_lines(compared, ways), "<")
+    lines = _map_lines(compared, ways)
+    return "\n".join(aligned(lines, left=len(lines[0])))
 
 
 def _map_lines(compared: pd.DataFrame, ways: Ways) -> list[list[str]]:

@@ -1,4 +1,8 @@
-"""Cameras as data: a YAML file in which every number has a tag and a source, checked against the model of its kind."""
+"""Cameras as data: a YAML file in which every number has a tag and a source, checked against the model of its kind.
+
+tofpod's own are the files of ``scenes/cameras/``; packages offer others through the entry point group
+``tofpod.cameras``.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +20,29 @@ from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.effects import EffectsConfig
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
+
+GROUP = "tofpod.cameras"
+"""Entry points of this group name an attribute that is the path of a camera's file, called as the entry point is."""
+
+
+@lru_cache
+def _own_files() -> dict[str, str]:
+    return {path.stem: str(path) for path in CAMERA_FOLDER.glob("*.yaml") if not path.name.startswith(".")}
+
+
+CAMERAS = PlugIns(
+    GROUP,
+    "camera",
+    _own_files,
+    fix=f"to add one, write its file in scenes/cameras/, or install a package that offers it by {GROUP!r}",
+)
 
 AnyCamera = AmcwCamera | ScannedLidar
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
@@ -32,7 +53,10 @@ KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar]] = {"amcw_imager": AmcwCa
 class CameraConfig(Config):
     """Which camera an experiment uses, which unit of it, and which of its effects are on."""
 
-    name: str = Field("azure_kinect_nfov", description="a file of scenes/cameras/ without its ending")
+    name: str = Field(
+        "azure_kinect_nfov",
+        description="a file of scenes/cameras/ without its ending, or a camera of an installed package",
+    )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()
     fixed_pattern_scale: float = Field(
@@ -61,22 +85,32 @@ class CameraConfig(Config):
 
 
 def camera_names() -> tuple[str, ...]:
-    """The cameras that come with tofpod."""
-    return tuple(sorted(path.stem for path in CAMERA_FOLDER.glob("*.yaml") if not path.name.startswith(".")))
+    """The cameras that come with tofpod and those of installed packages."""
+    return CAMERAS.names()
 
 
-@lru_cache
+def camera_file(name: str) -> Path:
+    """The file of the camera of that name.
+
+    Raises UserError for an unknown name, for one that is taken twice, and where a package offers no file.
+    """
+    offer = CAMERAS.offer(name)
+    if offer.built_in:
+        return Path(offer.target)
+    offered = CAMERAS.load(offer)
+    if not isinstance(offered, str | Path):
+        raise CAMERAS.broken(offer, f"the path of a YAML file is wanted, not {type(offered).__name__}")
+    path = Path(offered)
+    if path.stem != name:
+        raise CAMERAS.broken(offer, f"the file of the camera {name} must be called {name}.yaml, not {path.name}")
+    if not path.is_file():
+        raise CAMERAS.broken(offer, f"there is no file {path}")
+    return path
+
+
 def load_camera(name: str) -> AnyCamera:
-    """The camera of that name. Raises UserError for an unknown name or a file that does not describe a camera."""
-    path = CAMERA_FOLDER / f"{name}.yaml"
-    if name not in camera_names():
-        near = difflib.get_close_matches(name, camera_names(), n=1)
-        raise UserError(
-            f"there is no camera {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
-            legal=", ".join(camera_names()),
-            fix=f"to add one, write {path.name} in scenes/cameras/",
-        )
-    return read_camera(path)
+    """The camera of that name. Raises UserError as `camera_file`, and for a file that does not describe a camera."""
+    return _camera_at(camera_file(name))
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
@@ -102,10 +136,15 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}",
-                legal=f"a number of scenes/cameras/{name}.yaml, such as lens.fx_px",
+                legal=f"a number of {_told(camera_file(name))}, such as lens.fx_px",
             )
         at.update(value=value, tag="U", source="set by the experiment")
     return _validated(data, f"source.camera.numbers, put into {name},")
+
+
+def _told(path: Path) -> str:
+    """A camera's file as messages name it: tofpod's own from the project's root."""
+    return f"scenes/cameras/{path.name}" if path.parent == CAMERA_FOLDER else str(path)
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -115,6 +154,11 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
         if isinstance(value, dict):
             paths += [prefix + key] if "value" in value else number_paths(value, f"{prefix}{key}.")
     return paths
+
+
+@lru_cache
+def _camera_at(path: Path) -> AnyCamera:
+    return read_camera(path)
 
 
 def read_camera(path: Path) -> AnyCamera:

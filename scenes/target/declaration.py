@@ -1,6 +1,7 @@
 """The front door of target declarations: every kind of target, told apart by ``name``.
 
-    AnyTargetConfig  a TargetConfig ("custom": all parts spelt out) or a ThesisTargetConfig ("thesis": the named board)
+    AnyTargetConfig  a TargetConfig ("custom": all parts spelt out), a ThesisTargetConfig ("thesis": the named board) or
+                     a DrawnTargetConfig ("drawn": a family of boards with random damage)
 
 Each answers ``declare()`` with the full TargetConfig, which `scenes.target.mesh.build_target` builds.
 """
@@ -28,6 +29,7 @@ from scenes.target.custom import (
     TargetConfig,
     TermConfig,
 )
+from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import OpenFact, ThesisTargetConfig, open_facts
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "BoardConfig",
     "CylinderConfig",
     "DentConfig",
+    "DrawnTargetConfig",
     "FlatConfig",
     "HoleConfig",
     "MaterialConfig",
@@ -53,15 +56,16 @@ __all__ = [
     "target_from_data",
 ]
 
-AnyTargetConfig = Annotated[ThesisTargetConfig | TargetConfig, Field(discriminator="name")]
+AnyTargetConfig = Annotated[ThesisTargetConfig | TargetConfig | DrawnTargetConfig, Field(discriminator="name")]
 
-TARGETS: dict[str, type[ThesisTargetConfig] | type[TargetConfig]] = {
+TARGETS: dict[str, type[ThesisTargetConfig] | type[TargetConfig] | type[DrawnTargetConfig]] = {
     "thesis": ThesisTargetConfig,
     "custom": TargetConfig,
+    "drawn": DrawnTargetConfig,
 }
 """The kinds by name."""
 
 
-def target_from_data(data: Any) -> ThesisTargetConfig | TargetConfig:
+def target_from_data(data: Any) -> ThesisTargetConfig | TargetConfig | DrawnTargetConfig:
     """Validate plain data (as of YAML and JSON). Raises pydantic.ValidationError; its ``loc`` starts with the kind."""
     return TypeAdapter(AnyTargetConfig).validate_json(json.dumps(data))

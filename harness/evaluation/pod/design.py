@@ -167,7 +167,9 @@ def repeats_are_not_targets(
         np.asarray(size, float), np.asarray(hit, float), link=link, log_size=log_size, inspections=np.asarray(target)
     )
     right = bound(fit, pod, confidence, method)
-    wrong = bound(fit, pod, confidence, method, rows_are_targets=True)
+    # A fit of its own: where hits and misses separate, the penalty would still count targets.
+    rows = fit_hit_miss(np.asarray(size, float), np.asarray(hit, float), link=link, log_size=log_size)
+    wrong = bound(rows, pod, confidence, method)
     name = f"a{100 * pod:g}/{100 * confidence:g}"
     text = (
         f"{fit.n} inspections of {fit.targets} targets are {fit.targets} targets: {name} {_said(right)}; "

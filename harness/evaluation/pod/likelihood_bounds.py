@@ -10,6 +10,7 @@ All are one-sided upper bounds on size. Coverage at 60 targets is measured by ``
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,8 @@ FARTHEST = 2.0**40
 """Largest distance from the estimate, in spreads of the sizes, at which a bound is looked for."""
 DIRECTIONS = 720
 """Points on the outline of the likelihood ratio set from which a band is drawn."""
+REACH, REFINED = 10, 40
+"""Doublings of a distance (from 2 to 2000 standard errors) and refinements of it, at most; about ten are needed."""
 
 
 def bound(
@@ -35,15 +38,20 @@ def bound(
     method: str = "likelihood ratio",
     *,
     rows_are_targets: bool = False,
+    design_effect: float = 1.0,
 ) -> Bound:
     """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
 
     ``rows_are_targets`` ignores that rows repeat targets: the wrong number, to be shown beside the right one.
+    ``design_effect``: what targets that come in clusters multiply the variance by; so it multiplies the criterion (Rao
+    and Scott, Annals of Statistics 12 (1984), 46).
     """
     _check(pod, confidence, method)
+    if not design_effect > 0:
+        raise UserError(f"design effect {design_effect:g} is out of range", legal="above 0")
     if pod <= fit.curve.floor:
         raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
-    repeats = 1.0 if rows_are_targets else fit.repeats
+    repeats = design_effect * (1.0 if rows_are_targets else fit.repeats)
     if method == "wald":
         x, why = _wald_bound(fit, pod, confidence, repeats)
     else:
@@ -138,8 +146,7 @@ def _x_at(fit: HitMissFit, pod: float) -> float:
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0.
 
-    Along directions evenly spread in the metric of the covariance, by bisection of the distance, which a concave
-    likelihood makes exact.
+    Along directions evenly spread in the metric of the covariance; a concave likelihood crosses it once in each.
     """
     data = fit.data
     best = np.array([fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread])
@@ -150,12 +157,40 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     with np.errstate(divide="ignore"):
         farthest = np.where(step[:, 1] < 0, -best[1] / step[:, 1], np.inf)
     lowest = float(data.value(*best)) - 0.5 * allowed
-    inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 1e3 * np.sqrt(allowed))
-    for _ in range(34):
-        middle = 0.5 * (inside + outside)
-        within = data.value(best[0] + middle * step[:, 0], best[1] + middle * step[:, 1]) >= lowest
-        inside, outside = np.where(within, middle, inside), np.where(within, outside, middle)
+    inside = _distances(lambda r: data.value(best[0] + r * step[:, 0], best[1] + r * step[:, 1]) - lowest, farthest)
     return np.asarray(best + inside[:, None] * step)
+
+
+def _distances(excess: Callable[[np.ndarray], np.ndarray], farthest: np.ndarray) -> np.ndarray:
+    """Where ``excess``, above 0 at distance 0, falls through 0, direction by direction; the farthest looked at
+    where it does not.
+
+    Doubled distances bracket it, then the Illinois variant of the false position (Dowell and Jarratt, BIT 11 (1971)).
+    """
+    inside, outside = np.zeros_like(farthest), np.minimum(farthest, 2.0)
+    value_in, value_out = excess(inside), excess(outside)
+    for _ in range(REACH):
+        further = (value_out > 0) & (outside < farthest)
+        if not further.any():
+            break
+        inside, value_in = np.where(further, outside, inside), np.where(further, value_out, value_in)
+        outside = np.where(further, np.minimum(2.0 * outside, farthest), outside)
+        value_out = excess(outside)
+    ends = value_out >= 0
+    side = np.zeros_like(farthest)
+    for _ in range(REFINED):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = np.where(ends, outside, inside + (outside - inside) * value_in / (value_in - value_out))
+        value = excess(r)
+        within = value > 0
+        value_out = np.where(within & (side > 0), 0.5 * value_out, value_out)
+        value_in = np.where(~within & (side < 0), 0.5 * value_in, value_in)
+        side = np.where(within, 1.0, -1.0)
+        inside, value_in = np.where(within, r, inside), np.where(within, value, value_in)
+        outside, value_out = np.where(within, outside, r), np.where(within, value_out, value)
+        if np.all(ends | (outside - inside <= 1e-9 * outside) | (np.abs(value) <= 1e-9)):
+            break
+    return np.where(ends, outside, r)
 
 
 def _variance(covariance: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -1,0 +1,115 @@
+"""The easy way to a detector: say how every pixel scores, and clusters, quiet threshold and sizes follow."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Generic, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.measure import HoleModelConfig, extents, measure_detection
+from detectors.segment import euclidean_clusters
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.config import Config
+from harness.vocabulary.units import MM
+
+
+class ScoreMapConfig(Config):
+    """What turns a score map into findings. Pixels above the threshold that a chain of steps no longer than
+    ``cluster_distance_mm`` joins are one finding; those with fewer than ``min_points`` are none."""
+
+    min_points: int = Field(default=1, ge=1)
+    cluster_distance_mm: float = Field(default=10.0, gt=0)
+    hole_model: HoleModelConfig = Field(default_factory=HoleModelConfig)
+
+
+S = TypeVar("S", bound=ScoreMapConfig)
+
+
+class ScoreMapDetector(ABC, Generic[S]):
+    """Implements `detectors.interface.Detector` but for `analyse`. A subclass also gives ``name``, ``version`` and, for
+    settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is what
+    ``python -m harness.ls`` says of it. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
+
+    settings_type: ClassVar[type[ScoreMapConfig]] = ScoreMapConfig
+    name: str
+    version: int
+
+    def __init__(self, settings: S) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score every pixel. Raises UserError where the cloud cannot be judged (empty crop, too few points)."""
+
+    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+        """Clusters of pixels whose score is above the threshold, strongest first."""
+        pixels = above(evidence, threshold)
+        labels = self._clusters(cloud, pixels)
+        clusters = [pixels[labels == label] for label in range(labels.max(initial=-1) + 1)]
+        found = [self._detection(cloud, evidence, cluster) for cluster in clusters]
+        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
+
+    def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
+        """The lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
+        return self._strength(cloud, evidence, above(evidence, 0.0))
+
+    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+        """The thesis' extents, and the model of a blurred hole."""
+        return measure_detection(cloud, evidence, detection, self.settings.hole_model)
+
+    def _detection(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> Detection:
+        centre_m = extents(cloud.points_m.reshape(-1, 3)[pixels])[1]
+        return Detection(self._strength(cloud, evidence, pixels), pixels, centre_m)
+
+    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+        points = cloud.points_m.reshape(-1, 3)[pixels]
+        return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+
+    def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
+        """The lowest threshold at which no cluster of ``min_points`` is left among these pixels.
+
+        Raising the threshold only takes points away and only splits clusters, so the answer is the score of the point,
+        in falling order, that completes the first cluster: found by doubling and bisection.
+        """
+        if len(pixels) < self.settings.min_points:
+            return 0.0
+        scores = evidence.score.reshape(-1)[pixels]
+        if self.settings.min_points == 1:
+            return float(scores.max())
+        falling = np.argsort(-scores, kind="stable")
+
+        def completes(count: int) -> bool:
+            return bool((self._clusters(cloud, pixels[falling[:count]]) >= 0).any())
+
+        count = _first_true(completes, self.settings.min_points, len(pixels))
+        return 0.0 if count is None else float(scores[falling[count - 1]])
+
+
+def above(evidence: Evidence, threshold: float) -> np.ndarray:
+    """Flat indices, ascending, of the pixels whose score exceeds the threshold."""
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero(evidence.score.reshape(-1) > threshold)
+
+
+def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(h, w) image with the values (n,) where the mask (h, w) is true, in its order, and NaN elsewhere."""
+    image = np.full(mask.shape, np.nan)
+    image[mask] = values
+    return image
+
+
+def _first_true(test: Callable[[int], bool], low: int, high: int) -> int | None:
+    """The least n in low..high at which a test that never turns false again is true; None if it never is."""
+    trial = low
+    while not test(trial):
+        if trial == high:
+            return None
+        low, trial = trial + 1, min(2 * trial, high)
+    while low < trial:
+        middle = (low + trial) // 2
+        low, trial = (low, middle) if test(middle) else (middle + 1, trial)
+    return trial

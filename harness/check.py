@@ -1,0 +1,151 @@
+"""``python -m harness.check experiments/regression.yaml``: a gate that fails where a detection limit got worse.
+
+The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
+set-up fails if its a90 or its rate of false calls has grown by more than 10 % and the test over boards says that it is
+not by chance (0.1 % for the whole check); or if it has no limit any more, more failed trials, or is missing.
+
+What it sees, by `tests/validation/gate_power.py`, for 30 boards of ten holes, 20 boards to calibrate on, two set-ups:
+with another draw of all noise 0.6 % of 500 checks fail (0.1 to 1.7 %); of 16 checks each, 12 % fail where a90 grows
+by 5 %, 81 % by 10 %, 94 % by 15 % and all by 20 % and more. With the same seed and code the frames are the
+baseline's, and nothing fails that has not changed. On other frames a rise of false calls is seen worse than on the
+same: few calibration boards leave much to luck.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.evaluation.study.record import StudyRecord
+    from harness.evaluation.study.verdict import Comparison
+    from harness.experiment.points import Experiment
+
+BASELINES = Path(__file__).resolve().parents[1] / "results" / "baselines"
+"""Where the repository keeps them, one ``<name of the experiment>.json`` each."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user (a missing baseline, one
+    measured with another stick), 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.check " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.check",
+        description="Run a study of detection limits and compare it with its baseline. Fails (exit code 1) where a "
+        "limit, or the rate of false calls, has grown by more than 10 % and a paired test says that it is not by "
+        "chance, where a set-up has no limit any more, or where more trials fail.",
+        epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
+    )
+    add = parser.add_argument
+    add("experiment", type=Path, help="a YAML file with a `study`, such as experiments/regression.yaml")
+    add(
+        "--set",
+        dest="overrides",
+        metavar="PATH=VALUE",
+        action="append",
+        default=[],
+        help="change one value of the file, such as seed=7 for another draw of the noise; may be repeated",
+    )
+    add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
+    add("--update", action="store_true", help="write the baseline anew, and print what changes")
+    add("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 4096:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
+    return int(text)
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.engine.study import run_study
+    from harness.experiment.load import load_experiment
+
+    experiment = load_experiment(options.experiment, options.overrides)
+    if experiment.config.study is None:
+        raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
+    path = options.baseline or BASELINES / f"{experiment.config.name}.json"
+    baseline = _baseline(path, may_be_missing=options.update)
+    code = run_study(experiment, options.out, options.jobs, command)
+    if code not in (0, 1):
+        return code
+    found = _found(experiment, options.out)
+    comparison = _compared(baseline, found, experiment.folder(options.out), command)
+    if options.update:
+        return _update(path, found, trials_failed=code == 1)
+    assert comparison is not None
+    return _gate(comparison, path)
+
+
+def _baseline(path: Path, *, may_be_missing: bool) -> StudyRecord | None:
+    """Read before anything runs: a study takes minutes."""
+    from harness.evaluation.study.record import read_record
+
+    if path.is_file():
+        return read_record(path)
+    if may_be_missing:
+        return None
+    raise UserError(f"{path}: there is no such baseline", fix="write one with --update, and commit it")
+
+
+def _found(experiment: Experiment, out: Path) -> StudyRecord:
+    from harness.evaluation.study.record import read_record
+
+    return read_record(experiment.folder(out))
+
+
+def _compared(baseline: StudyRecord | None, found: StudyRecord, folder: Path, command: str) -> Comparison | None:
+    """Printed, and written beside the study's own results."""
+    from harness.compare import FILES, print_comparison, write_comparison
+    from harness.evaluation.study.verdict import compare_studies
+
+    if baseline is None:
+        return None
+    comparison = compare_studies(baseline, found)
+    print()
+    print_comparison(comparison)
+    write_comparison(comparison, folder, command)
+    print(f"comparison with the baseline: {folder / FILES[1]}")
+    return comparison
+
+
+def _update(path: Path, found: StudyRecord, *, trials_failed: bool) -> int:
+    from harness.evaluation.study.record import record_text
+    from harness.vocabulary.files import write_text
+
+    if trials_failed:
+        raise UserError(f"{path}: is left as it was, since trials failed", fix="mend what makes them fail first")
+    write_text(path, record_text(found))
+    print(f"wrote {path}")
+    return 0
+
+
+def _gate(comparison: Comparison, path: Path) -> int:
+    missing = [row.label for row in comparison.marked("only in first")]
+    if missing:
+        print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
+    if missing or any(row.is_worse for row in comparison.rows):
+        print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
+        return 1
+    if apart := comparison.marked("not comparable"):
+        raise UserError(
+            f"{path}: cannot be compared with: {'; '.join(f'{row.label}: {row.why}' for row in apart)}",
+            fix="run the check again with --update and commit the baseline",
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

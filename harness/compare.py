@@ -1,0 +1,92 @@
+"""``python -m harness.compare A B``: two studies of detection limits, set-up by set-up, with paired tests."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import exit_code_of
+
+if TYPE_CHECKING:
+    from harness.evaluation.study.verdict import Comparison
+
+FILES = ("compare.json", "compare.html")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.compare " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.compare",
+        description="Compare the detection limits of two studies: a90 and its change with an interval over boards, "
+        "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
+        "failing, x not comparable.",
+        epilog="Set-ups are paired by name and frames; where each study has one only, by that. Tests are paired where "
+        "both studies have the same boards. To make a change of a detection limit fail: python -m harness.check.",
+    )
+    add = parser.add_argument
+    add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
+    add("second", type=Path, metavar="B", help="likewise; what is asked is whether B is worse or better than A")
+    add("--json", action="store_true", help="print JSON instead of the table")
+    add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.evaluation.study.record import read_record
+    from harness.evaluation.study.verdict import compare_studies
+
+    comparison = compare_studies(read_record(options.first), read_record(options.second))
+    print_comparison(comparison, as_json=options.json)
+    if options.out is not None:
+        write_comparison(comparison, options.out, command)
+        # On stdout it would be no JSON any more.
+        print(f"wrote {', '.join(str(options.out / name) for name in FILES)}", file=sys.stderr)
+    return 0
+
+
+def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
+    """The table, in colour on a terminal; or JSON."""
+    from harness.report.compare_rows import compare_table, compare_text
+
+    if as_json:
+        print(_json(comparison))
+        return
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        console, table = Console(), compare_table(comparison)
+        # On a narrow terminal rich would cut the numbers; wrapped lines can still be read.
+        if console.measure(table, options=console.options.update(max_width=1000)).maximum <= console.width:
+            console.print(table)
+            return
+    print(compare_text(comparison))
+
+
+def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
+    """`FILES` in ``folder``."""
+    from harness.report.compare_page import compare_html
+    from harness.vocabulary.files import write_text
+
+    write_text(folder / FILES[0], _json(comparison) + "\n")
+    write_text(folder / FILES[1], compare_html(comparison, command))
+
+
+def _json(comparison: Comparison) -> str:
+    import json
+
+    from harness.report.compare_rows import compare_data
+
+    return json.dumps(compare_data(comparison), indent=2, allow_nan=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""What a study asks of one board beside the ordinary rows: signals at every place, findings, and what would be found
+and flagged at other thresholds than the one in use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from harness.engine.judge import Judgement, centres_m, places_of
+from harness.engine.sight import Sight
+from harness.evaluation.match import match
+from harness.vocabulary.units import MM
+from scenes.target.truth import Damage
+
+STUDY_TABLES = ("sites", "findings", "operating", "pixels")
+STEPS_PER_OCTAVE = 4
+FINDING_OCTAVES = (-2, 3)
+"""Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
+PIXEL_OCTAVES = (-6, 4)
+"""Other thresholds for pixels: reaches down to where a third of the undamaged face and more lies above."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Rows of one point's judgement. ``of_study``: by table of `STUDY_TABLES`; ``errors``: of a map, on the probes."""
+
+    run: dict[str, Any]
+    holes: list[dict[str, Any]]
+    of_study: Mapping[str, list[dict[str, Any]]] = field(default_factory=dict)
+    errors: list[int | None] | None = None
+
+
+def study_rows(sight: Sight, judgement: Judgement, radius_m: float, *, hole_free: bool) -> Judged:
+    """The rows of one board: of a board that only sets a threshold, the area that was judged."""
+    score = judgement.evidence.score
+    run = {**judgement.run, "inspected_m2": sight.area_m2(np.isfinite(score))}
+    threshold = run["threshold"]
+    if np.isnan(threshold):
+        return Judged(run, [])
+    signals = [_signal(sight, score, damage, radius_m) for damage in sight.truth]
+    sites = list(_sites(sight, judgement, signals)) if hole_free else []
+    judged = [] if hole_free else zip(judgement.holes, signals, strict=True)
+    holes = [{**row, "signal": signal} for row, signal in judged]
+    tables = {
+        "sites": sites,
+        "findings": list(_findings(sight, judgement, hole_free=hole_free)),
+        "operating": [_operating(sight, judgement, threshold, radius_m, hole_free=hole_free)],
+        "pixels": [] if hole_free else list(_pixels(sight, score, threshold)),
+    }
+    return Judged(run, holes, tables)
+
+
+def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
+    """(n,) thresholds in equal ratios about the one in use; that alone where it is 0."""
+    if not threshold > 0:
+        return np.array([threshold])
+    steps = np.arange(octaves[0] * STEPS_PER_OCTAVE, octaves[1] * STEPS_PER_OCTAVE + 1)
+    return np.asarray(threshold * 2.0 ** (steps / STEPS_PER_OCTAVE))
+
+
+def _signal(sight: Sight, score: np.ndarray, damage: Damage, radius_m: float) -> float:
+    """The highest score within the hit radius of a damage's centre; NaN where no pixel there was judged."""
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(sight.places_m - damage.centre_board_m[:2], axis=-1) <= radius_m
+    there = score[near & np.isfinite(score)]
+    return float(there.max()) if there.size else float("nan")
+
+
+def _sites(sight: Sight, judgement: Judgement, signals: list[float]) -> Iterator[dict[str, Any]]:
+    """A hole-free board's places of left-out damage."""
+    for number, (damage, signal) in enumerate(zip(sight.truth, signals, strict=True)):
+        yield {
+            "hole": str(damage.id),
+            "true_diameter_mm": damage.diameter_m / MM,
+            "true_depth_mm": damage.depth_m / MM,
+            "true_x_mm": float(damage.centre_board_m[0]) / MM,
+            "true_y_mm": float(damage.centre_board_m[1]) / MM,
+            "detected": number in judgement.pairs,
+            "signal": signal,
+        }
+
+
+def _findings(sight: Sight, judgement: Judgement, *, hole_free: bool) -> Iterator[dict[str, Any]]:
+    pairs = {} if hole_free else judgement.pairs
+    counts_for = {finding: str(sight.truth[damage].id) for damage, finding in pairs.items()}
+    for number, (detection, place) in enumerate(zip(judgement.detections, judgement.places_m, strict=True)):
+        yield {
+            "x_mm": float(place[0]) / MM,
+            "y_mm": float(place[1]) / MM,
+            "score": float(detection.score),
+            "hole": counts_for.get(number, ""),
+        }
+
+
+def _operating(
+    sight: Sight, judgement: Judgement, threshold: float, radius_m: float, *, hole_free: bool
+) -> dict[str, list[Any]]:
+    """Lists over the grid of thresholds: numbers of findings and of hits."""
+    thresholds = grid(threshold, FINDING_OCTAVES)
+    findings, hits = [], []
+    for one in thresholds:
+        found = judgement.detector.find(sight.cloud, judgement.evidence, float(one))
+        findings.append(len(found))
+        hits.append(0 if hole_free else len(match(centres_m(sight), places_of(sight, found), radius_m)))
+    return {"threshold": thresholds.tolist(), "findings": findings, "hits": hits}
+
+
+def _pixels(sight: Sight, score: np.ndarray, threshold: float) -> Iterator[dict[str, Any]]:
+    """Of each damage and of the undamaged face: judged pixels, and how many of them lie above each threshold."""
+    thresholds = grid(threshold, PIXEL_OCTAVES)
+    flat = score.ravel()
+    parts = [(str(damage.id), sight.outlines[damage.id]) for damage in sight.truth]
+    for name, pixels in (*parts, ("", np.flatnonzero(sight.undamaged.ravel()))):
+        there = np.sort(flat[pixels][np.isfinite(flat[pixels])])
+        above = len(there) - np.searchsorted(there, thresholds, side="right")
+        yield {"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above.tolist()}

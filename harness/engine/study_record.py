@@ -1,0 +1,114 @@
+"""From a study's tables to its record: every inspection of every set-up, and what names targets and frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from harness.engine.plan import CODE, PACKAGES, Batch, Group, Plan
+from harness.engine.tables import Tables
+from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
+from harness.experiment.declared import detector_version
+from harness.experiment.points import Experiment, Point
+from harness.vocabulary.seeds import digest
+from harness.vocabulary.sources import source_digest
+
+SIMULATION = tuple(folder for folder in CODE if folder in ("scenes", "harness/vocabulary"))
+"""Code that decides frames; a change of any makes frames count as different."""
+
+
+def record_of(
+    experiment: Experiment, plan: Plan, tables: Tables, failed: Mapping[str, int], provenance: Mapping[str, Any]
+) -> StudyRecord:
+    """The record of a study. ``failed``: trials that raised, by point digest. Set-ups no trial of which ended are left
+    out, as nothing can be said of them."""
+    calibrate = experiment.config.threshold.calibrate
+    found = {point.digest: group for group in plan.groups for point in group.points}
+    set_ups = [_set_up(point, found[point.digest], tables, failed.get(point.digest, 0)) for point in experiment.points]
+    return StudyRecord(
+        name=experiment.config.name,
+        digest=experiment.digest,
+        hit_radius_mm=experiment.config.matching.radius_mm,
+        false_calls_per_m2=None if calibrate is None else calibrate.false_calls_per_m2,
+        provenance={key: provenance[key] for key in ("commit", "dirty", "versions", "seed", "command")},
+        set_ups=tuple(one for one in set_ups if one is not None),
+    )
+
+
+def _set_up(point: Point, group: Group, tables: Tables, failed: int) -> SetUpRecord | None:
+    frames = point.config.capture.frames
+    holes, runs = (_of(table, point.variant, frames) for table in (tables.holes, tables.runs))
+    if holes.empty:
+        return None
+    judged = runs[runs["threshold"].notna()]
+    unflawed = judged[judged["role"] == "hole_free"]
+    threshold = float(judged["threshold"].iloc[0])
+    return SetUpRecord(
+        variant=point.variant,
+        frames=frames,
+        axes=dict(point.axes),
+        detector=point.config.detector.name,
+        detector_version=detector_version(point.config),
+        threshold=threshold,
+        threshold_mm=threshold * float(judged["scale_mm"].mean()),
+        calibration_runs=int((runs["role"] == "calibration").sum()),
+        failed=failed,
+        targets_digest=_targets_digest(group.then),
+        frames_digest=_frames_digest(point, group),
+        inspected=_inspected(holes),
+        unflawed=Unflawed(
+            board=unflawed["board"].to_numpy(int),
+            repeat=unflawed["repeat"].to_numpy(int),
+            calls=unflawed["false_calls"].to_numpy(int),
+            area_m2=unflawed["inspected_m2"].to_numpy(float),
+        ),
+    )
+
+
+def _of(table: pd.DataFrame, variant: str, frames: int) -> pd.DataFrame:
+    if table.empty:
+        return table
+    return table[(table["variant"] == variant) & (table["frames"] == frames)]
+
+
+def _inspected(holes: pd.DataFrame) -> Inspected:
+    return Inspected(
+        board=holes["board"].to_numpy(int),
+        hole=holes["hole"].to_numpy(str),
+        repeat=holes["repeat"].to_numpy(int),
+        diameter_mm=holes["true_diameter_mm"].to_numpy(float),
+        depth_mm=holes["true_depth_mm"].to_numpy(float),
+        x_mm=holes["true_x_mm"].to_numpy(float),
+        y_mm=holes["true_y_mm"].to_numpy(float),
+        hit=holes["detected"].to_numpy(bool),
+        signal=holes["signal"].to_numpy(float),
+    )
+
+
+def _targets_digest(batches: Sequence[Batch]) -> str:
+    """Names the damage and the size of every damaged board, wherever and before whichever camera it stands."""
+    boards = [batch.views[0].set_up.target for batch in batches if batch.role == "damaged"]
+    return digest([[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards])
+
+
+def _frames_digest(point: Point, group: Group) -> str:
+    """Equal where every frame of every judged board is: renders, camera, noise, number of frames, simulating code."""
+    renders: Iterable[str] = (job.path.stem for batch in group.then for job in batch.renders)
+    config = point.config
+    code = source_digest(SIMULATION, PACKAGES)
+    return digest([code, *renders, point.frames_key, config.capture.to_data(), config.repeats])
+
+
+def failed_by_point(plan: Plan, whats: Iterable[str], thresholds: Mapping[str, float]) -> dict[str, int]:
+    """How many trials of each point raised, from the journal keys of failures."""
+    keys = set(whats)
+    counts: dict[str, int] = {}
+    for group in plan.groups:
+        for batch in group.batches:
+            given = {} if batch in group.first else thresholds
+            for key, task in group.trials(batch, given):
+                for asked in task.points if key in keys else ():
+                    counts[asked.digest] = counts.get(asked.digest, 0) + 1
+    return counts

@@ -1,0 +1,242 @@
+"""The limits of validity of a study, on one page: what was varied, what was held, what is not in it, and how its
+statistics depart from MIL-HDBK-1823A. Every sentence is true of the study at hand, or it is not there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.evaluation.pod.false_calls import SITES_PER_TARGET
+from harness.evaluation.pod.state_hits import LEAST_TARGETS
+from harness.evaluation.study.chance import ChanceHits
+from harness.evaluation.study.held import held_sentences, is_swept, number, swept_sentences, varied_sentences
+from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit
+from harness.evaluation.study.record import StudyRecord
+
+Section = tuple[str, tuple[str, ...]]
+KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom", "dent": "spherical dents"}
+RISE = (0.05, 0.95)
+"""Between these the curve rises; sizes should reach past both, or the curve is known from one side."""
+
+
+def validity_of(
+    record: StudyRecord,
+    limits: Sequence[SetUpLimit],
+    chances: Sequence[ChanceHits | None],
+    facts: Mapping[str, Any],
+) -> tuple[Section, ...]:
+    """Headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ``sweep``, ...)."""
+    sections = (
+        ("What was varied", (*_inspected(limits), *varied_sentences(facts), *swept_sentences(facts))),
+        ("What was held", held_sentences(facts)),
+        ("What counts as a hit", _hits(record, limits)),
+        ("Threshold and false calls", tuple(_calls(record, limit) for limit in limits)),
+        ("Hits by chance", tuple(_chance(limit, one) for limit, one in zip(limits, chances, strict=True) if one)),
+        ("The model and what it stands on", tuple(_model(limit) for limit in limits)),
+        ("Departures from MIL-HDBK-1823A", _departures(limits, chances, facts)),
+        ("What is not in it", _missing(limits, facts)),
+    )
+    return tuple((heading, sentences) for heading, sentences in sections if sentences)
+
+
+def _inspected(limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
+    """Sizes, depths, boards and places, where all set-ups have them in common, else set-up by set-up."""
+    said: dict[str, list[str]] = {}
+    for limit in limits:
+        seen = limit.record.inspected
+        if len(seen.hit):
+            said.setdefault(_sizes(limit), []).append(limit.record.label)
+    if len(said) == 1:
+        return (f"{next(iter(said))}.",)
+    return tuple(f"{', '.join(labels)}: {text}." for text, labels in said.items())
+
+
+def _sizes(limit: SetUpLimit) -> str:
+    seen = limit.record.inspected
+    depths = (float(seen.depth_mm.min()), float(seen.depth_mm.max()))
+    deep = f"all {number(depths[0])} mm deep" if depths[0] == depths[1] else f"{_span(*depths)} mm deep"
+    noise = limit.inspections / limit.targets
+    repeats = "" if noise == 1 else f", each inspected {number(noise)} times with new noise"
+    return (
+        f"{limit.targets} damages on {limit.boards} boards, {_span(seen.diameter_mm.min(), seen.diameter_mm.max())} mm "
+        f"in diameter and {deep}{repeats}"
+    )
+
+
+def _hits(record: StudyRecord, limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
+    radius = number(record.hit_radius_mm)
+    rule = (
+        f"A damage is hit where the centre of a finding lies within {radius} mm of its own; the closest pairs first, "
+        "each finding for one damage at most. The radius was fixed beforehand and is the same for all sizes"
+    )
+    smaller = [one for one in limits if _largest(one) / 2 > record.hit_radius_mm]
+    if smaller:
+        return (f"{rule}.", f"The largest damages, up to {number(_largest(smaller[0]))} mm, reach beyond that radius.")
+    return (f"{rule}.",)
+
+
+def _calls(record: StudyRecord, limit: SetUpLimit) -> str:
+    one = limit.record
+    where = f"{one.label}: threshold {number(one.threshold)}, {number(one.threshold_mm)} mm"
+    if one.calibration_runs and record.false_calls_per_m2 is not None:
+        wanted = number(record.false_calls_per_m2)
+        where += (
+            f", set for {wanted} false calls per m² on {one.calibration_runs} hole-free runs of boards of their own"
+        )
+    else:
+        where += ", given and not calibrated"
+    rate = limit.false_calls
+    if rate is None:
+        return f"{where}. False calls were not counted: no hole-free board was inspected."
+    interval = rate.interval_per_m2
+    found = (
+        f"{where}. Found on other hole-free boards: {number(rate.rate_per_m2)} per m² "
+        f"({_span(interval.low, interval.high)}, 95 %), {rate.calls} calls on {number(rate.area_m2)} m²"
+    )
+    if record.false_calls_per_m2 is None or not one.calibration_runs:
+        return f"{found}."
+    apart = not interval.low <= record.false_calls_per_m2 <= interval.high
+    return f"{found}; {'the rate wanted lies outside' if apart else 'the rate wanted lies inside'}."
+
+
+def _chance(limit: SetUpLimit, chance: ChanceHits) -> str:
+    text = f"{limit.record.label}: {_percent(chance.probability)} of damages would be hit by chance"
+    if chance.interval.known:
+        text += f" ({_percent(chance.interval.low)} to {_percent(chance.interval.high)}, 95 %)"
+    text += ", by places laid over other boards' findings"
+    if chance.sites:
+        text += f"; {number(chance.found)} of {chance.sites} places without damage were hit"
+    return f"{text}."
+
+
+def _model(limit: SetUpLimit) -> str:
+    label = limit.record.label
+    basis = f"{limit.targets} independent targets on {limit.boards} boards"
+    if limit.statement is None:
+        return f"{label}: no curve, as {limit.why}; {basis}. a90/95: {_bound(limit)}."
+    text = f"{label}: {limit.statement.model}, of all links and axes the one with the least deviance; {basis}"
+    if np.isfinite(limit.design_effect):
+        text += f"; boards multiply the variance of a90 by {number(limit.design_effect)}"
+    text += (
+        f". a90/95: {_bound(limit)} with damages of one board as independent, {_size(limit.over_boards_mm)} with that "
+        "factor in it, where it is above 1"
+    )
+    return f"{text}{': damages of one board are alike, quote the larger' if limit.boards_matter else ''}."
+
+
+def _departures(
+    limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
+) -> tuple[str, ...]:
+    said = []
+    if facts.get("source", {}).get("kind") == "simulated":
+        said.append("Boards and camera are simulated. The handbook speaks of real flaws, inspected by the real system.")
+    if any(limit.targets > limit.boards for limit in limits):
+        most = max(limit.targets / limit.boards for limit in limits if limit.boards)
+        said.append(
+            f"Targets share boards, {number(most)} to a board. a90/95 takes them as independent, as the handbook does; "
+            "the same bound with the boards' design effect in it stands beside it (Rao and Scott 1984)."
+        )
+    if any(limit.inspections > limit.targets for limit in limits):
+        said.append(
+            "Targets were inspected more than once with new noise and count once each: the criterion of a90/95 is "
+            "scaled by the number of inspections."
+        )
+    said += [*_few_targets(limits), *_few_sites(limits, chances), *_sizes_miss_the_rise(limits)]
+    if any(limit.statement is not None for limit in limits):
+        said.append(
+            "The model is the one with the least deviance, and its bound is that of this one model: that the same data "
+            "chose it is not in the bound."
+        )
+    if any(limit.statement is None and limit.a90_95.demonstrated for limit in limits):
+        said.append(
+            f"Where everything was found there is no curve. a90/95 is then the {ALL_FOUND}th smallest size: were its "
+            f"POD below 90 %, the {ALL_FOUND} smallest would all be found in less than 5 % of studies."
+        )
+    if len(limits) > 1:
+        said.append(f"{len(limits)} limits stand side by side; each interval holds for itself, not for all at once.")
+    failed = sum(limit.record.failed for limit in limits)
+    if failed:
+        said.append(f"{failed} trials failed and are missing from what is counted.")
+    return tuple(said)
+
+
+def _few_targets(limits: Sequence[SetUpLimit]) -> list[str]:
+    few = [one for one in limits if one.targets < LEAST_TARGETS]
+    return [f"{_labels(few)}: fewer than {LEAST_TARGETS} targets ({min(one.targets for one in few)})."] if few else []
+
+
+def _few_sites(limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None]) -> list[str]:
+    """Unflawed places are where damage could have been drawn, on hole-free boards."""
+    ratios = [one.sites / limit.targets for limit, one in zip(limits, chances, strict=True) if one and limit.targets]
+    if not ratios or min(ratios) >= SITES_PER_TARGET:
+        return []
+    return [
+        f"Unflawed places for each damage: {number(min(ratios))}; the handbook asks for {SITES_PER_TARGET}. Besides, "
+        "false calls are counted on the whole face of hole-free boards."
+    ]
+
+
+def _sizes_miss_the_rise(limits: Sequence[SetUpLimit]) -> list[str]:
+    said = []
+    for limit in limits:
+        if limit.statement is None:
+            continue
+        low, high = (float(limit.statement.curve.pod(np.array(size))) for size in (_smallest(limit), _largest(limit)))
+        if low > RISE[0]:
+            said.append(f"{limit.record.label}: the smallest size inspected is found with a POD of {_percent(low)}.")
+        if high < RISE[1]:
+            said.append(f"{limit.record.label}: the largest size inspected is found with a POD of {_percent(high)}.")
+        if limit.a90_95.demonstrated and limit.a90_95.value > _largest(limit):
+            said.append(f"{limit.record.label}: a90/95 lies beyond the largest size inspected, by the curve alone.")
+    return said
+
+
+def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """What no number of this study speaks of."""
+    source = facts.get("source", {})
+    simulated = source.get("kind") == "simulated"
+    said = ["An inspector, who can miss findings and doubt others: the POD is that of the program alone."]
+    if source.get("target", {}).get("name") == "drawn":
+        kind = source["target"].get("damage", {}).get("kind", "")
+        only = f": all are {KINDS[kind]}" if kind in KINDS and not is_swept(facts, "source.target.damage.kind") else ""
+        said.append(f"Damage that is not round, that stands in rows or clusters, or several kinds on one board{only}.")
+    if simulated:
+        said.append(
+            "Gloss, translucency, light of other sources than the camera's and what is declared as ambient, motion "
+            "during a capture, dirt and wear: all surfaces are Lambertian, and the camera is what its model has in it."
+        )
+    if "camera" in source and "source.camera.unit_seed" not in facts.get("sweep", {}):
+        said.append("Other units of the camera: fixed pattern and offset are those of one unit.")
+    if any(limit.boards for limit in limits):
+        said.append("Boards of another family: intervals are over boards drawn as these were.")
+    return tuple(said)
+
+
+def _labels(limits: Sequence[SetUpLimit]) -> str:
+    return ", ".join(limit.record.label for limit in limits)
+
+
+def _smallest(limit: SetUpLimit) -> float:
+    return float(limit.record.inspected.diameter_mm.min(initial=np.inf))
+
+
+def _largest(limit: SetUpLimit) -> float:
+    return float(limit.record.inspected.diameter_mm.max(initial=-np.inf))
+
+
+def _bound(limit: SetUpLimit) -> str:
+    return _size(limit.a90_95.value)
+
+
+def _size(value: float) -> str:
+    return f"{number(value)} mm" if np.isfinite(value) else "not demonstrated"
+
+
+def _span(low: float, high: float) -> str:
+    return f"{number(low)} to {number(high)}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.4g} %"

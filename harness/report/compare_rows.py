@@ -1,0 +1,189 @@
+"""A comparison of two studies in words and numbers: cells of a table, one sentence for all, and data for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.evaluation.pod.statement import finite
+from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.verdict import ALPHA, MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
+from harness.report.page_parts import aligned, mm
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+HEADS = ("", "set-up", "verdict", "a90 mm", "change", "95 % mm", "a90/95 mm", "lost, won", "p", "false calls/m²", "p")
+LEFT = 3
+"""Columns flush left."""
+SAID: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
+"""Marks that the table does not explain by its numbers."""
+COLOURS: Mapping[Mark, str] = {
+    "worse": "bold red",
+    "newly failing": "bold red",
+    "only in first": "yellow",
+    "not comparable": "yellow",
+    "better": "green",
+    "newly working": "green",
+}
+RULE = (
+    f"Worse (+): a90, or the rate of false calls, has grown by more than {100 * (MARGIN - 1):.0f} %, and a test says "
+    f"that it is not by chance (p < {ALPHA:g} by Holm over all set-ups and both questions). Better (-): likewise for "
+    "a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed trials. *: a limit for the "
+    "first time. x: measured with another stick. < and >: in the first, in the second study only."
+)
+TESTS = (
+    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is of a sign-flip "
+    "test in which boards, not damages, are the units; where the studies have different boards, of boards drawn again "
+    "for each. The p of false calls is of such a test too on identical frames; on others it allows for the luck that "
+    "each study had with the calibration of its threshold. Both are one-sided, of being worse, and adjusted. 95 %: "
+    "interval of the change of a90 over boards drawn again."
+)
+
+
+def answer(comparison: Comparison) -> str:
+    """The comparison in one sentence."""
+    rows = comparison.rows
+    worse = [row for row in rows if row.is_worse]
+    if worse:
+        said = "; ".join(f"{row.label}: {row.why}" for row in worse[:3])
+        verb = "is" if len(worse) == 1 else "are"
+        return f"{len(worse)} of {len(rows)} set-ups {verb} worse. {said}{'; ...' if len(worse) > 3 else '.'}"
+    counts = {mark: len(comparison.marked(mark)) for mark in SIGNS}
+    return f"No set-up is worse: {', '.join(f'{n} {mark}' for mark, n in counts.items() if n) or 'there is none'}."
+
+
+def cells(row: ComparedSetUps) -> tuple[str, ...]:
+    """One row's cells, as many as `HEADS`."""
+    return (
+        SIGNS[row.mark],
+        row.label,
+        row.mark,
+        _both(row, lambda limit: limit.a90_mm),
+        _percent(row),
+        _interval(row),
+        _both(row, lambda limit: limit.a90_95.value),
+        f"-{row.hits.only_first} +{row.hits.only_second}" if row.hits else "–",
+        p_text(row.limit_p[0]) if row.limit else "–",
+        " → ".join(f"{rate:.2f}" for rate in row.calls.rates_per_m2) if row.calls else "–",
+        p_text(row.calls_p[0]) if row.calls else "–",
+    )
+
+
+def remarks(comparison: Comparison) -> list[str]:
+    """What the table leaves open: reasons of the marks in `SAID`, and what differs between the studies."""
+    said = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in SAID and row.why]
+    differs = _changed(comparison)
+    return [*said, *([f"what differs: {'; '.join(differs)}"] if differs else [])]
+
+
+def p_text(p: float) -> str:
+    """A p-value with two digits."""
+    return "< 0.0001" if p < 0.0001 else f"{p:.2g}"
+
+
+def compare_text(comparison: Comparison) -> str:
+    """The comparison as plain lines: table, remarks, the answer."""
+    table = aligned([HEADS, *(cells(row) for row in comparison.rows)], left=LEFT)
+    return "\n".join([*table, *_closing(comparison)])
+
+
+def compare_table(comparison: Comparison) -> Table:
+    """The same table for a terminal, with colour."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, collapse_padding=True, caption="\n".join(_closing(comparison)).strip())
+    table.caption_justify, table.caption_style = "left", ""
+    for place, head in enumerate(HEADS):
+        table.add_column(head, justify="left" if place < LEFT else "right", no_wrap=True)
+    for row in comparison.rows:
+        table.add_row(*(Text(text, style=COLOURS.get(row.mark, "")) for text in cells(row)))
+    return table
+
+
+def compare_data(comparison: Comparison) -> dict[str, Any]:
+    """The comparison as JSON's types; what is not a number is None."""
+    return {
+        "first": _study(comparison.first),
+        "second": _study(comparison.second),
+        "rule": {"margin": MARGIN, "alpha": ALPHA},
+        "worse": [row.label for row in comparison.rows if row.is_worse],
+        "set_ups": [_row_data(row) for row in comparison.rows],
+    }
+
+
+def _closing(comparison: Comparison) -> list[str]:
+    return ["", *remarks(comparison), answer(comparison)]
+
+
+def _changed(comparison: Comparison) -> list[str]:
+    """What differs between the studies, each thing once, with the set-ups where it does not concern all."""
+    pairs = [row for row in comparison.rows if row.first is not None and row.second is not None]
+    by_change: dict[str, list[str]] = {}
+    for row in pairs:
+        for change in row.changed:
+            by_change.setdefault(change, []).append(row.label)
+    return [f"{what}" + ("" if len(at) == len(pairs) else f" ({'; '.join(at)})") for what, at in by_change.items()]
+
+
+def _both(row: ComparedSetUps, size_mm: Callable[[SetUpLimit], float]) -> str:
+    return " → ".join("–" if limit is None else mm(size_mm(limit)) for limit in (row.first, row.second))
+
+
+def _percent(row: ComparedSetUps) -> str:
+    """Growth of a90 in per cent; a dash where either has none."""
+    return f"{100 * (row.limit.ratio - 1):+.1f} %" if row.limit and np.isfinite(row.limit.ratio) else "–"
+
+
+def _interval(row: ComparedSetUps) -> str:
+    if not (row.limit and np.isfinite(row.limit.ratio) and row.limit.interval_mm.known):
+        return "–"
+    low, high = (f"{end:+.2f}" for end in (row.limit.interval_mm.low, row.limit.interval_mm.high))
+    return f"{low} to {high}".replace("inf", "∞")
+
+
+def _study(study: Any) -> dict[str, Any]:
+    return {"name": study.name, "digest": study.digest, "commit": study.provenance.get("commit")}
+
+
+def _row_data(row: ComparedSetUps) -> dict[str, Any]:
+    data: dict[str, Any] = {"set_up": row.label, "mark": row.mark, "why": row.why, "changed": list(row.changed)}
+    data |= {"first": _limit_data(row.first), "second": _limit_data(row.second)}
+    if row.limit is not None:
+        low, high = row.limit.interval_mm.low, row.limit.interval_mm.high
+        data["a90_change"] = {
+            "ratio": finite(row.limit.ratio),
+            "difference_mm": finite(row.limit.difference_mm),
+            "interval_mm": [finite(low), finite(high)],
+            "paired": row.limit.paired,
+            "bootstrap_p": {"grown": row.limit.grown_p, "shrunk": row.limit.shrunk_p},
+            "decides": dict(zip(("worse", "better"), row.limit_p, strict=True)),
+        }
+    if row.hits is not None:
+        data["hits"] = {**vars(row.hits), "boards_p": row.hits.boards_p}
+    if row.calls is not None:
+        decides = dict(zip(("worse", "better"), row.calls_p, strict=True))
+        data["false_calls"] = {**vars(row.calls), "ratio": finite(row.calls.ratio), "decides": decides}
+    return data
+
+
+def _limit_data(limit: SetUpLimit | None) -> dict[str, Any] | None:
+    if limit is None:
+        return None
+    return {
+        "detector": f"{limit.record.detector} {limit.record.detector_version}",
+        "threshold": finite(limit.record.threshold),
+        "failed": limit.record.failed,
+        "a50_mm": finite(limit.a50_mm),
+        "a90_mm": finite(limit.a90_mm),
+        "a90_interval_mm": [finite(limit.a90_interval_mm.low), finite(limit.a90_interval_mm.high)],
+        "a90_95_mm": finite(limit.a90_95.value),
+        "hits": limit.hits,
+        "inspections": limit.inspections,
+        "boards": limit.boards,
+        "false_calls": None if limit.false_calls is None else limit.false_calls.calls,
+        "why": limit.why,
+    }

@@ -1,0 +1,178 @@
+"""The page of a study: its detection limits, what they rest on, and how far they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from harness.evaluation.study.result import StudyResult
+from harness.report.page_parts import closing_sections, template
+from harness.report.study_axes_figure import AxisGroup, axis_figure, axis_groups
+from harness.report.study_axes_rows import (
+    SURFACE_HEADS,
+    axis_heads,
+    axis_note,
+    axis_rows,
+    size_tables,
+    surface_rows,
+)
+from harness.report.study_calls_figure import calls_figure
+from harness.report.study_example import StudyExample
+from harness.report.study_examples_figure import examples_figure
+from harness.report.study_operating_figure import operating_figure
+from harness.report.study_pod_figures import MOST_PANELS, curves_figure, signals_figure, with_room
+from harness.report.study_rows import limit_rows, name_of, study_answer, unbroken
+from harness.report.study_surface_figure import surface_figure
+from harness.report.study_tables import (
+    CHANCE_HEADS,
+    OPERATING_HEADS,
+    SIGNAL_HEADS,
+    THRESHOLD_HEADS,
+    chance_rows,
+    operating_notes,
+    operating_rows,
+    signal_notes,
+    signal_rows,
+    signal_tests,
+    threshold_note,
+    threshold_rows,
+)
+from harness.vocabulary.files import write_text
+
+MOST_NAMED = 3
+"""Set-ups that a note calls by name; of more it gives the number."""
+
+
+def write_study_report(
+    folder: Path,
+    result: StudyResult,
+    examples: Sequence[StudyExample],
+    provenance: Mapping[str, Any],
+    resolved_yaml: str,
+    title: str,
+) -> Path:
+    """Write ``folder/report.html`` and return its path. ``provenance`` as of `harness.report.page.write_report`. The
+    same input gives the same bytes. Raises UserError where the folder cannot be written."""
+    path = Path(folder) / "report.html"
+    write_text(path, study_html(result, examples, provenance, resolved_yaml, title))
+    return path
+
+
+def study_html(
+    result: StudyResult,
+    examples: Sequence[StudyExample],
+    provenance: Mapping[str, Any],
+    resolved_yaml: str,
+    title: str,
+) -> str:
+    """The page as text; see `write_study_report`."""
+    limits = result.limits
+    surfaces = [(one.limit, one.surface) for one in result.set_ups if one.surface is not None]
+    groups = axis_groups(result.axes)
+    shown = _examples_by_set_up(result, examples)
+    return template("study.html").render(
+        title=title,
+        answer=unbroken(study_answer(limits)),
+        rule=_rule(result),
+        limits=[replace(row, name=unbroken(row.name)) for row in limit_rows(limits)],
+        most_panels=MOST_PANELS,
+        axes=[_axis(group, _axis_name(number)) for number, group in enumerate(groups)],
+        surface_heads=SURFACE_HEADS,
+        surface_rows=surface_rows(surfaces),
+        surface_notes=_without_surface(result),
+        chance_heads=CHANCE_HEADS,
+        chance_rows=chance_rows(result.set_ups),
+        threshold_heads=THRESHOLD_HEADS,
+        threshold_rows=threshold_rows(limits),
+        threshold_note=threshold_note(result.record),
+        signal_heads=SIGNAL_HEADS,
+        signal_rows=signal_rows(limits),
+        signal_tests=signal_tests(limits),
+        signal_notes=signal_notes(limits),
+        operating_heads=OPERATING_HEADS,
+        operating_rows=operating_rows(result.set_ups),
+        operating_notes=operating_notes(result.set_ups),
+        examples=[(head, name) for name, (head, _) in shown.items()],
+        size_tables=size_tables(limits, [one.sizes for one in result.set_ups]),
+        validity=result.validity,
+        figures=_figures(result, groups, shown),
+        **closing_sections(provenance, resolved_yaml),
+    )
+
+
+def _figures(
+    result: StudyResult, groups: Sequence[AxisGroup], examples: Mapping[str, tuple[str, Sequence[StudyExample]]]
+) -> dict[str, str]:
+    """The figures that the data allow, as SVG text by name."""
+    shown = with_room(result.set_ups)
+    inspected = [one.limit for one in shown if one.limit.inspections]
+    surfaces = [(one.limit, one.surface) for one in shown if one.surface is not None]
+    signals = [one.limit for one in shown if one.limit.signals is not None]
+    curved = [one for one in shown if one.roc or one.free_response or one.pixels]
+    figures = {_axis_name(number): axis_figure(group, _axis_name(number)) for number, group in enumerate(groups)}
+    if inspected:
+        figures["curves"] = curves_figure(inspected)
+    if surfaces:
+        figures["surface"] = surface_figure(surfaces)
+    if any(limit.false_calls is not None for limit in result.limits):
+        figures["calls"] = calls_figure(result.limits, result.record.false_calls_per_m2)
+    if signals:
+        figures["signals"] = signals_figure(signals)
+    if curved:
+        figures["operating"] = operating_figure(curved)
+    return figures | {name: examples_figure(name, some, head) for name, (head, some) in examples.items()}
+
+
+def _rule(result: StudyResult) -> str:
+    return (
+        "Fixed beforehand: a damage is found where the centre of a finding lies within "
+        f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
+        "board are no further targets."
+    )
+
+
+def _axis_name(number: int) -> str:
+    return f"axis-{number + 1}"
+
+
+def _axis(group: AxisGroup, name: str) -> dict[str, Any]:
+    caption = "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95."
+    if not group.numeric:
+        caption += " The values have no order."
+    return {
+        "title": group.name,
+        "figure": name,
+        "caption": caption,
+        "heads": axis_heads(group),
+        "rows": axis_rows(group),
+        "note": axis_note(group),
+    }
+
+
+def _examples_by_set_up(
+    result: StudyResult, examples: Sequence[StudyExample]
+) -> dict[str, tuple[str, list[StudyExample]]]:
+    """Name of the figure -> the set-up and its examples, of those set-ups with room on the page."""
+    found = []
+    for one in with_room(result.set_ups):
+        record = one.limit.record
+        some = [e for e in examples if (e.variant, e.frames) == (record.variant, record.frames)]
+        if some:
+            found.append((name_of(one.limit), some))
+    return {f"examples-{number + 1}": pair for number, pair in enumerate(found)}
+
+
+def _without_surface(result: StudyResult) -> list[str]:
+    """Why there is no surface over diameter and depth, set-ups with one reason together."""
+    reasons: dict[str, list[str]] = {}
+    for one in result.set_ups:
+        if one.surface is None:
+            reasons.setdefault(one.surface_why, []).append(name_of(one.limit))
+    notes = []
+    for why, labels in reasons.items():
+        some = ", ".join(labels) if len(labels) <= MOST_NAMED else f"{len(labels)} of {len(result.set_ups)} set-ups"
+        every = len(labels) == len(result.set_ups)
+        notes.append(f"No surface{'' if every else f' for {some}'}: {why}.")
+    return notes

@@ -1,0 +1,139 @@
+"""What can be had by name: tofpod's own, and what installed packages offer through an entry point group.
+
+Names are looked up without importing anything; only what is asked for is imported.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from harness.vocabulary.errors import UserError
+
+OWN = "tofpod"
+"""The package that the built-in ones come from, as it is told."""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """One name and what stands behind it: ``target`` is ``module:attribute`` (of a built-in also a file), ``package``
+    and ``package_version`` where it comes from."""
+
+    name: str
+    target: str
+    package: str
+    package_version: str
+
+    @property
+    def built_in(self) -> bool:
+        """Whether it comes with tofpod."""
+        return self.package == OWN
+
+    @property
+    def origin(self) -> str:
+        """The package and its version, for messages and tables."""
+        return f"{self.package} {self.package_version}".strip()
+
+
+@dataclass(frozen=True)
+class PlugIns:
+    """The names of one entry point group. ``noun`` is what one of them is called in messages; ``built_in`` gives
+    tofpod's own, name to target; ``fix`` is the advice on an unknown name."""
+
+    group: str
+    noun: str
+    built_in: Callable[[], Mapping[str, str]]
+    fix: str = ""
+
+    def offers(self) -> tuple[Offer, ...]:
+        """Every offer, by name; a name that two packages claim stands there twice."""
+        own = [Offer(name, target, OWN, _own_version()) for name, target in self.built_in().items()]
+        others = [_offer(entry) for entry in _installed(self.group, _search_path())]
+        once = dict.fromkeys((*own, *others))
+        return tuple(sorted(once, key=lambda offer: (offer.name, not offer.built_in, offer.package)))
+
+    def names(self) -> tuple[str, ...]:
+        """Every known name, sorted; a name that is taken twice is one of them."""
+        return tuple(sorted({offer.name for offer in self.offers()}))
+
+    def offer(self, name: str) -> Offer:
+        """What stands behind a name.
+
+        Raises UserError on an unknown name, with the nearest one, and on a name that is taken twice, with both.
+        """
+        found = [offer for offer in self.offers() if offer.name == name]
+        if not found:
+            names = self.names()
+            near = difflib.get_close_matches(name, names, n=1)
+            raise UserError(
+                f"there is no {self.noun} {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
+                legal=", ".join(names),
+                fix=self.fix or f"install the package that offers it through the entry point group {self.group!r}",
+            )
+        if len({offer.target for offer in found}) > 1:
+            both = " and ".join(f"{offer.target} ({offer.origin})" for offer in found)
+            raise UserError(
+                f"{len(found)} {self.noun}s are called {name!r}: {both}",
+                fix="uninstall all of these packages but one, or rename an entry point",
+            )
+        return found[0]
+
+    def load(self, offer: Offer) -> Any:
+        """The attribute behind an offer. Raises UserError, with its package, where a plug-in cannot be imported; what
+        is wrong with a built-in one is a bug and keeps its traceback."""
+        module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
+        try:
+            found: Any = importlib.import_module(module)
+            for part in filter(None, attribute.split(".")):
+                found = getattr(found, part)
+            return found
+        # whatever a foreign module does on import, the mistake is that it is installed here
+        except Exception as error:
+            if offer.built_in:
+                raise
+            raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error
+
+    def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
+        """The mistake that a plug-in is not what its group asks for. ``command`` would show more."""
+        shown = f"; `{command}` shows where it fails" if command else ""
+        return UserError(
+            f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}",
+            fix=f"repair or uninstall the package {offer.package}{shown}",
+        )
+
+
+def _offer(entry: EntryPoint) -> Offer:
+    if entry.dist is None:
+        return Offer(entry.name, entry.value, entry.module, "")
+    return Offer(entry.name, entry.value, entry.dist.name, entry.dist.version)
+
+
+def _own_version() -> str:
+    from harness import __version__
+
+    return __version__
+
+
+def _search_path() -> tuple[tuple[str, int], ...]:
+    """Where packages are looked for, and when each folder last changed: installing or removing one changes it."""
+    return tuple((folder, _changed_ns(folder or os.curdir)) for folder in sys.path)
+
+
+def _changed_ns(folder: str) -> int:
+    try:
+        return os.stat(folder).st_mtime_ns
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=8)
+def _installed(group: str, _search_path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
+    """The group's entry points. Remembered, because finding them reads every installed package: 7 ms each time."""
+    return tuple(entry_points(group=group))

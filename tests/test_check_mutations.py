@@ -1,0 +1,101 @@
+"""The gate against faults put into detector and camera: each must fail it, another draw of the noise must not.
+
+The program and its rule are those of CI; the study is `experiments/regression.yaml` with fewer boards, sizes about the
+limit, one frame and no reflected light, since five faults and two honest runs of it must fit into a test. Renders are
+shared: they depend on neither detector, nor the sensor's noise, nor its seed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.mutated_detectors import write_mutants
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALLER = (
+    "study.boards=20",
+    "source.target.damage.diameter_mm=[2.5, 6.5]",  # about the limit: the same holes say more of its changes
+    "study.hole_free_boards=16",
+    "threshold.calibrate.boards=20",
+    "source.render.bounces=0",
+    "sweep={capture.frames: [1]}",
+)
+DOUBLED_NOISE = (
+    # a quarter of the light doubles the noise of photons, which is all but a few per cent of a frame's
+    "source.camera.numbers={photons.signal_electrons: 292.0}",
+    "source.camera.fixed_pattern_scale=2.0",
+)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What one run of the program gave."""
+
+    code: int
+    said: str
+    data: dict
+
+
+class Gate:
+    """The program with a baseline, results and renders of its own."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        plug_ins = str(write_mutants(home / "plug_ins"))
+        paths = [plug_ins, *filter(None, [os.environ.get("PYTHONPATH")])]
+        self.environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+    def check(self, *changed: str, update: bool = False) -> Checked:
+        command = [sys.executable, "-m", "harness.check", "experiments/regression.yaml"]
+        command += ["--baseline", str(self.home / "baseline.json"), "--out", str(self.home / "results")]
+        for one in (*SMALLER, *changed):
+            command += ["--set", one]
+        done = subprocess.run(
+            [*command, *(["--update"] if update else [])],
+            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=600,
+        )  # fmt: skip
+        said = done.stdout + done.stderr
+        written = [line.split(": ", 1)[1] for line in done.stdout.splitlines() if line.startswith("comparison with")]
+        data = json.loads(Path(written[0]).with_name("compare.json").read_text()) if written else {}
+        return Checked(done.returncode, said, data)
+
+
+@pytest.fixture(scope="module")
+def gate(tmp_path_factory: pytest.TempPathFactory) -> Gate:
+    gate = Gate(tmp_path_factory.mktemp("gate"))
+    first = gate.check(update=True)
+    assert first.code == 0, first.said
+    return gate
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        pytest.param(("detector.name=halved",), "a90", id="halved sensitivity"),
+        pytest.param(DOUBLED_NOISE, "a90", id="doubled sensor noise"),
+        pytest.param(("detector.name=shifted",), "a90", id="threshold too high"),
+        pytest.param(("detector.name=lowered",), "false calls", id="threshold too low"),
+        pytest.param(("detector.name=cropped",), "a90", id="broken crop"),
+    ],
+)
+def test_a_fault_fails_the_gate(gate, changed, why):
+    checked = gate.check(*changed)
+    assert checked.code == 1, checked.said
+    (row,) = checked.data["set_ups"]
+    assert row["mark"] in ("worse", "newly failing") and row["why"].startswith((why, "no limit")), row
+    assert "the check fails" in checked.said
+
+
+def test_another_draw_of_the_noise_passes(gate):
+    checked = gate.check("seed=7")
+    assert checked.code == 0, checked.said
+    (row,) = checked.data["set_ups"]
+    assert row["changed"] == ["other frames of the same boards"] and row["a90_change"]["paired"]
+    assert row["hits"]["only_first"] + row["hits"]["only_second"] > 0, "the noise was not drawn again"

@@ -1,0 +1,298 @@
+"""The program `python -m harness.design`, and what it stands on: guessed curves, recommendations, repeats, areas."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from harness.design import FILES, main
+from harness.evaluation.pod.curve import LINKS
+from harness.evaluation.pod.design import Plan, design, repeats_are_not_targets
+from harness.evaluation.pod.false_calls import false_call_rate, threshold_for_rate
+from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.pod.likelihood_bounds import bound
+from harness.evaluation.pod.planning import CALLS, curve_through, fixed_share, hole_free, plans_by_frames, recommend
+from harness.evaluation.pod.repeats import repeated_studies
+from harness.evaluation.study.limit import limit_of
+from harness.evaluation.study.record import record_text
+from harness.vocabulary.errors import UserError
+from tests.synthetic_study import AREA_M2, SetUp, Study, study_record
+
+GUESS = curve_through(5.0, 7.0)
+TOLD = ["--a50", "5", "--a90", "7", "--sizes", "2", "12"]
+FEW = ["--studies", "20", "--targets", "30", "60"]
+
+
+def answered(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main([*arguments, "--json"]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of two set-ups; the second has a50 = 4."""
+    set_ups = (SetUp(frames=1), SetUp(frames=50, a50_mm=4.0))
+    folder = tmp_path_factory.mktemp("study")
+    (folder / "study.json").write_text(record_text(study_record(Study(set_ups=set_ups, boards=30))))
+    return folder
+
+
+# ---- the guess -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(a50=st.floats(0.1, 50), more=st.floats(1.05, 4), link=st.sampled_from(LINKS), log_size=st.booleans())
+def test_the_guess_goes_through_both_sizes(a50: float, more: float, link: str, log_size: bool) -> None:
+    curve = curve_through(a50, more * a50, link, log_size=log_size)
+    assert curve.pod(np.array([a50, more * a50])) == pytest.approx([0.5, 0.9], abs=1e-9)
+    assert (curve.size_at(0.5), curve.size_at(0.9)) == pytest.approx((a50, more * a50), rel=1e-9)
+
+
+def test_logit_by_hand() -> None:
+    """ln(0.9 / 0.1) = ln 9 widths lie between a50 and a90."""
+    assert (GUESS.mu, GUESS.sigma) == pytest.approx((5.0, 2.0 / np.log(9.0)))
+
+
+def test_the_fixed_share_by_hand() -> None:
+    """0.8 mm white over 50 frames is 0.0128 mm2, beside 0.09 mm2 that stays."""
+    assert fixed_share(0.8, 0.3, 50) == pytest.approx(0.09 / 0.1028)
+    assert (fixed_share(0.8, 0.0, 50), fixed_share(0.0, 0.3, 50)) == (0.0, 1.0)
+    with pytest.raises(UserError, match="fixed noise"):
+        fixed_share(0.0, 0.0, 1)
+
+
+def test_frames_are_studied_with_the_same_targets_and_luck() -> None:
+    asked: dict[str, Any] = {"pod": 0.9, "confidence": 0.95, "studies": 20, "seed": 2}
+    share = fixed_share(0.8, 0.3, 50)
+    one, fifty = plans_by_frames(
+        GUESS, (10, 50), guessed_with=50, fixed_share=share, targets=60, range_of_sizes=(2, 12), **asked
+    )
+    ratio = np.sqrt((0.64 / 10 + 0.09) / (0.64 / 50 + 0.09))
+    assert one.curve.size_at(0.9) == pytest.approx(7.0 * ratio)
+    assert fifty.curve.size_at(0.9) == pytest.approx(7.0)
+    assert fifty.plan.bound == design(GUESS, (60,), (2, 12), placements=("uniform",), **asked)[0].bound
+    assert np.array_equal(one.plan.sizes, fifty.plan.sizes)
+    assert one.plan.bound > fifty.plan.bound
+
+
+# ---- what is recommended ---------------------------------------------------------------------------------------------
+
+
+def plans(*told: tuple[int, str, float]) -> list[Plan]:
+    """(targets, placement, 90 % quantile)."""
+    first = Plan(60, "uniform", 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0), ())
+    return [replace(first, targets=n, placement=placed, high=high) for n, placed, high in told]  # type: ignore[arg-type]
+
+
+def test_recommends_the_fewest_that_are_sure_of_the_goal() -> None:
+    known = plans((30, "uniform", 7.9), (60, "uniform", 9.0), (120, "uniform", 8.4), (240, "uniform", 8.0))
+    assert recommend(known).plan is known[1], "without a wish the handbook's minimum"
+    wish = recommend(known, 8.5)
+    assert (wish.plan, wish.enough, wish.reaches) == (known[2], True, True)
+    vain = recommend(known, 7.5)
+    assert (vain.plan, vain.reaches) == (known[3], False), "30 targets are no study, whatever they seem to show"
+    short = recommend(known[:1])
+    assert (short.plan, short.enough, short.reaches) == (known[0], False, None)
+
+
+def test_concentrates_only_where_it_is_worth_it() -> None:
+    close, far = (plans((60, "uniform", 9.0), (60, "concentrated", high)) for high in (8.6, 8.5))
+    assert recommend(close).plan.placement == "uniform"
+    assert recommend(far).plan.placement == "concentrated"
+    endless = plans((60, "uniform", np.inf), (60, "concentrated", np.inf))
+    assert recommend(endless, 8.0).plan.placement == "uniform"
+
+
+# ---- repeats ---------------------------------------------------------------------------------------------------------
+
+
+def test_repeats_make_the_wrong_limit_too_small_and_the_right_one_not() -> None:
+    """40 studies of 8 targets with 20 repeats. Half the luck the target's own: the wrong limit, were it one, would be
+    too small in 5 % of studies; as often as seen it would be with probability < 1e-4. Without own luck it is a limit:
+    at most the 99.9 % quantile. The right one is in every case."""
+    none, half = repeated_studies(GUESS, 8, 20, (2, 12), shares=(0.0, 0.5), studies=40, seed=3)
+    for row in (none, half):
+        assert 40 * row.right_too_small <= stats.binom.ppf(0.999, 40, 0.05)
+        assert row.right > row.wrong
+        assert "160 inspections of 8 targets are 8 targets" in row.text
+    assert 40 * none.wrong_too_small <= stats.binom.ppf(0.999, 40, 0.05)
+    assert stats.binom.sf(40 * half.wrong_too_small - 1, 40, 0.05) < 1e-4
+
+
+def test_the_wrong_limit_is_that_of_rows_without_names() -> None:
+    """Also where hits and misses do not overlap, and a penalty takes the place of the likelihood."""
+    size, hit = np.repeat(np.arange(3.0, 11.0), 10), np.repeat([0, 0, 0, 1, 1, 1, 1, 1], 10)
+    check = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 10))
+    assert check.fit.separated
+    assert check.wrong.value == bound(fit_hit_miss(size, hit)).value
+    assert check.wrong.value < check.right.value
+
+
+# ---- hole-free boards ------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(rate=st.floats(0.05, 20), area=st.floats(0.01, 2))
+def test_the_fewest_boards_are_what_the_rule_of_thresholds_takes(rate: float, area: float) -> None:
+    found = hole_free(rate, area)
+    assert found.expected_per_m2 <= rate * (1 + 1e-9)
+    if found.calibration_boards > 1:
+        with pytest.raises(UserError, match=f"at least {found.calibration_boards} runs"):
+            threshold_for_rate(np.arange(found.calibration_boards - 1.0), area, rate)
+
+
+def test_areas_bound_the_rate_exactly() -> None:
+    found = hole_free(1.0, 0.25, 0.9)
+    assert found.areas_m2[0] == pytest.approx(-np.log(0.1)), "exp(-area) = 0.1"
+    for calls, area in zip(CALLS, found.areas_m2, strict=True):
+        assert false_call_rate(calls, area, 0.9).upper_per_m2 == pytest.approx(1.0, rel=1e-9)
+    assert [found.boards(area) for area in (0.25, 0.26, 3.0)] == [1, 2, 12]
+
+
+# ---- the program -----------------------------------------------------------------------------------------------------
+
+
+def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    said = answered(capsys, *TOLD, *FEW, "--goal", "11")
+    expected = design(GUESS, (30, 60), (2.0, 12.0), studies=20, seed=1)
+    assert [(one["targets"], one["placement"]) for one in said["plans"]] == [
+        (number, placed) for number in (30, 60) for placed in ("uniform", "concentrated")
+    ]
+    assert [one["bound"] for one in said["plans"]] == [plan.bound for plan in expected]
+    assert [one["sizes"] for one in said["plans"]] == [plan.sizes.tolist() for plan in expected]
+    chosen = recommend(expected, 11.0)
+    assert [one["recommended"] for one in said["plans"]] == [plan is chosen.plan for plan in expected]
+    assert said["recommendation"].startswith("Make 60 targets")
+    assert said["unflawed_sites"] == 180
+    assert (said["guess"]["a50"], said["guess"]["a90"]) == pytest.approx((5.0, 7.0))
+    assert any("60 independent targets" in note and "40 where signals" in note for note in said["notes"])
+
+
+def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixture[str]) -> None:
+    """The 90 % quantile comes nearer to a90 = 7 as one over the root of the targets: by hand from the plan's."""
+    said = answered(capsys, *TOLD, *FEW, "--goal", "7.2")
+    assert "no plan listed is sure to show the 7.2 mm" in said["recommendation"]
+    (high,) = (one["high"] for one in said["plans"] if one["recommended"])
+    wanted = 60 * ((high - 7) / 0.2) ** 2
+    (number,) = (note.split("some ")[1].split()[0] for note in said["notes"] if "would be needed" in note)
+    assert int(number) == pytest.approx(wanted, rel=0.051)
+
+
+def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    frames = ["--frames", "1", "50", "--guessed-with", "50", "--white-mm", "0.8", "--fixed-mm", "0.3"]
+    others = ["--repeats", "5", "--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
+    assert main([*TOLD, *FEW, "--studies", "10", *frames, *others]) == 0
+    printed = capsys.readouterr().out
+    assert "5 repeats of 8 targets are 8 targets" in printed
+    assert "WRONG: a90/95 (furlong)" in printed
+    assert "needs 4 hole-free boards of 0.25 m2" in printed
+    assert "no false call on 2.996 m2, which is 12 other boards" in printed
+    assert "the guess for 1 frame has a90 = 18.65 furlong outside the sizes" in printed
+    assert printed.rstrip().splitlines()[-1].startswith("Make 60 targets, ")
+    assert next(line for line in printed.splitlines() if line.startswith("* ")).split()[1] == "60"
+
+
+def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("a", "b"):
+        assert main([*TOLD, *FEW, "--studies", "10", "--out", str(tmp_path / folder)]) == 0
+    assert "design.png" in capsys.readouterr().err
+    first, second = ([(tmp_path / folder / name).read_bytes() for name in FILES] for folder in ("a", "b"))
+    assert first[1] == second[1]
+    assert first[1].startswith(b"\x89PNG")
+    page, other = (one[2].decode() for one in (first, second))
+    assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
+    assert page.count("<details") == 4
+    assert "Make 60 targets" in page and "http" not in page.replace("http://www.w3.org", "")
+    data = json.loads(first[0])
+    assert " ".join(f"{size:.4g}" for size in data["plans"][2]["sizes"]) in page
+
+
+def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A curve far wider than the sizes: most studies demonstrate nothing."""
+    arguments = ["--a50", "6", "--a90", "40", "--sizes", "5", "8", "--studies", "10", "--targets", "60"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
+    assert "even so most studies would demonstrate no a90/95" in capsys.readouterr().out
+    data = json.loads((tmp_path / "design.json").read_text())
+    assert data["plans"][0]["bound"] is None
+    assert any("outside the range" in note for note in data["notes"])
+
+
+def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["--study", str(study), "--set-up", "50 frames", "--studies", "10", "--targets", "60"]
+    more = ["--frames", "50", "--white-mm", "0.8", "--fixed-mm", "0.3", "--false-calls-per-m2", "1"]
+    said = answered(capsys, *asked, *more)
+    record = study_record(Study(set_ups=(SetUp(frames=1), SetUp(frames=50, a50_mm=4.0)), boards=30)).set_ups[1]
+    limit = limit_of(record)
+    assert said["guess"]["a50"] == pytest.approx(limit.a50_mm, rel=1e-12)
+    assert said["guess"]["a90"] == pytest.approx(limit.a90_mm, rel=1e-12)
+    assert said["frames"][0]["guess"]["a90"] == pytest.approx(limit.a90_mm), "guessed with its own 50 frames"
+    assert said["range_of_sizes"] == [record.inspected.diameter_mm.min(), record.inspected.diameter_mm.max()]
+    assert said["hole_free"]["board_m2"] == AREA_M2
+    assert said["guess"]["origin"] == "fitted to synthetic, 50 frames"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--a50", "7", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
+        (["--a50", "5", "--a90", "5", "--sizes", "2", "12"], "has to grow with size"),
+        (["--a50", "nan", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
+        (["--a50", "5", "--a90", "7", "--sizes", "12", "2"], "FROM < TO"),
+        (["--a50", "5", "--a90", "7", "--sizes", "6", "12"], "do not hold a50 = 5"),
+        (["--a50", "5", "--a90", "7", "--sizes", "0", "12", "--log"], "FROM above 0"),
+        (["--a90", "7"], "--a50, --sizes: not told"),
+        ([*TOLD, "--targets", "60", "9"], "--targets 9"),
+        ([*TOLD, "--targets", "20000"], "10 to 10000"),
+        ([*TOLD, "--studies", "1"], "--studies 1"),
+        ([*TOLD, "--pod", "1"], "0 < pod < 1"),
+        ([*TOLD, "--confidence", "0.4"], "0.5 < confidence < 1"),
+        ([*TOLD, "--goal", "6.5"], "not above the guess's own 7"),
+        ([*TOLD, "--frames", "10"], "--frames needs --white-mm and --fixed-mm and --guessed-with"),
+        ([*TOLD, "--white-mm", "1"], "--white-mm belongs to --frames"),
+        ([*TOLD, "--set-up", "main"], "--set-up belongs to --study"),
+        ([*TOLD, "--frames", "0", "--guessed-with", "1", "--white-mm", "1", "--fixed-mm", "0"], "--frames 0"),
+        ([*TOLD, "--frames", "5", "--guessed-with", "0", "--white-mm", "1", "--fixed-mm", "0"], "with 0 frames"),
+        ([*TOLD, "--frames", "5", "--guessed-with", "1", "--white-mm", "-1", "--fixed-mm", "0"], "0 or more"),
+        ([*TOLD, "--repeats", "1"], "nothing is repeated"),
+        ([*TOLD, "--false-calls-per-m2", "1"], "needs --board-m2"),
+        ([*TOLD, "--false-calls-per-m2", "-1", "--board-m2", "1"], "both above 0"),
+        (["--study", "nowhere", "--a50", "5"], "leave one out: --a50 or --study"),
+        (["--study", "nowhere/at/all"], "nowhere/at/all"),
+    ],
+)
+def test_mistakes(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.err.startswith("error: ") and said.err.count("error") == 1
+    assert said.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_set_up(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--study", str(study), "--set-up", "50 frame"]) == 2
+    said = capsys.readouterr().err
+    assert "did you mean '50 frames'?" in said and "legal: 1 frame; 50 frames" in said
+    assert main(["--study", str(study)]) == 2
+    assert "has 2 set-ups" in capsys.readouterr().err
+
+
+def test_a_study_without_a_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = study_record(Study(boards=5, set_ups=(SetUp(a50_mm=-50.0),)))
+    (tmp_path / "study.json").write_text(record_text(record))
+    assert main(["--study", str(tmp_path)]) == 2
+    assert "has no curve to guess from" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main([*TOLD, "--studies", "10", "--targets", "10", "--out", str(tmp_path / "file")]) == 2
+    assert "cannot be written" in capsys.readouterr().err

@@ -1,0 +1,325 @@
+"""Studies through the engine: boards of their own for thresholds, what a board gives, the same numbers however run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from detectors.interface import Detection
+from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
+from harness.engine.judge import Judgement
+from harness.engine.plan import plan_of
+from harness.engine.run import threshold_of
+from harness.engine.setup import met_on_face
+from harness.engine.sight import Sight
+from harness.evaluation.study.record import read_record
+from harness.experiment.load import load_experiment
+from harness.experiment.points import Point
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Region
+from scenes.target.custom import BoardConfig, SphereConfig
+from scenes.target.declaration import TargetConfig
+from scenes.target.face import face_of
+from scenes.target.pose import T_camera_board_of
+from scenes.target.truth import truth_of
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TINY = """\
+name: tiny
+seed: 3
+source:
+  kind: simulated
+  target: {name: drawn, damage: {kind: through, per_board: 5, diameter_mm: [2.0, 12.0]}}
+  camera: {name: azure_kinect_nfov}
+  render: {bounces: 0}
+capture: {frames: 2}
+detector: {name: thesis, settings: {crop: {kind: auto, inset_px: 4}}}
+threshold: {calibrate: {boards: 5, false_calls_per_m2: 4.0}}
+study: {boards: 4, hole_free_boards: 3}
+sweep:
+  capture.frames: [1, 2]
+"""
+
+
+def written(folder: Path, text: str = TINY) -> Path:
+    (folder / "tiny.yaml").write_text(text)
+    return folder / "tiny.yaml"
+
+
+# ---- what an experiment may say --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ("study=null", "a family of boards is for a study"),
+        ("source.target={name: thesis}", "a study needs a family of boards"),
+        ("threshold.calibrate={repeats: 5}", "a study's threshold is set on boards of their own"),
+        ("threshold.calibrate={boards: 5, false_calls_per_m2: 1.0}", "cannot show 1 false calls per m2"),
+        ("threshold.calibrate={repeats: 5, false_calls_per_m2: 1.0}", "needs `boards`"),
+        ("threshold.calibrate={repeats: 5, boards: 5}", "not both"),
+        ("source.target.distance_m=0.15", "a board drawn at"),
+        ("matching.radius_mm=25.0", "at most 20 mm"),
+    ],
+)
+def test_what_does_not_fit_together_is_told(tmp_path, changed, expected):
+    with pytest.raises(DeclarationError) as told:
+        load_experiment(written(tmp_path), [changed])
+    assert expected in str(told.value)
+
+
+def test_the_rate_of_false_calls_has_a_default_and_is_written_out(tmp_path):
+    experiment = load_experiment(written(tmp_path), ["threshold.calibrate={boards: 40}"])
+    calibrate = experiment.config.threshold.calibrate
+    assert calibrate is not None
+    assert calibrate.false_calls_per_m2 == 1.0
+
+
+def test_more_boards_are_another_study_of_the_same_boards(tmp_path):
+    few, more = (load_experiment(written(tmp_path), ["study.boards=" + n]) for n in ("4", "6"))
+    assert few.digest != more.digest
+    assert [point.digest for point in few.points] == [point.digest for point in more.points]
+    a, b = (plan_of(one, tmp_path).groups[0].then for one in (few, more))
+    assert {job.path for batch in a for job in batch.renders} < {job.path for batch in b for job in batch.renders}
+
+
+def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(tmp_path):
+    (group,) = plan_of(load_experiment(written(tmp_path)), tmp_path).groups
+    assert [(batch.role, batch.board) for batch in group.first] == [("calibration", n) for n in range(5)]
+    assert [batch.role for batch in group.then] == ["damaged"] * 4 + ["hole_free"] * 3
+    assert len({batch.renders[0].path for batch in group.batches}) == 12
+    for batch in group.batches:
+        shown, target = batch.renders[0].target, batch.set_ups[0].target
+        assert len(target.damages) == 5
+        assert shown == (target if batch.role == "damaged" else target.hole_free())
+
+
+# ---- thresholds ------------------------------------------------------------------------------------------------------
+
+
+def point_with(**threshold: object) -> Point:
+    calibrate = SimpleNamespace(**{"repeats": None, "false_calls_per_m2": None, **threshold})
+    return cast(
+        "Point", SimpleNamespace(config=SimpleNamespace(threshold=SimpleNamespace(k=None, calibrate=calibrate)))
+    )
+
+
+def test_a_study_s_threshold_is_set_by_the_wanted_rate():
+    """At 1 per m2 a run of 0.1 m2 calls with probability 0.0952. A new run exceeds the third highest of 39 with
+    probability 3 / 40, the fourth with 4 / 40, which is too often."""
+    quiet = [(float(k), 0.1) for k in range(39)]
+    assert threshold_of(point_with(false_calls_per_m2=1.0), quiet) == 36.0
+    assert threshold_of(point_with(repeats=39), quiet) == 38.0
+    assert threshold_of(point_with(repeats=39), []) is None
+    with pytest.raises(UserError, match="too few"):
+        threshold_of(point_with(false_calls_per_m2=0.1), quiet)
+
+
+# ---- one board -------------------------------------------------------------------------------------------------------
+
+
+def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
+    """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far from both 5."""
+    target = TargetConfig.from_data(
+        {
+            "name": "custom",
+            "board": {"width_mm": 100, "height_mm": 60, "thickness_mm": 10},
+            "holes": [
+                {"id": 1, "diameter_mm": 6, "centre_mm": [-30, 0]},
+                {"id": 2, "diameter_mm": 4, "centre_mm": [30, 0]},
+            ],
+        }
+    )
+    T_board_cloud = np.eye(4)
+    x, y = np.meshgrid(np.arange(-49.5, 50) * 1e-3, np.arange(-29.5, 30) * 1e-3)
+    points = np.stack([x, y, np.zeros(x.shape)], axis=-1)
+    none, zeros = np.full(x.shape, np.nan), np.zeros(x.shape, np.uint8)
+    region = Region(0, x.shape[0], 0, x.shape[1])
+    cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
+    places = points[..., :2]
+    truth = truth_of(target, T_camera_board_of(target.pose))
+    outlines = {
+        d.id: np.flatnonzero(np.linalg.norm(places - d.centre_board_m[:2], axis=-1) < d.diameter_m / 2) for d in truth
+    }
+    undamaged = np.ones(x.shape, bool)
+    undamaged.ravel()[np.concatenate(list(outlines.values()))] = False
+    sight = Sight(cloud, T_board_cloud, target, truth, outlines, places, undamaged, {1: 0.01, 2: 0.01})
+    score = np.zeros(x.shape)
+    score[:, 90:] = np.nan
+    score[29, 19], score[10, 50] = 9.0, 5.0
+    hit, call = (Detection(score[at], np.array([at[0] * 100 + at[1]]), points[at]) for at in ((29, 19), (10, 50)))
+
+    class Found:
+        def find(self, cloud: Cloud, evidence: object, threshold: float) -> tuple[Detection, ...]:
+            return tuple(one for one in (hit, call) if one.score > threshold)
+
+    evidence = SimpleNamespace(score=score)
+    judgement = Judgement(
+        run={"threshold": threshold},
+        holes=[{"hole": "1"}, {"hole": "2"}],
+        detector=Found(),  # type: ignore[arg-type]
+        evidence=evidence,  # type: ignore[arg-type]
+        detections=(hit, call),
+        places_m=np.array([points[29, 19, :2], points[10, 50, :2]]),
+        pairs={0: 0},
+    )
+    return sight, judgement
+
+
+def test_what_a_damaged_board_gives():
+    sight, judgement = sight_and_judgement()
+    rows = study_rows(sight, judgement, 0.01, hole_free=False)
+    assert [row["signal"] for row in rows.holes] == [9.0, 0.0]
+    assert rows.run["inspected_m2"] == pytest.approx(90 * 60e-6)  # ten columns of 100 were not judged
+    findings = rows.of_study["findings"]
+    assert [(one["hole"], one["score"]) for one in findings] == [("1", 9.0), ("", 5.0)]
+    assert (findings[1]["x_mm"], findings[1]["y_mm"]) == pytest.approx((0.5, -19.5))
+    (operating,) = rows.of_study["operating"]
+    at = dict(zip(operating["threshold"], zip(operating["findings"], operating["hits"], strict=True), strict=True))
+    assert at[4.0] == (2, 1)
+    assert at[8.0] == (1, 1)
+    assert at[16.0] == (0, 0)
+    of_pixels = {row["hole"]: row for row in rows.of_study["pixels"]}
+    assert of_pixels["1"]["pixels"] == len(sight.outlines[1])
+    assert of_pixels["1"]["above"][of_pixels["1"]["threshold"].index(4.0)] == 1
+    assert of_pixels[""]["above"][of_pixels[""]["threshold"].index(4.0)] == 1
+    assert rows.of_study["sites"] == []
+
+
+def test_a_hole_free_board_gives_the_same_places_as_sites():
+    sight, judgement = sight_and_judgement()
+    rows = study_rows(sight, judgement, 0.01, hole_free=True)
+    assert rows.holes == []
+    assert [(row["hole"], row["detected"], row["signal"]) for row in rows.of_study["sites"]] == [
+        ("1", True, 9.0),
+        ("2", False, 0.0),
+    ]
+    assert {one["hole"] for one in rows.of_study["findings"]} == {""}
+    assert rows.of_study["operating"][0]["hits"] == [0] * len(grid(4.0, FINDING_OCTAVES))
+    assert rows.of_study["pixels"] == []
+
+
+def test_a_place_where_nothing_was_judged_has_no_signal():
+    sight, judgement = sight_and_judgement()
+    judgement.evidence.score[:] = np.nan
+    assert np.isnan(study_rows(sight, judgement, 0.01, hole_free=True).of_study["sites"][0]["signal"])
+
+
+def test_the_grid_of_thresholds_holds_the_one_in_use():
+    for octaves in (FINDING_OCTAVES, PIXEL_OCTAVES):
+        found = grid(3.7, octaves)
+        assert 3.7 in found
+        assert found[1:] / found[:-1] == pytest.approx(2**0.25)
+    assert grid(0.0, FINDING_OCTAVES).tolist() == [0.0]
+
+
+def test_pixels_cover_the_face_however_it_is_tilted():
+    """A camera's grid on a plane tilted by 40 degrees: the pixels' areas sum to the face's."""
+    sight, _ = sight_and_judgement()
+    slopes = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 281), np.linspace(-0.05, 0.05, 201)), axis=-1)
+    tilt = np.deg2rad(40)
+    depth = 1.0 / (1 - slopes[..., 0] * np.tan(tilt))  # z = 1 + x tan
+    place = np.stack([slopes[..., 0] * depth / np.cos(tilt), slopes[..., 1] * depth], axis=-1)
+    inside = (np.abs(place[..., 0]) < 0.05) & (np.abs(place[..., 1]) < 0.03)
+    place[~inside] = np.nan
+    cloud = SimpleNamespace(organised=True)
+    tilted = replace(sight, cloud=cast("Cloud", cloud), places_m=place)
+    assert tilted.area_m2(inside) == pytest.approx(100 * 60e-6, rel=0.01)
+
+
+def test_lines_of_sight_meet_a_sphere_where_they_should():
+    board = BoardConfig(width_mm=200, height_mm=200, thickness_mm=5, shape=SphereConfig(kind="sphere", radius_mm=400))
+    direction = np.array([[0.1, -0.05, -1.0], [-0.15, 0.1, -1.0]])
+    met = met_on_face(np.tile([0.0, 0.0, 0.7], (2, 1)), direction, face_of(board))
+    assert np.linalg.norm(met - [0, 0, -0.4], axis=-1) == pytest.approx([0.4, 0.4], abs=1e-7)
+    assert np.linalg.norm(np.cross(met - [0, 0, 0.7], direction), axis=-1) == pytest.approx([0, 0], abs=1e-9)
+
+
+# ---- the whole study -------------------------------------------------------------------------------------------------
+
+
+def sweep(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "harness.sweep", str(folder.parent / "tiny.yaml"), "--out", str(folder)]
+    return subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("study")
+    written(home)
+    done = sweep(home / "out")
+    assert done.returncode == 0, done.stderr
+    assert "a90/95" in done.stdout
+    return home / "out"
+
+
+def results(folder: Path) -> Path:
+    (found,) = (folder / "tiny").iterdir()
+    return found
+
+
+def test_a_study_leaves_its_record_tables_and_report(finished):
+    folder = results(finished)
+    names = {path.name for path in folder.iterdir()}
+    tables = {f"{name}.parquet" for name in ("trials", "runs", "sites", "findings", "operating", "pixels")}
+    assert names >= {"study.json", "report.html", "provenance.json", "experiment.yaml", *tables}
+    record = read_record(folder)
+    assert [one.frames for one in record.set_ups] == [1, 2]
+    for one in record.set_ups:
+        assert sorted(set(one.inspected.board.tolist())) == [0, 1, 2, 3]
+        assert len(one.inspected.hit) == 20
+        # a hole of 10 mm, seven pixels wide, cannot be missed; one of 2 mm is a pixel and a half
+        assert one.inspected.hit[one.inspected.diameter_mm > 10].all()
+        assert one.unflawed.board.tolist() == [0, 1, 2]
+        assert one.unflawed.area_m2 == pytest.approx(0.057, abs=0.002)  # of 0.0619 m2, less a rim
+        assert one.calibration_runs == 5
+        assert one.threshold_mm > 0.5
+    assert record.set_ups[0].targets_digest == record.set_ups[1].targets_digest
+    assert record.set_ups[0].frames_digest != record.set_ups[1].frames_digest
+    runs = pd.read_parquet(folder / "runs.parquet")
+    assert runs[runs.role == "calibration"].threshold.isna().all()
+    assert runs[runs.role != "calibration"].groupby("frames").threshold.nunique().eq(1).all()
+
+
+def test_one_process_and_a_resumed_study_give_the_same_record(finished):
+    first = (results(finished) / "study.json").read_text()
+    again = finished.parent / "again"
+    shutil.copytree(finished / ".cache", again / ".cache")
+    assert sweep(again, "--jobs", "1").returncode == 0
+    half = finished.parent / "half"
+    shutil.copytree(finished, half)
+    journal = sorted((results(half) / "journal").glob("*.json"))
+    assert len(journal) == 12
+    for path in journal[::3]:
+        path.unlink()
+    assert sweep(half).returncode == 0
+    for folder in (again, half):
+        assert without_command((results(folder) / "study.json").read_text()) == without_command(first)
+
+
+def without_command(text: str) -> object:
+    data = json.loads(text)
+    del data["provenance"]["command"]
+    return data
+
+
+def test_another_seed_of_the_noise_keeps_the_boards(finished, tmp_path):
+    config = finished.parent / "tiny.yaml"
+    cache = finished / ".cache" / "renders"
+    here, there = (plan_of(load_experiment(config, changed), cache) for changed in ((), ("seed=4",)))
+    assert [job.path for job in here.renders] == [job.path for job in there.renders]
+    keys = [{key for g in plan.groups for b in g.first for key, _ in g.trials(b, {})} for plan in (here, there)]
+    assert keys[0].isdisjoint(keys[1])

@@ -1,0 +1,236 @@
+"""Detectors and cameras by name, tofpod's own and those of other packages, and the program that lists them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import detectors
+from detectors import detector_names, detector_type, load_detector
+from detectors.thesis import ThesisConfig, ThesisDetector
+from harness.ls import main
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.plug_ins import PlugIns
+from scenes.sensor import camera as cameras
+from scenes.sensor.camera import CAMERA_FOLDER, camera_file, camera_names, load_camera
+from tests.plug_in_packages import offer
+
+OWN_DETECTORS = ("blind", "oracle", "thesis")
+
+
+class Plain:
+    """Says nothing of its settings."""
+
+
+class Raises(ThesisDetector):
+    """Cannot be made."""
+
+    def __init__(self, settings: ThesisConfig) -> None:
+        raise ZeroDivisionError("no luck")
+
+
+def mistake(call, *arguments) -> UserError:
+    with pytest.raises(UserError) as caught:
+        call(*arguments)
+    return caught.value
+
+
+def listed(capsys: pytest.CaptureFixture[str], kind: str) -> dict[str, list[dict]]:
+    assert main([kind, "--json"]) == 0
+    rows: dict[str, list[dict]] = {}
+    for row in json.loads(capsys.readouterr().out)[kind]:
+        rows.setdefault(row["name"], []).append(row)
+    return rows
+
+
+# ---------------------------------------------------------------- the registry
+
+
+def test_a_plug_in_is_found_without_importing_it_and_gone_when_uninstalled(monkeypatch, tmp_path):
+    with monkeypatch.context() as patched:
+        offer(patched, tmp_path, "acme", detectors.GROUP, {"mine": "detectors.thesis:ThesisDetector", "off": "nope:X"})
+        assert detector_names() == ("blind", "mine", "off", "oracle", "thesis")
+        assert isinstance(load_detector("mine", {}), ThesisDetector)
+    assert detector_names() == OWN_DETECTORS
+
+
+def test_a_package_that_is_installed_later_is_found(monkeypatch, tmp_path):
+    offer(monkeypatch, tmp_path, "first", detectors.GROUP, {"one": "detectors.thesis:ThesisDetector"})
+    assert "one" in detector_names() and "two" not in detector_names()
+    offer(monkeypatch, tmp_path, "second", detectors.GROUP, {"two": "detectors.thesis:ThesisDetector"})
+    assert {"one", "two"} <= set(detector_names())
+
+
+def test_installed_packages_are_read_once(monkeypatch):
+    import harness.vocabulary.plug_ins as plug_ins
+
+    read = []
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: read.append(group) or ())
+    registry = PlugIns("tofpod.nothing", "thing", dict)
+    assert [registry.names() for _ in range(3)] == [(), (), ()] and read == ["tofpod.nothing"]
+
+
+def test_a_name_taken_twice_is_an_error_that_names_both_and_leaves_others_alone(monkeypatch, tmp_path):
+    offer(monkeypatch, tmp_path / "a", "acme", detectors.GROUP, {"thesis": "acme.found:Detector", "x": "p:A"})
+    offer(monkeypatch, tmp_path / "b", "bolt", detectors.GROUP, {"x": "q:B", "y": "detectors.thesis:ThesisDetector"})
+    told = str(mistake(load_detector, "thesis", {}))
+    assert "2 detectors are called 'thesis'" in told
+    assert "detectors.thesis:ThesisDetector (tofpod 0.1.0) and acme.found:Detector (acme 1.2)" in told
+    assert "p:A (acme 1.2) and q:B (bolt 1.2)" in str(mistake(detector_type, "x"))
+    assert detector_type("y") is ThesisDetector
+
+
+def test_one_offer_seen_twice_is_no_clash(monkeypatch, tmp_path):
+    entries = {"mine": "detectors.thesis:ThesisDetector"}
+    offer(monkeypatch, tmp_path / "a", "acme", detectors.GROUP, entries)
+    offer(monkeypatch, tmp_path / "b", "acme-mirror", detectors.GROUP, entries)
+    assert detector_type("mine") is ThesisDetector
+
+
+@pytest.mark.parametrize(
+    ("target", "why"),
+    [
+        ("no_such_package:Detector", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("detectors.thesis:NoSuch", "AttributeError"),
+        (f"{__name__}:Plain", "no `settings_type`"),
+        ("detectors.thesis", "no `settings_type`"),
+    ],
+)
+def test_a_broken_plug_in_is_told_with_its_package(monkeypatch, tmp_path, target, why):
+    offer(monkeypatch, tmp_path, "acme-tools", detectors.GROUP, {"bad": target})
+    told = str(mistake(load_detector, "bad", {}))
+    assert f"detector 'bad' ({target}, of the package acme-tools 1.2) cannot be loaded" in told
+    assert why in told and "repair or uninstall the package acme-tools" in told
+
+
+def test_what_is_wrong_with_a_built_in_one_keeps_its_traceback(monkeypatch):
+    monkeypatch.setitem(detectors.BUILT_IN, "gone", "detectors.no_such_module:X")
+    with pytest.raises(ModuleNotFoundError):
+        detector_type("gone")
+
+
+def test_the_nearest_name_is_told_and_it_may_be_a_plug_in(monkeypatch, tmp_path):
+    offer(monkeypatch, tmp_path, "acme", detectors.GROUP, {"wavelet": "acme:D"})
+    error = mistake(detector_type, "wavlet")
+    assert error.message == "there is no detector 'wavlet'; did you mean 'wavelet'?"
+    assert error.legal == "blind, oracle, thesis, wavelet" and "tofpod.detectors" in (error.fix or "")
+
+
+# ---------------------------------------------------------------- cameras
+
+
+@pytest.fixture
+def acme_camera(monkeypatch, tmp_path) -> Path:
+    """A package's camera: a Kinect v2 by another name."""
+    text = (CAMERA_FOLDER / "kinect_v2.yaml").read_text().replace("name: kinect_v2", "name: acme_tof", 1)
+    (tmp_path / "acme_tof.yaml").write_text(text)
+    (tmp_path / "acme_cameras.py").write_text(
+        "from pathlib import Path\nFILE = Path(__file__).parent / 'acme_tof.yaml'\nTEXT = str(FILE)\nNUMBER = 7\n"
+    )
+    offer(monkeypatch, tmp_path, "acme-cameras", cameras.GROUP, {"acme_tof": "acme_cameras:FILE"})
+    monkeypatch.delitem(sys.modules, "acme_cameras", raising=False)
+    return tmp_path / "acme_tof.yaml"
+
+
+def test_a_packages_camera_is_read_like_any_other(acme_camera):
+    assert camera_names() == ("acme_tof", "azure_kinect_nfov", "kinect_v2", "realsense_l515")
+    assert camera_file("acme_tof") == acme_camera
+    own, copied = load_camera("kinect_v2"), load_camera("acme_tof")
+    assert copied.name == "acme_tof" and copied.to_data() == {**own.to_data(), "name": "acme_tof"}
+
+
+def test_a_number_that_a_packages_camera_has_not_is_told_with_its_file(acme_camera):
+    config = cameras.CameraConfig(name="acme_tof", numbers={"lens.fx": 500.0})
+    assert str(acme_camera) in str(mistake(cameras.camera_of, config))
+    config = cameras.CameraConfig(name="kinect_v2", numbers={"lens.fx": 500.0})
+    assert "scenes/cameras/kinect_v2.yaml" in str(mistake(cameras.camera_of, config))
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "why"),
+    [
+        ("other", "acme_cameras:TEXT", "must be called other.yaml, not acme_tof.yaml"),
+        ("acme", "acme_cameras:NUMBER", "the path of a YAML file is wanted, not int"),
+        ("nope", "acme_cameras:NOPE", "AttributeError"),
+    ],
+)
+def test_a_packages_camera_that_is_no_file_is_told_with_its_package(acme_camera, monkeypatch, name, target, why):
+    offer(monkeypatch, acme_camera.parent / "more", "more-cameras", cameras.GROUP, {name: target})
+    told = str(mistake(load_camera, name))
+    assert f"camera {name!r} ({target}, of the package more-cameras 1.2) cannot be loaded" in told and why in told
+
+
+def test_a_packages_camera_whose_file_is_gone_is_told(acme_camera):
+    acme_camera.unlink()
+    assert "there is no file" in str(mistake(load_camera, "acme_tof"))
+
+
+# ---------------------------------------------------------------- what is listed
+
+
+def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    assert "detectors (entry points: tofpod.detectors)" in out and "cameras (entry points: tofpod.cameras)" in out
+    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert set(lines) == {*OWN_DETECTORS, *camera_names()}
+    assert "tofpod 0.1.0" in lines["thesis"] and "version 3" in lines["thesis"]
+    assert [name for name, line in lines.items() if "tests the harness" in line] == ["blind", "oracle"]
+    assert "acme-cameras 1.2" in lines["acme_tof"] and "512 x 424 px" in lines["acme_tof"]
+    assert "0.5 to 4.5 m" in lines["acme_tof"] and "860 nm" in lines["acme_tof"]
+
+
+def test_broken_ones_and_clashes_are_listed_as_such_and_the_program_succeeds(monkeypatch, tmp_path, capsys):
+    entries = {"bad": "no_such:X", "raises": f"{__name__}:Raises", "thesis": f"{__name__}:Plain"}
+    offer(monkeypatch, tmp_path, "acme", detectors.GROUP, entries)
+    rows = listed(capsys, "detectors")
+    assert "No module named 'no_such'" in rows["bad"][0]["broken"]
+    assert "ZeroDivisionError: no luck" in rows["raises"][0]["broken"]
+    assert [row["package"] for row in rows["thesis"]] == ["tofpod", "acme"]
+    assert all("2 detectors are called 'thesis'" in row["broken"] for row in rows["thesis"])
+    assert "broken" not in rows["oracle"][0]
+    assert main(["detectors"]) == 0
+    assert "broken: detector 'bad'" in capsys.readouterr().out
+
+
+def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
+    assert main(["detectors", "thesis", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    settings = {one["path"]: one for one in shown["settings"]}
+    assert shown["version"] == 3 and shown["package"] == "tofpod"
+    assert settings["surface.degree"] == {"path": "surface.degree", "value": 3, "about": "a whole number from 0 to 8"}
+    assert settings["crop.kind"]["about"] == "one of none, box, polygon, auto"
+    # the listed defaults are all of the settings: they make the same declaration
+    rebuilt: dict = {}
+    for path, one in settings.items():
+        at = rebuilt
+        *groups, leaf = path.split(".")
+        for group in groups:
+            at = at.setdefault(group, {})
+        at[leaf] = one["value"]
+    assert ThesisConfig.from_data(rebuilt) == ThesisConfig()
+    assert main(["detectors", "thesis"]) == 0
+    text = capsys.readouterr().out
+    assert "surface.method" in text and "one of lar, bisquare, lts, least_squares" in text
+
+
+def test_a_named_camera_shows_every_number_with_its_source(capsys):
+    assert main(["cameras", "kinect_v2", "--json"]) == 0
+    numbers = {one["path"]: one for one in json.loads(capsys.readouterr().out)["numbers"]}
+    facts = load_camera("kinect_v2")
+    assert numbers["lens.fx_px"]["value"] == facts.lens.fx_px.value
+    assert numbers["lens.fx_px"]["about"].endswith(facts.lens.fx_px.source)
+    assert set(numbers) == set(cameras.number_paths(facts.to_data()))
+
+
+def test_mistakes_are_one_message(capsys, monkeypatch, tmp_path):
+    assert main(["detectors", "thesys"]) == 2
+    assert "did you mean 'thesis'" in capsys.readouterr().err
+    assert main(["cameras", "azure"]) == 2
+    assert "there is no camera 'azure'" in capsys.readouterr().err
+    offer(monkeypatch, tmp_path, "acme", detectors.GROUP, {"bad": "no_such:X"})
+    assert main(["detectors", "bad"]) == 2
+    assert "of the package acme 1.2" in capsys.readouterr().err

@@ -1,0 +1,270 @@
+"""Limits of set-ups: against the library, by hand, and over boards."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic_study import SetUp, Study, study_record
+
+from harness.evaluation.pod.curve import LINKS, PodCurve
+from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss
+from harness.evaluation.pod.likelihood_bounds import bound
+from harness.evaluation.study.limit import ALL_FOUND, limit_of
+from harness.evaluation.study.over_boards import (
+    board_weights,
+    design_effect,
+    percentiles,
+    refitted_sizes,
+    row_weights,
+    targets_of,
+)
+from harness.evaluation.study.record import Inspected, SetUpRecord
+
+
+def set_up(study: Study) -> SetUpRecord:
+    return study_record(study).set_ups[0]
+
+
+def with_hits(record: SetUpRecord, hit: np.ndarray) -> SetUpRecord:
+    return dataclasses.replace(record, inspected=dataclasses.replace(record.inspected, hit=hit))
+
+
+def first_rows(record: SetUpRecord, n: int) -> SetUpRecord:
+    columns = {field.name: getattr(record.inspected, field.name)[:n] for field in dataclasses.fields(Inspected)}
+    return dataclasses.replace(record, inspected=Inspected(**columns))
+
+
+@pytest.fixture(scope="module")
+def small() -> SetUpRecord:
+    return set_up(Study(boards=15, hole_free_boards=12))
+
+
+@pytest.fixture(scope="module")
+def repeated() -> SetUpRecord:
+    return set_up(Study(boards=15, repeats=3))
+
+
+class TestHeadline:
+    def test_is_the_likelihood_ratio_bound_of_the_model_with_the_least_deviance(self, small):
+        limit, seen = limit_of(small), small.inspected
+        best = choose_model(seen.diameter_mm, seen.hit)[0]
+        assert limit.a90_95 == bound(best)
+        assert (limit.a50_mm, limit.a90_mm) == (best.curve.size_at(0.5), best.curve.size_at(0.9))
+        assert limit.why == "" and limit.targets == limit.inspections == 120 and limit.boards == 15
+
+    def test_repeats_of_one_damage_are_one_target(self, repeated):
+        limit, seen = limit_of(repeated), repeated.inspected
+        assert limit.targets == 120 and limit.inspections == 360
+        assert limit.statement.targets == 120
+        assert limit.a90_95.value > limit.statement.independent.value
+        by_hand = fit_hit_miss(
+            seen.diameter_mm,
+            seen.hit,
+            link=limit.statement.curve.link,
+            log_size=limit.statement.curve.log_size,
+            inspections=seen.board * 100 + seen.hole.astype(int),
+        )
+        assert limit.a90_95 == bound(by_hand)
+
+    def test_is_near_the_truth(self):
+        answers = SetUp()
+        limit = limit_of(set_up(Study((answers,))))
+        # 480 targets: standard error of a90 about 0.25 mm
+        assert abs(limit.a50_mm - answers.a50_mm) < 0.5
+        assert abs(limit.a90_mm - answers.a90_mm) < 0.75
+        assert limit.a90_mm < limit.a90_95.value < answers.a90_mm + 1.0
+        assert limit.a50_interval_mm.low < answers.a50_mm < limit.a50_interval_mm.high
+
+    def test_same_record_same_bits(self, small):
+        one, other = limit_of(small), limit_of(small)
+        assert np.array_equal(one.a90_draws_mm, other.a90_draws_mm) and one.rate_interval == other.rate_interval
+
+
+class TestWithoutACurve:
+    def test_all_found_is_bounded_by_the_29th_smallest(self, small):
+        limit = limit_of(with_hits(small, np.ones(120, bool)))
+        assert ALL_FOUND == 29 and 0.9**29 < 0.05 < 0.9**28
+        assert limit.statement is None and "found" in limit.why
+        assert limit.a90_95.value == np.sort(small.inspected.diameter_mm)[28]
+        assert "all found" in limit.a90_95.method and not limit.over_boards.demonstrated
+        assert limit.a90_mm == limit.a50_mm == small.inspected.diameter_mm.min()
+        assert np.all(limit.a90_draws_mm == small.inspected.diameter_mm.min())
+
+    def test_28_found_of_28_demonstrate_nothing(self, small):
+        record = first_rows(small, 28)
+        limit = limit_of(with_hits(record, np.ones(28, bool)))
+        assert not limit.a90_95.demonstrated and "it takes 29" in limit.a90_95.why
+
+    def test_the_29th_smallest_covers(self):
+        """A detector whose POD is just below 90 % at the 29 smallest sizes is passed in less than 5 % of studies."""
+        rng = np.random.default_rng(5)
+        passed = (rng.random((20_000, 29)) < 0.9).all(axis=1).mean()
+        assert passed < 0.05 and passed == pytest.approx(0.9**29, abs=4 * np.sqrt(0.047 * 0.953 / 20_000))
+
+    def test_nothing_found(self, small):
+        limit = limit_of(with_hits(small, np.zeros(120, bool)))
+        assert limit.statement is None and "missed" in limit.why and limit.why in limit.a90_95.why
+        assert not limit.a90_95.demonstrated and np.isnan(limit.a90_mm) and np.isnan(limit.a50_mm)
+        assert np.all(np.isinf(limit.a90_draws_mm)) and np.isinf(limit.over_boards_mm)
+        assert limit.rate == 0 and not limit.boards_matter
+
+    def test_a_chance_that_falls_with_size(self, small):
+        limit = limit_of(with_hits(small, small.inspected.diameter_mm < np.median(small.inspected.diameter_mm)))
+        assert limit.statement is None and "does not grow" in limit.why and not limit.a90_95.demonstrated
+        assert np.all(np.isinf(limit.a90_draws_mm))
+
+    def test_no_damage_at_all(self, small):
+        limit = limit_of(first_rows(small, 0))
+        assert limit.why == "no damage was inspected" and limit.targets == 0 and np.isnan(limit.rate)
+        assert not limit.rate_interval.known and not limit.a90_95.demonstrated
+
+    def test_hits_and_misses_apart(self, small):
+        size = small.inspected.diameter_mm
+        limit = limit_of(with_hits(small, size > 6.0))
+        gap = (size[size <= 6].max(), size[size > 6].min())
+        assert limit.statement is not None and np.isfinite(limit.a90_draws_mm).all()
+        assert np.median(limit.a90_draws_mm) == pytest.approx(np.mean(gap), abs=0.6)
+
+
+class TestFalseCalls:
+    def test_counts_and_area(self, small):
+        limit = limit_of(small)
+        assert limit.false_calls.calls == small.unflawed.calls.sum()
+        assert limit.false_calls.area_m2 == pytest.approx(12 * 0.25)
+        assert limit.false_calls_interval_per_m2.low <= limit.false_calls.rate_per_m2
+
+    def test_none_without_hole_free_boards(self):
+        limit = limit_of(set_up(Study(boards=8, hole_free_boards=0)))
+        assert limit.false_calls is None and not limit.false_calls_interval_per_m2.known
+
+    def test_calls_that_come_in_clusters_widen_the_interval_over_boards(self, small):
+        calls = np.zeros(12, int)
+        calls[3] = 24
+        clustered = dataclasses.replace(small, unflawed=dataclasses.replace(small.unflawed, calls=calls))
+        limit = limit_of(clustered)
+        over = limit.false_calls_interval_per_m2
+        poisson = limit.false_calls.interval_per_m2
+        assert over.high - over.low > 1.5 * (poisson.high - poisson.low)
+
+
+class TestSignals:
+    def test_agree_with_hits(self):
+        answers = SetUp()
+        limit = limit_of(set_up(Study((answers,))), noise_floor=3.2)
+        assert limit.signals.signal.left == 3.2 and limit.signals.signal.decision == 5.0
+        assert abs(limit.signals.a90 - answers.a90_mm) < 0.6
+        assert limit.signals.numbers["signals at or below --left"] > 50
+
+    def test_a_floor_above_the_threshold_is_cut_to_it(self, small):
+        assert limit_of(small, noise_floor=9.0).signals.signal.left == 5.0
+
+    def test_places_that_were_not_judged_have_no_signal(self, small):
+        signal = small.inspected.signal.copy()
+        signal[:118] = np.nan
+        changed = dataclasses.replace(small, inspected=dataclasses.replace(small.inspected, signal=signal))
+        limit = limit_of(changed)
+        assert limit.signals is None and limit.signals_why == "2 signals"
+
+
+class TestBoardsDrawnAgain:
+    def test_weights_are_the_same_for_as_many_boards_and_differ_between_populations(self):
+        assert np.array_equal(board_weights(7, 20), board_weights(7, 20))
+        assert np.all(board_weights(7, 20).sum(axis=1) == 7)
+        assert not np.array_equal(board_weights(7, 20), board_weights(7, 20, "hole-free"))
+        rows = row_weights(np.array([9, 4, 9]), 20)
+        assert np.array_equal(rows[:, 0], rows[:, 2]) and np.array_equal(rows[:, 1], board_weights(2, 20)[:, 0])
+
+    @pytest.mark.parametrize("link", LINKS)
+    @pytest.mark.parametrize("log_size", [False, True])
+    def test_a_draw_is_the_fit_of_its_boards(self, small, link, log_size):
+        seen = small.inspected
+        targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+        curve = fit_hit_miss(seen.diameter_mm, seen.hit, link=link, log_size=log_size).curve
+        drawn = refitted_sizes(targets, curve, (0.5, 0.9), 6)
+        for k, weight in enumerate(row_weights(seen.board, 6)):
+            again = np.repeat(np.arange(120), weight.astype(int))
+            fit = fit_hit_miss(seen.diameter_mm[again], seen.hit[again], link=link, log_size=log_size)
+            assert drawn[0, k] == pytest.approx(fit.curve.size_at(0.5), rel=1e-5)
+            assert drawn[1, k] == pytest.approx(fit.curve.size_at(0.9), rel=1e-5)
+
+    def test_a_draw_of_repeats_is_the_fit_of_their_rows(self, repeated):
+        seen = repeated.inspected
+        targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+        assert np.all(targets.inspections == 3) and targets.hits.sum() == seen.hit.sum()
+        curve = fit_hit_miss(seen.diameter_mm, seen.hit).curve
+        again = np.repeat(np.arange(360), row_weights(seen.board, 1)[0].astype(int))
+        fit = fit_hit_miss(seen.diameter_mm[again], seen.hit[again])
+        assert refitted_sizes(targets, curve, (0.9,), 1)[0, 0] == pytest.approx(fit.curve.size_at(0.9), rel=1e-5)
+
+    @pytest.mark.parametrize("boards_mm, low, high", [(0.0, 0.9, 1.1), (2.5, 1.7, 3.5)])
+    def test_design_effect_is_one_of_independent_damage_and_more_where_boards_matter(self, boards_mm, low, high):
+        """Means over 100 studies of 30 boards; of one study the ratio is known to about 25 %."""
+        effects = []
+        for seed in range(100):
+            seen = set_up(Study((SetUp(boards_mm=boards_mm),), boards=30, hole_free_boards=0, seed=seed)).inspected
+            targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+            effects.append(design_effect(targets, fit_hit_miss(seen.diameter_mm, seen.hit).curve, 0.9))
+        assert low < np.mean(effects) < high
+
+    def test_the_spread_of_draws_is_the_estimates_standard_error(self):
+        """Over 100 studies of 30 boards that matter: the standard deviation of a90 against the mean of the draws'."""
+        estimates, spreads = [], []
+        for seed in range(100):
+            seen = set_up(Study((SetUp(boards_mm=1.5),), boards=30, hole_free_boards=0, seed=seed)).inspected
+            curve = fit_hit_miss(seen.diameter_mm, seen.hit).curve
+            targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+            estimates.append(curve.size_at(0.9))
+            spreads.append(refitted_sizes(targets, curve, (0.9,), 100)[0].std())
+        assert np.mean(spreads) == pytest.approx(np.std(estimates), rel=0.25)
+
+    def test_the_bound_over_boards_has_the_effect_in_its_criterion(self):
+        limit = limit_of(set_up(Study((SetUp(boards_mm=3.0),), boards=30)))
+        curve, seen = limit.statement.curve, limit.record.inspected
+        fit = fit_hit_miss(seen.diameter_mm, seen.hit, link=curve.link, log_size=curve.log_size)
+        assert limit.design_effect > 1.3 and limit.over_boards == bound(fit, design_effect=limit.design_effect)
+        assert limit.over_boards_mm > limit.a90_95.value
+        calm = limit_of(set_up(Study(boards=30, hole_free_boards=0, seed=3)))
+        assert (calm.over_boards is calm.a90_95) == (calm.design_effect <= 1)
+
+    def test_all_found_counts_one_damage_a_board(self):
+        record = set_up(Study(boards=30, hole_free_boards=0))
+        limit = limit_of(with_hits(record, np.ones(240, bool)))
+        smallest = [record.inspected.diameter_mm[record.inspected.board == board].min() for board in range(30)]
+        assert limit.over_boards_mm == np.sort(smallest)[28] > limit.a90_95.value
+
+    def test_design_effect_of_boards_with_one_damage_is_one(self, small):
+        seen = small.inspected
+        targets = targets_of(np.arange(120), seen.hole, seen.diameter_mm, seen.hit)
+        curve = fit_hit_miss(seen.diameter_mm, seen.hit).curve
+        assert design_effect(targets, curve, 0.9) == pytest.approx(1.0, rel=1e-12)
+
+    def test_design_effect_of_copied_damage_is_the_number_of_copies(self, small):
+        """Every damage eight times on a board of its own: 8, but for G / (G - 1) of 120 boards and of 960 targets."""
+        seen = small.inspected
+        size, hit = np.repeat(seen.diameter_mm, 8), np.repeat(seen.hit, 8)
+        targets = targets_of(np.repeat(np.arange(120), 8), np.tile(np.arange(8), 120), size, hit)
+        curve = fit_hit_miss(seen.diameter_mm, seen.hit).curve
+        assert design_effect(targets, curve, 0.9) == pytest.approx(8 * (120 / 119) / (960 / 959), rel=1e-9)
+
+    @settings(max_examples=20, deadline=None)
+    @given(st.integers(0, 10_000), st.floats(0.1, 10.0))
+    def test_another_unit_of_size_scales_every_draw(self, seed, unit):
+        rng = np.random.default_rng(seed)
+        size, board = rng.uniform(1, 10, 60), np.repeat(np.arange(12), 5)
+        hit = rng.random(60) < 1 / (1 + np.exp(-(size - 5)))
+        curve = PodCurve("logit", False, 5.0, 1.0, np.zeros((2, 2)))
+        scaled = PodCurve("logit", False, 5.0 * unit, unit, np.zeros((2, 2)))
+        hole = np.arange(60)
+        one = refitted_sizes(targets_of(board, hole, size, hit), curve, (0.5,), 10)
+        other = refitted_sizes(targets_of(board, hole, size * unit, hit), scaled, (0.5,), 10)
+        assert np.allclose(other, one * unit, rtol=1e-4)
+
+    def test_percentiles(self):
+        values = np.arange(1.0, 101.0)
+        assert percentiles(values) == type(percentiles(values))(3.0, 98.0)
+        assert percentiles(np.array([np.nan, np.nan, 1.0])).known is False
+        assert percentiles(np.r_[values, np.full(100, np.inf)]).high == np.inf

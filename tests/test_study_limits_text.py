@@ -1,0 +1,251 @@
+"""Limits in words and in the terminal's table, and figures drawn from limits alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic_study import SetUp, Study, study_record
+
+from harness.evaluation.intervals import UNKNOWN, Interval
+from harness.evaluation.study.axes import FRAMES, axis_lines
+from harness.evaluation.study.limit import SetUpLimit, limit_of
+from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.report.study_axes_figure import axis_figure, axis_groups
+from harness.report.study_axes_rows import axis_heads, axis_rows
+from harness.report.study_example import StudyExample
+from harness.report.study_examples_figure import examples_figure, framed_pixels
+from harness.report.study_pod_figures import MOST_PANELS, curves_figure, with_room
+from harness.report.study_rows import (
+    interval_text,
+    limit_rows,
+    limit_sentence,
+    study_answer,
+    unbroken,
+    with_interval,
+)
+from harness.report.study_terminal import HEADS, study_table, study_text
+
+
+def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
+    record = study_record(Study(set_ups=set_ups, boards=20, hole_free_boards=12, **study))  # type: ignore[arg-type]
+    return [limit_of(one, draws=100) for one in record.set_ups]
+
+
+def result_of(limits: list[SetUpLimit]) -> StudyResult:
+    """A result of limits alone."""
+    set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", (), np.nan) for one in limits)
+    return StudyResult(study_record(), set_ups, (), ())
+
+
+@pytest.fixture(scope="module")
+def two() -> list[SetUpLimit]:
+    return limits_of(SetUp(frames=1, a50_mm=6.0), SetUp(frames=50, a50_mm=4.0))
+
+
+@pytest.fixture(scope="module")
+def nothing_found() -> SetUpLimit:
+    return limits_of(SetUp(a50_mm=60.0))[0]
+
+
+@pytest.fixture(scope="module")
+def everything_found() -> SetUpLimit:
+    return limits_of(SetUp(a50_mm=-60.0))[0]
+
+
+def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
+    for limit in two:
+        said = limit_sentence(limit)
+        assert said.startswith(f"{limit.record.label}: damage of {limit.a90_95.value:.2f} mm is found 90 % of the time")
+        assert limit.false_calls is not None
+        assert f"at {limit.false_calls.rate_per_m2:.2g} false calls per m²" in said
+    assert study_answer(two) == " ".join(limit_sentence(limit) for limit in two)
+
+
+def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
+    said = study_answer([*two, *two, nothing_found])
+    assert said.startswith(f"Of 5 set-ups, the smallest limit (a90/95) is {two[1].a90_95.value:.2f} mm (50 frames)")
+    assert f"the largest {two[0].a90_95.value:.2f} mm (1 frame)" in said
+    assert said.endswith("; 1 of 5 set-ups demonstrates no limit.")
+    assert study_answer([nothing_found] * 4) == "None of 4 set-ups demonstrates a limit (a90/95)."
+    assert study_answer([]) == "No set-up was inspected, so there is no answer."
+
+
+def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> None:
+    row = limit_rows([nothing_found])[0]
+    assert (row.a50, row.a90, row.a90_95, row.over_boards) == ("none", "none", "not demonstrated", "not demonstrated")
+    assert row.why.startswith("every target was missed")
+    assert not row.demonstrated
+    assert "a90/95 is not demonstrated (every target was missed" in limit_sentence(nothing_found)
+
+
+def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLimit) -> None:
+    row = limit_rows([everything_found])[0]
+    assert row.a90_95 == f"{everything_found.a90_95.value:.2f}"
+    assert row.why.startswith("all found: binomial")
+    assert row.found == "160 of 160"
+
+
+def test_the_terminals_table_and_its_plain_twin_say_the_same(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
+    from rich.console import Console
+
+    limits = [*two, nothing_found]
+    result = result_of(limits)
+    plain = study_text(result)
+    console = Console(width=110, force_terminal=False)
+    with console.capture() as capture:
+        console.print(study_table(result))
+    shown = [line.split() for line in capture.get().splitlines()[1:]]
+    assert shown == [line.split() for line in plain.splitlines()[: len(limits) + 1]]
+    assert plain.splitlines()[0].split() == " ".join(HEADS).split()
+    for limit in limits:
+        assert limit_sentence(limit) in plain
+
+
+def test_boards_that_matter_and_failed_trials_are_told(two: list[SetUpLimit]) -> None:
+    limit = replace(
+        two[0],
+        over_boards=replace(two[0].a90_95, value=1.2 * two[0].a90_95.value),
+        design_effect=2.34,
+        record=replace(two[0].record, failed=3),
+    )
+    why = limit_rows([limit])[0].why
+    assert "design effect 2.3" in why
+    assert "3 trials failed" in why
+
+
+def test_repeats_are_no_targets_and_both_limits_are_told() -> None:
+    limit = limits_of(SetUp(), repeats=3)[0]
+    assert limit.statement is not None
+    assert limit.statement.independent is not None
+    wrong = limit.statement.independent.value
+    assert wrong < limit.a90_95.value
+    why = limit_rows([limit])[0].why
+    assert "480 inspections of 160 targets count as 160" in why
+    assert f"were every inspection a target of its own, a90/95 would be {wrong:.2f} mm: wrong" in why
+
+
+def test_few_targets_are_told() -> None:
+    limit = limits_of(SetUp(), holes=2)[0]
+    assert "40 independent targets; MIL-HDBK-1823A asks for at least 60" in limit_rows([limit])[0].why
+
+
+@given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
+@settings(max_examples=30, deadline=None)
+def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
+    text = with_interval(value, Interval(value - down, value + up))
+    numbers = [float(one) for one in re.findall(r"-?\d+\.\d\d", text)]
+    assert np.allclose(numbers, [value, value - down, value + up], atol=0.0051)
+
+
+def test_numbers_are_held_to_their_units() -> None:
+    assert unbroken("distance=0.7 m, 50 frames of kind 3, 4") == "distance=0.7\u00a0m, 50\u00a0frames of kind 3, 4"
+
+
+def test_intervals_without_ends() -> None:
+    assert interval_text(UNKNOWN) == "unknown"
+    assert with_interval(1.0, UNKNOWN) == "1.00"
+    assert with_interval(1.0, Interval(0.5, np.inf)) == "1.00 (0.50 to ∞)"
+    assert with_interval(np.inf, Interval(2.0, np.inf)) == "∞ (2.00 to ∞)"
+    assert with_interval(np.nan, Interval(2.0, 3.0)) == "none"
+
+
+def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
+    def one(camera: str, distance: float, frames: int) -> SetUp:
+        axes = {"source.camera.name": camera, "source.target.distance_m": distance, "detector.name": "thesis"}
+        return SetUp(variant=f"{camera} {distance}", frames=frames, axes=axes, a50_mm=4.0 + distance)
+
+    limits = limits_of(*(one(camera, distance, n) for camera in ("a", "b") for distance in (0.5, 1.0) for n in (1, 50)))
+    camera, distance, frames = axis_groups(axis_lines(limits))
+    assert [group.path for group in (camera, distance, frames)] == [
+        "source.camera.name",
+        "source.target.distance_m",
+        FRAMES,
+    ]
+    assert (distance.title, distance.values, distance.numeric) == ("distance (m)", (0.5, 1.0), True)
+    assert (camera.values, camera.numeric) == (("a", "b"), False)
+    assert list(distance.lines) == ["a, 1 frame", "a, 50 frames", "b, 1 frame", "b, 50 frames"]
+    assert distance.lines["b, 50 frames"].limits == (limits[5], limits[7])
+    rows = axis_rows(distance)
+    assert [row[:2] for row in rows[:3]] == [("a, 1 frame", "0.5 m"), ("", "1 m"), ("a, 50 frames", "0.5 m")]
+    assert {len(row) for row in rows} == {len(axis_heads(distance))}
+    step = distance.lines["a, 1 frame"].steps[0]
+    assert rows[1][-1].startswith(f"× {limits[2].a90_mm / limits[0].a90_mm:.2f} ({step.interval.low:.2f} to")
+    assert rows[1][-1].endswith(" *") == step.beyond_chance
+    figure = axis_figure(distance, "axis-1")
+    assert f"a, 1 frame: 0.5 m: {limits[0].a90_mm:.2f} mm, 1 m: {limits[2].a90_mm:.2f} mm" in figure
+
+
+def test_no_axis_without_two_values(two: list[SetUpLimit]) -> None:
+    assert axis_groups(axis_lines(two[:1])) == []
+    (frames,) = axis_groups(axis_lines(two))
+    assert list(frames.lines) == [""]
+    assert axis_heads(frames)[0] == "frames"
+
+
+def test_of_many_set_ups_those_from_the_smallest_limit_to_the_largest_are_shown(two: list[SetUpLimit]) -> None:
+    sizes = np.random.default_rng(2).permutation(np.arange(1.0, 21.0))
+    many = [replace(two[0], a90_95=replace(two[0].a90_95, value=float(size))) for size in sizes]
+    shown = [one.limit.a90_95.value for one in with_room(result_of(many).set_ups)]
+    assert len(shown) == MOST_PANELS
+    assert sorted(shown) == [1.0, 5.0, 9.0, 12.0, 16.0, 20.0]
+    assert shown == [size for size in sizes if size in shown]
+    assert [one.limit for one in with_room(result_of(two).set_ups)] == two
+
+
+def test_curves_without_a_curve_are_drawn(nothing_found: SetUpLimit, everything_found: SetUpLimit) -> None:
+    figure = curves_figure([nothing_found, everything_found])
+    assert "a90/95 is not demonstrated" in figure
+    assert "nan" not in re.sub(r"<!--.*?-->", "", figure, flags=re.DOTALL).lower()
+
+
+def test_pixels_are_framed_along_their_edges() -> None:
+    mask = np.zeros((4, 5), bool)
+    mask[1, 2:4] = True
+    border = {tuple(sorted(edge)) for edge in framed_pixels(mask)}
+    assert border == {
+        ((1.5, 0.5), (2.5, 0.5)),
+        ((2.5, 0.5), (3.5, 0.5)),
+        ((1.5, 1.5), (2.5, 1.5)),
+        ((2.5, 1.5), (3.5, 1.5)),
+        ((1.5, 0.5), (1.5, 1.5)),
+        ((3.5, 0.5), (3.5, 1.5)),
+    }
+    assert framed_pixels(np.zeros((3, 3), bool)) == []
+    assert len(framed_pixels(np.ones((3, 4), bool))) == 14
+
+
+def example(**changed: object) -> StudyExample:
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    rng = np.random.default_rng(3)
+    kept = StudyExample(
+        variant="main",
+        frames=1,
+        board=4,
+        hole="3",
+        where="at",
+        diameter_mm=6.2,
+        depth_mm=19.0,
+        pod=0.71,
+        hit=True,
+        score=6.123,
+        threshold=4.5,
+        residual_mm=rng.normal(0.0, 0.5, (21, 21)),
+        detected=np.hypot(*(np.indices((21, 21)) - 10)) < 3,
+        outline_px=10 + 2.2 * np.column_stack([np.cos(angle), np.sin(angle)]),
+        pitch_mm=1.4,
+    )
+    return replace(kept, **changed)  # type: ignore[arg-type]
+
+
+def test_examples_say_what_came_of_them() -> None:
+    missed = example(where="below", hit=False, score=np.nan, residual_mm=np.full((21, 21), np.nan))
+    figure = examples_figure("examples-1", [missed, example()], "1 frame")
+    assert "6.2 mm, below the limit, missed: no pixel was judged" in figure
+    assert "6.2 mm, at the limit, hit: score 6.12, threshold 4.5" in figure
+    assert "stroke: #ff00ff" in figure
+    assert "stroke: #ff00ff" not in examples_figure("e", [example(detected=np.zeros((21, 21), bool))], "1 frame")

@@ -1,0 +1,256 @@
+"""The page of a study: complete, self-contained, honest about what is not demonstrated, and the same every time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_study import SetUp, Study, Tables, study_record, study_tables
+from test_study_limits_text import example
+
+from harness.evaluation.study.record import StudyRecord, Unflawed
+from harness.evaluation.study.result import StudyResult, evaluate_study
+from harness.report.study_page import study_html, write_study_report
+from harness.report.study_rows import limit_sentence, unbroken
+from harness.vocabulary.errors import UserError
+from scenes.target.thesis import DIAMETERS_IN
+
+PROVENANCE = {
+    "command": "python -m harness.sweep experiments/x.yaml",
+    "commit": "0" * 40,
+    "dirty": False,
+    "seed": 3,
+    "seconds": {"render": 12.0, "trials": 30.0},
+    "failures": ["board 3 <&> fell over"],
+}
+YAML = "name: limits # <few> & many\n"
+SECTIONS = [
+    "Detection limits",
+    "Probability of detection",
+    "Limits against what was varied",
+    "Diameter and depth",
+    "False calls and chance hits",
+    "Signal against size",
+    "Operating curves",
+    "Examples",
+    "The thesis' holes",
+    "Limits of validity",
+    "Failures",
+    "Cost",
+    "Provenance",
+]
+
+
+def judged(study: Study, **changed: object) -> StudyResult:
+    record, tables = study_record(study), study_tables(study)
+    record = replace(record, **changed)  # type: ignore[arg-type]
+    return evaluate_study(record, tables, {}, diameters_mm=[25.4 * size for size in DIAMETERS_IN], draws=60)
+
+
+def small(*set_ups: SetUp, **changed: object) -> Study:
+    return replace(Study(set_ups=set_ups, boards=12, hole_free_boards=10, holes=6), **changed)  # type: ignore[arg-type]
+
+
+def html(result: StudyResult, examples: tuple[object, ...] = (), title: str = "A study") -> str:
+    return study_html(result, examples, PROVENANCE, YAML, title)  # type: ignore[arg-type]
+
+
+def headings(page: str) -> list[str]:
+    return re.findall(r"<h2>(.*?)</h2>", page)
+
+
+def words(page: str) -> str:
+    """The page's text alone."""
+    return re.sub(r"\s+", " ", re.sub(r"<(svg|style).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL))
+
+
+def section(page: str, heading: str) -> str:
+    """The text of one section."""
+    return words(page.split(f"<h2>{heading}</h2>")[1].split("<h2>")[0])
+
+
+@pytest.fixture(scope="module")
+def whole() -> StudyResult:
+    set_ups = [
+        SetUp(variant=f"depth <{name}>", frames=n, axes={"source.target.distance_m": at}, a50_mm=a, mm_per_depth_mm=0.3)
+        for name, at, a in (("near", 0.5, 5.0), ("far", 1.0, 7.0))
+        for n in (1, 50)
+    ]
+    return judged(small(*set_ups, depths_mm=(2.0, 10.0)))
+
+
+@pytest.fixture(scope="module")
+def page(whole: StudyResult) -> str:
+    examples = tuple(
+        example(variant="depth <near>", frames=n, where=where) for n in (1, 50) for where in ("below", "at", "above")
+    )
+    return html(whole, examples, "Limits of <cameras>")
+
+
+class Structure(HTMLParser):
+    """Ids, references and pictures of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.labels: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        self.tags.add(tag)
+        self.ids += [named["id"] or ""] if "id" in named else []
+        self.links += [value or "" for name, value in attrs if name in ("href", "src", "xlink:href")]
+        self.labels += [named.get("aria-label") or ""] if tag == "svg" else []
+
+
+@pytest.fixture(scope="module")
+def structure(page: str) -> Structure:
+    seen = Structure()
+    seen.feed(page)
+    return seen
+
+
+def test_every_section_is_there(page: str) -> None:
+    assert headings(page) == SECTIONS
+    for name in ("curves", "axis-1", "axis-2", "surface", "calls", "signals", "operating", "examples-1", "examples-2"):
+        assert f'<figure id="{name}"' in page
+    assert "No data for this figure" not in page
+
+
+def test_nothing_comes_from_outside_and_no_script_runs(structure: Structure) -> None:
+    assert "script" not in structure.tags
+    assert [link for link in structure.links if not link.startswith(("#", "data:image/png;base64,"))] == []
+    assert len(structure.ids) == len(set(structure.ids))
+    assert {link[1:] for link in structure.links if link.startswith("#")} <= set(structure.ids)
+
+
+def test_every_figure_has_words_for_those_who_cannot_see(structure: Structure, whole: StudyResult) -> None:
+    assert len(structure.labels) == 9
+    assert all(len(label) > 40 for label in structure.labels)
+    assert not [label for label in structure.labels if "nan" in label.split()]
+
+
+def test_the_users_words_are_escaped(page: str) -> None:
+    assert "<h1>Limits of &lt;cameras&gt;</h1>" in page
+    assert "depth &lt;near&gt;, 1\u00a0frame" in page
+    assert "board 3 &lt;&amp;&gt; fell over" in page
+    assert "&lt;few&gt; &amp; many" in page
+    assert "<near>" not in page
+    assert "<few>" not in page
+
+
+def test_no_number_is_written_as_python_would(page: str) -> None:
+    text = words(page)
+    assert not re.search(r"\b(nan|inf|None|True)\b", text)
+    assert not re.search(r"\d\.\d{6,}", text.split("Provenance")[0])
+
+
+def test_the_limits_stand_in_their_table(whole: StudyResult, page: str) -> None:
+    rows = section(page, "Detection limits")
+    for limit in whole.limits:
+        assert f"{limit.a90_95.value:.2f}" in rows
+        assert f"{limit.hits} of {limit.inspections}" in rows
+    best = min(whole.limits, key=lambda limit: limit.a90_95.value)
+    answer = re.search(r'class="answer">(.*?)</p>', page)
+    assert answer is not None
+    assert f"the smallest limit (a90/95) is {best.a90_95.value:.2f}\u00a0mm" in answer[1]
+    assert "within 15 mm of its own" in words(page)
+
+
+def test_false_calls_stand_beside_the_wanted_rate(page: str) -> None:
+    text = section(page, "False calls and chance hits")
+    assert "Calibrated to 1 false call per m² on hole-free boards of their own" in text
+    assert "shuffled positions" in text
+
+
+def test_the_drills_of_the_thesis_have_their_chances(whole: StudyResult, page: str) -> None:
+    text = section(page, "The thesis' holes")
+    assert len(re.findall(r"\b(?:1/16|1/8|3/16|1/4|5/16|3/8|7/16|1/2|5/8|3/4|1) in\b", text)) == 11
+    row = whole.set_ups[0].sizes[4]
+    assert row.diameter_mm == pytest.approx(7.9375)
+    assert f"{100 * row.pod:.0f} % (" in text
+    # 5/8, 3/4 and 1 inch lie beyond the 14 mm inspected, for each of four set-ups.
+    assert text.count("% of 0 near") == 0
+    assert len(re.findall(r"\) outside", text)) == 3 * 4
+
+
+def test_validity_is_the_results_own(whole: StudyResult, page: str) -> None:
+    text = section(page, "Limits of validity")
+    for heading, sentences in whole.validity:
+        assert heading in text
+        assert len(sentences) > 0
+    assert "@media print" in page
+    assert '<section class="sheet">' in page
+
+
+def test_where_nothing_is_found_the_page_says_so() -> None:
+    page = html(judged(small(SetUp(a50_mm=60.0))))
+    assert headings(page) == [name for name in SECTIONS if name != "Limits against what was varied"]
+    assert "a90/95 is not demonstrated (every target was missed" in words(page)
+    assert "no curve" in section(page, "The thesis' holes")
+    assert "No surface: every damage fared alike" in section(page, "Diameter and depth")
+    assert "No example was kept." in page
+    assert "nan" not in words(page).split()
+
+
+def test_where_everything_is_found_the_bound_needs_no_curve() -> None:
+    result = judged(small(SetUp(a50_mm=-60.0)))
+    page = html(result)
+    assert result.limits[0].a90_95.demonstrated
+    assert unbroken(limit_sentence(result.limits[0])) in page
+    assert "all found: binomial on the 29 smallest" in section(page, "Detection limits")
+
+
+@pytest.fixture(scope="module")
+def single() -> StudyResult:
+    return judged(small(SetUp()))
+
+
+@pytest.fixture(scope="module")
+def single_page(single: StudyResult) -> str:
+    return html(single)
+
+
+def test_one_set_up_has_no_axis_and_one_depth_no_surface(single_page: str) -> None:
+    page = single_page
+    assert 'id="axis-1"' not in page
+    assert 'id="surface"' not in page
+    assert "No surface: depth does not vary" in section(page, "Diameter and depth")
+    # Of a single set-up the ROC is drawn by classes of size.
+    assert "a90 and above" in section(page, "Operating curves")
+
+
+def test_given_thresholds_and_no_hole_free_boards() -> None:
+    study = small(SetUp())
+    record: StudyRecord = study_record(study)
+    nothing = Unflawed(*(np.zeros(0, kind) for kind in (int, int, int, float)))
+    one = replace(record.set_ups[0], unflawed=nothing, calibration_runs=0)
+    record = replace(record, false_calls_per_m2=None, set_ups=(one,))
+    tables: Tables = study_tables(study)
+    damaged = {name: getattr(tables, name) for name in ("runs", "findings", "operating")}
+    tables = replace(tables, sites=tables.sites.iloc[:0], **{n: t[t["role"] == "damaged"] for n, t in damaged.items()})
+    page = html(evaluate_study(record, tables, {}, draws=40))
+    text = section(page, "False calls and chance hits")
+    assert "No hole-free board was inspected" in text
+    assert "none: given" in text
+    assert "Thresholds were given, not calibrated" in text
+    assert "No sizes were asked for." in page
+
+
+def test_the_same_input_gives_the_same_file(tmp_path: Path, single: StudyResult, single_page: str) -> None:
+    path = write_study_report(tmp_path, single, (), PROVENANCE, YAML, "A study")
+    assert path == tmp_path / "report.html"
+    assert path.read_text() == single_page
+
+
+def test_a_folder_that_is_none_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, single: StudyResult) -> None:
+    monkeypatch.setattr("harness.report.study_page.study_html", lambda *_: "<html></html>")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError):
+        write_study_report(tmp_path / "file", single, (), PROVENANCE, YAML, "A study")

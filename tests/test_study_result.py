@@ -1,0 +1,184 @@
+"""A whole study judged, and the sentences on the limits of its validity."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_study import THRESHOLD, SetUp, Study, Tables, study_record, study_tables
+
+from harness.evaluation.study.held import held_sentences, number, swept_sentences, varied_sentences
+from harness.evaluation.study.record import read_record, record_text
+from harness.evaluation.study.result import StudyResult, evaluate_study
+from harness.evaluation.study.validity import validity_of
+
+DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
+FACTS: dict[str, Any] = {
+    "source": {
+        "kind": "simulated",
+        "target": {
+            "name": "drawn",
+            "seed": 1,
+            "damage": {"kind": "blind", "per_board": 8, "diameter_mm": [1, 14], "depth_mm": [2, 9], "sizes": "uniform"},
+            "board": {"width_mm": 304.8, "shape": {"kind": "flat"}},
+            "distance_m": 0.7,
+            "distance_jitter_mm": 10.0,
+            "tilt_deg": 8.0,
+            "roll_deg": 0.0,
+            "material": {"albedo_850": 0.6, "grain_contrast": 0.05},
+            "tapes": [],
+        },
+        "camera": {"name": "azure_kinect_nfov", "unit_seed": 1, "edge_gate": True},
+        "views": None,
+    },
+    "capture": {"frames": 1, "average": {"method": "mean"}},
+    "detector": {"name": "plane"},
+    "sweep": {"capture.frames": [1, 10], "source.target.distance_m": [0.5, 0.7]},
+}
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    return Study(
+        (SetUp(), SetUp(frames=10, a50_mm=4.5)), boards=16, hole_free_boards=16, depths_mm=(2.0, 9.0), repeats=2
+    )
+
+
+@pytest.fixture(scope="module")
+def result(study) -> StudyResult:
+    return evaluate_study(study_record(study), study_tables(study), FACTS, diameters_mm=DIAMETERS_MM, draws=200)
+
+
+def section(result: StudyResult, heading: str) -> str:
+    return " ".join(dict(result.validity).get(heading, ()))
+
+
+class TestStudy:
+    def test_everything_is_there(self, result):
+        assert [one.limit.record.frames for one in result.set_ups] == [1, 10]
+        for one in result.set_ups:
+            assert one.limit.statement is not None and one.surface is not None and one.chance.laid > 0
+            assert len(one.roc) == 4 and one.free_response is not None and one.pixels is not None
+            assert [row.diameter_mm for row in one.sizes] == list(DIAMETERS_MM)
+            assert one.limit.signals.signal.left == one.noise_floor < THRESHOLD
+        assert [line.axis for line in result.axes] == ["capture.frames"]
+        assert result.axes[0].whole.beyond_chance and result.axes[0].whole.ratio < 1
+
+    def test_record_and_tables_tell_the_same(self, study, result):
+        tables = study_tables(study)
+        for one in result.set_ups:
+            frames = one.limit.record.frames
+            holes = tables.holes[tables.holes["frames"] == frames]
+            assert one.limit.hits == holes["detected"].sum()
+            assert one.free_response.at[1] == pytest.approx(one.limit.rate)
+            runs = tables.runs[(tables.runs["frames"] == frames) & (tables.runs["role"] == "hole_free")]
+            assert one.limit.false_calls.calls == runs["false_calls"].sum()
+
+    def test_a_record_from_its_file_gives_the_same_limits(self, study, result, tmp_path):
+        file = tmp_path / "study.json"
+        file.write_text(record_text(study_record(study)))
+        again = evaluate_study(read_record(file), study_tables(study), FACTS, diameters_mm=DIAMETERS_MM, draws=200)
+        for one, other in zip(result.limits, again.limits, strict=True):
+            assert one.a90_95 == other.a90_95 and np.array_equal(one.a90_draws_mm, other.a90_draws_mm)
+        assert again.validity == result.validity
+
+    def test_nothing_but_the_record_is_enough_for_limits(self, study):
+        record, none = study_record(study), pd.DataFrame()
+        bare = evaluate_study(record, Tables(none, none, none, none, none, none), {})
+        assert [one.limit.a90_95.demonstrated for one in bare.set_ups] == [True, True]
+        first = bare.set_ups[0]
+        assert (first.chance, first.free_response, first.pixels, first.roc) == (None, None, None, ())
+        assert "What was held" not in dict(bare.validity) and "Hits by chance" not in dict(bare.validity)
+
+    def test_a_detector_that_finds_nothing_is_judged_too(self, study):
+        blind = dataclasses.replace(study, set_ups=(SetUp(a50_mm=200.0),))
+        result = evaluate_study(study_record(blind), study_tables(blind), FACTS, draws=50)
+        assert not result.limits[0].a90_95.demonstrated and result.set_ups[0].surface is None
+        assert "not demonstrated" in section(result, "The model and what it stands on")
+
+
+class TestValidity:
+    def test_varied_and_held(self, result):
+        varied = section(result, "What was varied")
+        assert "128 damages on 16 boards, 1 to 14 mm in diameter" in varied
+        assert "each inspected 2 times with new noise" in varied
+        assert "diameter from 1 to 14 mm and depth from 2 to 9 mm" in varied
+        assert "distance by ±10 mm" in varied and "tilt by ±8°" in varied and "roll" not in varied
+        assert "capture.frames: 1, 10." in varied
+        held = section(result, "What was held")
+        assert "board.width_mm 304.8" in held and "edge_gate on" in held and "name plane" in held
+        assert "distance_m" not in held and "diameter_mm" not in held and "frames" not in held and "tapes" not in held
+        assert "Averaging: frames 1," in " ".join(held_sentences({**FACTS, "sweep": {}}))
+
+    def test_hit_rule_and_false_calls(self, result):
+        assert "within 15 mm" in section(result, "What counts as a hit")
+        calls = section(result, "Threshold and false calls")
+        rate = result.limits[0].false_calls
+        assert f"{rate.calls} calls on 8 m²" in calls and "set for 1 false calls per m² on 60 hole-free runs" in calls
+        assert "the rate wanted lies inside" in calls
+
+    def test_a_rate_that_was_missed_is_said(self, study):
+        loud = dataclasses.replace(study, set_ups=(SetUp(false_calls_per_m2=6.0),))
+        result = evaluate_study(study_record(loud), study_tables(loud), FACTS, draws=50)
+        assert "the rate wanted lies outside" in section(result, "Threshold and false calls")
+
+    def test_departures_are_those_of_this_study(self, result):
+        said = section(result, "Departures from MIL-HDBK-1823A")
+        for words in (
+            "simulated",
+            "Targets share boards, 8 to a board",
+            "more than once",
+            "Unflawed places",
+            "deviance",
+        ):
+            assert words in said
+        assert "fewer than 60" not in said and "beyond the largest" not in said and "failed" not in said
+
+    def test_a_small_study_with_one_damage_a_board_departs_otherwise(self):
+        study = Study((SetUp(a50_mm=12.0),), boards=40, hole_free_boards=120, holes=1)
+        record = study_record(study)
+        failed = dataclasses.replace(record, set_ups=(dataclasses.replace(record.set_ups[0], failed=3),))
+        said = section(evaluate_study(failed, study_tables(study), {}, draws=50), "Departures from MIL-HDBK-1823A")
+        assert "fewer than 60 targets (40)" in said and "3 trials failed" in said and "largest size" in said
+        assert "share boards" not in said and "simulated" not in said and "more than once" not in said
+
+    def test_all_found_names_its_rule(self, study):
+        sighted = dataclasses.replace(study, set_ups=(SetUp(a50_mm=-9.0),))
+        result = evaluate_study(study_record(sighted), study_tables(sighted), FACTS, draws=50)
+        assert "29th smallest size" in section(result, "Departures from MIL-HDBK-1823A")
+
+    def test_kinds_are_named_unless_they_were_swept(self, result):
+        missing = "What is not in it"
+        assert "all are holes with a flat bottom" in section(result, missing)
+        assert "one unit" in section(result, missing)
+        swept = {**FACTS, "sweep": {"source.target.damage.kind": ["blind", "dent"], "source.camera.unit_seed": [1, 2]}}
+        other = dict(validity_of(result.record, result.limits, [one.chance for one in result.set_ups], swept))[missing]
+        assert not any("all are" in sentence or "one unit" in sentence for sentence in other)
+
+    def test_what_was_swept_is_not_called_drawn_or_held(self):
+        facts = {
+            **FACTS,
+            "sweep": {"source.target.damage.depth_mm": [[2, 3], [8, 9]], "source.target.tilt_deg": [0, 8]},
+        }
+        varied = " ".join(varied_sentences(facts))
+        assert "diameter from" in varied and "depth from" not in varied and "tilt" not in varied
+        assert swept_sentences(facts) == (
+            "source.target.damage.depth_mm: [2, 3], [8, 9].",
+            "source.target.tilt_deg: 0, 8.",
+        )
+        whole = {**FACTS, "sweep": {"source.camera": [{"name": "a"}, {"name": "b"}]}}
+        assert not any(sentence.startswith("Camera") for sentence in held_sentences(whole))
+
+    def test_no_sentence_without_its_fact(self):
+        assert varied_sentences({}) == swept_sentences({}) == held_sentences({}) == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (1.0, "1"), (7.5279, "7.53"), (1234.5, "1234"), (0.00021, "0.00021"), (12345.6, "1.23e+04")],
+)
+def test_number(value, text):
+    assert number(value) == text
