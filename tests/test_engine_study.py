@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,15 +16,21 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from detectors.interface import Detection
+from harness.engine import workers
 from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
+from harness.engine.journal import Journal
 from harness.engine.judge import Judgement
 from harness.engine.plan import plan_of
-from harness.engine.run import threshold_of
+from harness.engine.run import run_plan, threshold_of
 from harness.engine.setup import met_on_face
 from harness.engine.sight import Sight
-from harness.evaluation.study.record import read_record
+from harness.engine.study_record import record_of
+from harness.engine.tables import Tables, tables_of
+from harness.evaluation.study.record import StudyRecord, read_record
+from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import load_experiment
 from harness.experiment.points import Point
 from harness.vocabulary.capture import Cloud
@@ -294,26 +302,102 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     assert runs[runs.role != "calibration"].groupby("frames").threshold.nunique().eq(1).all()
 
 
-def test_one_process_and_a_resumed_study_give_the_same_record(finished):
-    first = (results(finished) / "study.json").read_text()
-    again = finished.parent / "again"
-    shutil.copytree(finished / ".cache", again / ".cache")
-    assert sweep(again, "--jobs", "1").returncode == 0
-    half = finished.parent / "half"
-    shutil.copytree(finished, half)
-    journal = sorted((results(half) / "journal").glob("*.json"))
-    assert len(journal) == 12
-    for path in journal[::3]:
+class Here:
+    """A pool without processes: work is done as it is submitted."""
+
+    def submit(self, work: Callable[..., object], *arguments: object) -> Future[object]:
+        future: Future[object] = Future()
+        future.set_result(work(*arguments))
+        return future
+
+
+@contextmanager
+def here(_count: int) -> Iterator[Here]:
+    yield Here()
+
+
+def judged(home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str) -> tuple[StudyRecord, Tables]:
+    """A study run serially in this process, on the renders that are there, its journal in ``folder``."""
+    monkeypatch.setattr(workers, "pool", here)
+    experiment = load_experiment(home / "tiny.yaml", changes)
+    plan = plan_of(experiment, home / "out" / ".cache" / "renders")
+    outcome = run_plan(plan, Journal(folder), 1, lambda _: None)
+    assert outcome.failures == []
+    tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
+    provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
+    return record_of(experiment, plan, tables, {}, provenance), tables
+
+
+def set_ups_of(record: StudyRecord) -> object:
+    return record.to_data()["set_ups"]
+
+
+def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, monkeypatch):
+    parallel = set_ups_of(read_record(results(finished)))
+    serial, _ = judged(finished.parent, tmp_path / "serial", monkeypatch)
+    assert set_ups_of(serial) == parallel
+    journal = tmp_path / "half"
+    shutil.copytree(results(finished) / "journal", journal)
+    kept = sorted(journal.glob("*.json"))
+    assert len(kept) == 12
+    for path in kept[::3]:
         path.unlink()
-    assert sweep(half).returncode == 0
-    for folder in (again, half):
-        assert without_command((results(folder) / "study.json").read_text()) == without_command(first)
+    resumed, _ = judged(finished.parent, journal, monkeypatch)
+    assert set_ups_of(resumed) == parallel
 
 
-def without_command(text: str) -> object:
-    data = json.loads(text)
-    del data["provenance"]["command"]
-    return data
+# ---- two detectors that test the harness -----------------------------------------------------------------------------
+
+ONE_FRAME = ("sweep={}", "capture.frames=1")
+
+
+def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
+    """Handed the truth it finds every damage once and nothing else: whatever is less is a fault of the harness."""
+    oracle = "detector={name: oracle, settings: {}}"
+    record, tables = judged(finished.parent, tmp_path, monkeypatch, *ONE_FRAME, oracle)
+    result = evaluate_study(record, tables, {})
+    (one,) = result.set_ups
+    smallest = record.set_ups[0].inspected.diameter_mm.min()
+    assert record.set_ups[0].inspected.hit.all()
+    assert (record.set_ups[0].inspected.signal == 1).all()
+    assert (one.limit.a50_mm, one.limit.a90_mm, one.limit.rate) == (smallest, smallest, 1.0)
+    assert record.set_ups[0].unflawed.calls.sum() == 0
+    assert tables.findings["score"].eq(1).all()
+    assert len(tables.findings) == len(tables.holes)
+    assert one.roc[0].area == 1.0
+    assert one.pixels is not None
+    assert one.pixels.pro == 1.0
+
+
+def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeypatch):
+    """Its false calls per area are those of its own law at the threshold, its hits those of places laid anywhere: a
+    damage is hit where one guess or more falls within the radius, 1 - exp(-rate pi r^2), and no limit is shown.
+
+    Two-sided tests at 0.1 % each; the seed is fixed.
+    """
+    blind = "detector={name: blind, settings: {guesses_per_m2: 400, crop: {kind: auto, inset_px: 4}}}"
+    wanted = "threshold.calibrate={boards: 5, false_calls_per_m2: 60.0}"
+    record, tables = judged(finished.parent, tmp_path, monkeypatch, *ONE_FRAME, blind, wanted, "repeats=12")
+    (of_one,) = record.set_ups
+    rate_per_m2 = 400 * np.exp(-of_one.threshold)
+    calls, area_m2 = int(of_one.unflawed.calls.sum()), float(of_one.unflawed.area_m2.sum())
+    assert poisson_p(calls, rate_per_m2 * area_m2) > 1e-3
+    by_chance = 1 - np.exp(-rate_per_m2 * np.pi * 0.015**2)
+    hits = of_one.inspected.hit
+    assert len(hits) == 4 * 5 * 12
+    # a guess counts for one damage only, but damages stand farther apart than two radii
+    assert stats.binomtest(int(hits.sum()), len(hits), by_chance).pvalue > 1e-3
+    sites = tables.sites["detected"]
+    assert stats.binomtest(int(sites.sum()), len(sites), by_chance).pvalue > 1e-3
+    (one,) = evaluate_study(record, tables, {}).set_ups
+    assert not one.limit.a90_95.demonstrated
+    assert one.chance is not None
+    assert one.chance.probability == pytest.approx(by_chance, rel=0.25)
+
+
+def poisson_p(count: int, mean: float) -> float:
+    """Two-sided p-value of a Poisson count: twice the smaller tail."""
+    return float(2 * min(stats.poisson.cdf(count, mean), stats.poisson.sf(count - 1, mean)))
 
 
 def test_another_seed_of_the_noise_keeps_the_boards(finished, tmp_path):

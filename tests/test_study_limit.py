@@ -93,6 +93,14 @@ class TestWithoutACurve:
         assert "all found" in limit.a90_95.method and not limit.over_boards.demonstrated
         assert limit.a90_mm == limit.a50_mm == small.inspected.diameter_mm.min()
         assert np.all(limit.a90_draws_mm == small.inspected.diameter_mm.min())
+        assert limit.is_at_most and not limit_of(small).is_at_most
+
+    def test_boards_that_all_fared_alike_give_no_interval(self, small):
+        """Boards drawn again from them fare so too: an interval without width would say that all is known."""
+        for found in (True, False):
+            limit = limit_of(with_hits(small, np.full(120, found)))
+            for interval in (limit.a50_interval_mm, limit.a90_interval_mm, limit.rate_interval):
+                assert not interval.known
 
     def test_28_found_of_28_demonstrate_nothing(self, small):
         record = first_rows(small, 28)
@@ -140,6 +148,12 @@ class TestFalseCalls:
     def test_none_without_hole_free_boards(self):
         limit = limit_of(set_up(Study(boards=8, hole_free_boards=0)))
         assert limit.false_calls is None and not limit.false_calls_interval_per_m2.known
+
+    def test_no_call_gives_no_interval_over_boards_but_poisson_s(self, small):
+        silent = dataclasses.replace(small, unflawed=dataclasses.replace(small.unflawed, calls=np.zeros(12, int)))
+        limit = limit_of(silent)
+        assert not limit.false_calls_interval_per_m2.known
+        assert limit.false_calls.interval_per_m2.high == pytest.approx(-np.log(0.025) / 3.0)
 
     def test_calls_that_come_in_clusters_widen_the_interval_over_boards(self, small):
         calls = np.zeros(12, int)

@@ -85,6 +85,8 @@ def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> N
 
 def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLimit) -> None:
     row = limit_rows([everything_found])[0]
+    # the smallest of 160 sizes from 1 to 14 mm: an upper limit of both estimates, and none of them has an interval
+    assert row.a50 == row.a90 == "≤\u00a01.00"
     assert row.a90_95 == f"{everything_found.a90_95.value:.2f}"
     assert row.why.startswith("all found: binomial")
     assert row.found == "160 of 160"

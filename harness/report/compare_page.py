@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
+from harness.evaluation.intervals import UNKNOWN
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.verdict import ComparedSetUps, Comparison
 from harness.report.compare_figure import compare_svg
 from harness.report.compare_rows import HEADS, LEFT, RULE, TESTS, answer, cells, remarks
 from harness.report.page_parts import mm, template
+from harness.report.study_rows import estimate_text
 
 CLASSES: Mapping[str, str] = {"worse": "no", "newly failing": "no", "better": "yes", "newly working": "yes"}
 
@@ -47,10 +47,9 @@ def _sizes(row: ComparedSetUps) -> tuple[str, ...]:
         if limit is None:
             texts += ["–", "–", "–", "–"]
             continue
-        low, high = limit.a90_interval_mm.low, limit.a90_interval_mm.high
         texts += [
-            mm(limit.a50_mm),
-            f"{mm(limit.a90_mm)} ({mm(low)}–{mm(high)})" if np.isfinite(limit.a90_mm) else "–",
+            estimate_text(limit, limit.a50_mm, UNKNOWN),
+            estimate_text(limit, limit.a90_mm, limit.a90_interval_mm),
             mm(limit.a90_95.value) if limit.a90_95.demonstrated else "not demonstrated",
             f"{limit.hits}/{limit.inspections}",
         ]

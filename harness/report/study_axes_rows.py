@@ -14,7 +14,15 @@ from harness.evaluation.study.surface import PodSurface
 from harness.evaluation.study.table_one import SizeRow
 from harness.report.measures import inches
 from harness.report.study_axes_figure import AxisGroup, axis_value
-from harness.report.study_rows import bound_text, interval_text, mm_text, name_of, percent_text, with_interval
+from harness.report.study_rows import (
+    bound_text,
+    estimate_text,
+    interval_text,
+    mm_text,
+    name_of,
+    percent_text,
+    with_interval,
+)
 
 SURFACE_HEADS = (
     "set-up",
@@ -117,8 +125,8 @@ def _line_rows(group: AxisGroup, label: str, line: AxisLine) -> Iterator[tuple[s
         yield (
             *first,
             axis_value(group.path, value),
-            with_interval(limit.a50_mm, limit.a50_interval_mm),
-            with_interval(limit.a90_mm, limit.a90_interval_mm),
+            estimate_text(limit, limit.a50_mm, limit.a50_interval_mm),
+            estimate_text(limit, limit.a90_mm, limit.a90_interval_mm),
             bound_text(limit.a90_95),
             "" if step is None else _step(step),
         )

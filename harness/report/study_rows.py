@@ -113,6 +113,11 @@ def with_interval(value: float, interval: Interval, digits: int = 2) -> str:
     return f"{text} ({interval_text(interval, digits)})" if interval.known and not np.isnan(value) else text
 
 
+def estimate_text(limit: SetUpLimit, size_mm: float, interval: Interval) -> str:
+    """a50 or a90 with its interval; ``≤ 2.05`` where everything was found, so that neither is known to be larger."""
+    return f"≤\u00a0{mm_text(size_mm)}" if limit.is_at_most else with_interval(size_mm, interval)
+
+
 def rate_text(calls: FalseCallRate | None) -> str:
     """False calls per square metre with their exact Poisson interval."""
     return "none inspected" if calls is None else with_interval(calls.rate_per_m2, calls.interval_per_m2)
@@ -121,8 +126,8 @@ def rate_text(calls: FalseCallRate | None) -> str:
 def _row(limit: SetUpLimit) -> LimitRow:
     return LimitRow(
         name=limit.record.label,
-        a50=with_interval(limit.a50_mm, limit.a50_interval_mm),
-        a90=with_interval(limit.a90_mm, limit.a90_interval_mm),
+        a50=estimate_text(limit, limit.a50_mm, limit.a50_interval_mm),
+        a90=estimate_text(limit, limit.a90_mm, limit.a90_interval_mm),
         a90_95=bound_text(limit.a90_95),
         over_boards=bound_text(limit.over_boards),
         false_calls=rate_text(limit.false_calls),

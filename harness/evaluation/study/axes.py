@@ -82,7 +82,7 @@ def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
 
 def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
     """How a90 changes from one set-up to another."""
-    paired = frm.record.targets_digest == to.record.targets_digest or _same_boards(frm, to)
+    paired = _same_boards(frm, to)
     before, after = frm.a90_draws_mm, to.a90_draws_mm
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = after / before if paired else np.divide.outer(after, before).ravel()
@@ -90,12 +90,10 @@ def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
 
 
 def _same_boards(frm: SetUpLimit, to: SetUpLimit) -> bool:
-    """Boards of one family keep number, places and sizes where something else is changed, such as depth or albedo."""
+    """Boards of one family keep number, places and sizes where something else is changed, such as depth or albedo.
+    Those whose trials failed in one of the two are missing there, and draws of different boards are no pairs."""
     a, b = frm.record.inspected, to.record.inspected
-    return all(
-        len(getattr(a, name)) == len(getattr(b, name)) and bool(np.all(getattr(a, name) == getattr(b, name)))
-        for name in ("board", "hole", "x_mm", "y_mm")
-    )
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("board", "hole", "x_mm", "y_mm"))
 
 
 def _ascending(members: list[tuple[Any, SetUpLimit]]) -> list[tuple[Any, SetUpLimit]]:

@@ -66,7 +66,7 @@ class PixelCurves:
     """``false`` (k,): share of undamaged pixels above each threshold, ascending from 0; ``overlap`` (k,): mean over
     damages of the share of their pixels above; ``true`` (k,): share of all damaged pixels. ``pro`` is the area under
     ``overlap`` up to `PRO_LIMIT`, divided by it; ``auroc`` that under ``true``. NaN, and ``why``, where the thresholds
-    counted do not reach so far."""
+    counted do not reach so far, unless no pixel of damage is left to be gained beyond them."""
 
     false: np.ndarray
     overlap: np.ndarray
@@ -148,7 +148,7 @@ def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None
     false, overlap, true = _rates(face, damage, np.ones((1, len(face.board))), np.ones((1, len(damage.board))))
     why = (
         ""
-        if false[0, -2] >= PRO_LIMIT
+        if false[0, -2] >= PRO_LIMIT or overlap[0, -2] == 1
         else f"the thresholds counted end at a false-positive rate of {false[0, -2]:.3g}"
     )
     weights = board_weights(len(damage.board), draws)

@@ -50,8 +50,10 @@ class SetUpLimit:
     ``*_draws_mm`` (B,): the same of boards drawn again, in the same order for all set-ups of as many boards (infinite
     where a draw has none); ``*_interval_mm``: their 95 % percentiles. ``over_boards``: a90/95 were damages of one
     board as alike as the data say, never below ``a90_95``.
-    Where everything is found both estimates are the smallest size inspected, which they do not exceed; where nothing is
-    found, or the chance of detection does not grow with size, they are NaN and their draws infinite.
+    Where everything is found both estimates are the smallest size inspected, which they do not exceed
+    (``is_at_most``); where nothing is found, or the chance of detection does not grow with size, they are NaN and their
+    draws infinite. Boards drawn again from boards that all fared alike do so too, which is no certainty: intervals are
+    then unknown.
     ``design_effect``: variance of a90 with boards as units over that with damages as units. ``rate`` = ``hits`` /
     ``inspections`` with an interval over boards. ``false_calls`` on hole-free boards (None: none inspected) as a
     Poisson count, ``false_calls_interval_per_m2`` over boards. ``signals``: a second opinion, the signal's regression
@@ -80,6 +82,11 @@ class SetUpLimit:
     false_calls_interval_per_m2: Interval
     signals: PodStatement | None
     signals_why: str
+
+    @property
+    def is_at_most(self) -> bool:
+        """Whether ``a50_mm`` and ``a90_mm`` are sizes that both do not exceed, everything having been found."""
+        return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     @property
     def over_boards_mm(self) -> float:
@@ -119,8 +126,8 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np
         a90_mm=a90,
         a50_draws_mm=of_a50,
         a90_draws_mm=of_a90,
-        a50_interval_mm=percentiles(of_a50),
-        a90_interval_mm=percentiles(of_a90),
+        a50_interval_mm=UNKNOWN if statement is None else percentiles(of_a50),
+        a90_interval_mm=UNKNOWN if statement is None else percentiles(of_a90),
         over_boards=over_boards,
         design_effect=effect,
         boards=targets.boards,
@@ -216,7 +223,7 @@ def _boards_without_curve(targets: Targets, a90_95: Bound) -> Bound:
 
 
 def _rate_interval(targets: Targets, draws: int) -> Interval:
-    if targets.boards < 2:
+    if targets.boards < 2 or targets.hits.sum() in (0.0, targets.inspections.sum()):
         return UNKNOWN
     weights = row_weights(targets.board, draws)
     return percentiles((weights @ targets.hits) / (weights @ targets.inspections))
@@ -227,7 +234,7 @@ def _false_calls(unflawed: Unflawed, draws: int) -> tuple[FalseCallRate | None, 
     if not area > 0:
         return None, UNKNOWN
     rate = false_call_rate(int(unflawed.calls.sum()), area)
-    if len(np.unique(unflawed.board)) < 2:
+    if len(np.unique(unflawed.board)) < 2 or not rate.calls:
         return rate, UNKNOWN
     weights = row_weights(unflawed.board, draws, "hole-free")
     with np.errstate(invalid="ignore", divide="ignore"):
