@@ -190,7 +190,7 @@ def test_repeats_that_all_agree_say_no_more_than_one_inspection(seed: int, metho
     assert (often.n, often.targets, often.repeats) == (1500, 30, 50.0)
     assert often.covariance == pytest.approx(once.covariance, rel=1e-6)
     assert bound(often, method=method).value == pytest.approx(bound(once, method=method).value, rel=1e-6)
-    wrong = bound(often, method=method, rows_are_targets=True)
+    wrong = bound(fit_hit_miss(np.repeat(sizes, 50), np.repeat(hits, 50)), method=method)
     assert wrong.value < bound(once, method=method).value
     assert often.covariance_of_rows == pytest.approx(once.covariance / 50.0, rel=1e-6)
     assert "1500 inspections of 30 targets count as 30" in often.notes[-1]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.pod.design import Plan
-from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, RED, STYLE, svg
+from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, RED, save_png, svg
 from harness.report.design_rows import PLACED, StudyDesign, answer, size_text
 from harness.report.pod_figure import axis_text, plain
 
@@ -37,18 +37,7 @@ def design_svg(design: StudyDesign) -> str:
 
 def save_design_png(path: Path, design: StudyDesign) -> None:
     """The figure as a PNG of 160 dots an inch at ``path``; the same bytes for the same design."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    from harness.vocabulary.files import atomic_path
-
-    style: Any = STYLE
-    with rc_context(style), atomic_path(path) as temporary:
-        figure = Figure(figsize=SIZE_IN, layout="constrained", dpi=160)
-        canvas = FigureCanvasAgg(figure)
-        _drawing(design)(figure)
-        canvas.print_png(str(temporary), metadata={"Software": None})
+    save_png(path, SIZE_IN, _drawing(design))
 
 
 def _drawing(design: StudyDesign) -> Callable[[Figure], None]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.statement import POD, PodStatement
-from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, STYLE, svg
+from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, save_png, svg
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,19 +30,8 @@ def pod_svg(statement: PodStatement) -> str:
 
 def save_pod_png(path: Path, statement: PodStatement) -> None:
     """The figure as a PNG of 160 dots an inch at ``path``; the same bytes for the same statement."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    from harness.vocabulary.files import atomic_path
-
     size_in, draw = _plan(statement)
-    style: Any = STYLE
-    with rc_context(style), atomic_path(path) as temporary:
-        figure = Figure(figsize=size_in, layout="constrained", dpi=160)
-        canvas = FigureCanvasAgg(figure)
-        draw(figure)
-        canvas.print_png(str(temporary), metadata={"Software": None})
+    save_png(path, size_in, draw)
 
 
 def answer(statement: PodStatement) -> str:

@@ -37,12 +37,10 @@ def bound(
     confidence: float = 0.95,
     method: str = "likelihood ratio",
     *,
-    rows_are_targets: bool = False,
     design_effect: float = 1.0,
 ) -> Bound:
     """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
 
-    ``rows_are_targets`` ignores that rows repeat targets: the wrong number, to be shown beside the right one.
     ``design_effect``: what targets that come in clusters multiply the variance by; so it multiplies the criterion (Rao
     and Scott, Annals of Statistics 12 (1984), 46).
     """
@@ -51,7 +49,7 @@ def bound(
         raise UserError(f"design effect {design_effect:g} is out of range", legal="above 0")
     if pod <= fit.curve.floor:
         raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
-    repeats = design_effect * (1.0 if rows_are_targets else fit.repeats)
+    repeats = design_effect * fit.repeats
     if method == "wald":
         x, why = _wald_bound(fit, pod, confidence, repeats)
     else:

@@ -10,6 +10,7 @@ from harness.evaluation.pod.hit_miss import (
     FloorCeilingTest,
     HitMissFit,
     choose_model,
+    fit_hit_miss,
     floor_ceiling_test,
 )
 from harness.evaluation.pod.inspection_file import Inspections
@@ -81,7 +82,7 @@ def _stated(
             for other in METHODS
             if other != method and (bounded == "none" or other != "wald")
         ),
-        independent=bound(fit, POD, CONFIDENCE, method, rows_are_targets=True) if fit.targets < fit.n else None,
+        independent=_taken_for_targets(read, fit, method) if fit.targets < fit.n else None,
         sizes=sizes,
         lower=lower,
         upper=upper,
@@ -89,6 +90,14 @@ def _stated(
         notes=(*fit.notes, *_notes(fit, limit, needed)),
         tests=tuple((TESTED[one.bounded], one.p_value, _reads(one)) for one in needed),
     )
+
+
+def _taken_for_targets(read: Inspections, fit: HitMissFit, method: str) -> Bound:
+    """The wrong limit, as if every inspection had a target of its own: a fit of its own, because where hits and misses
+    separate the penalty counts targets."""
+    curve = fit.curve
+    rows = fit_hit_miss(read.size, read.response, link=curve.link, log_size=curve.log_size, bounded=fit.bounded)
+    return bound(rows, POD, CONFIDENCE, method)
 
 
 def _name(fit: HitMissFit) -> str:
