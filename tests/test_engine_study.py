@@ -19,7 +19,7 @@ import pytest
 from scipy import stats
 
 from detectors.interface import Detection
-from harness.engine import workers
+from harness.engine import run, workers
 from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
 from harness.engine.journal import Journal
 from harness.engine.judge import Judgement
@@ -29,6 +29,7 @@ from harness.engine.setup import met_on_face
 from harness.engine.sight import Sight
 from harness.engine.study_record import record_of
 from harness.engine.tables import Tables, tables_of
+from harness.engine.trial import TrialTask, board_labels, run_trial
 from harness.evaluation.study.record import StudyRecord, read_record
 from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import load_experiment
@@ -81,6 +82,9 @@ def written(folder: Path, text: str = TINY) -> Path:
         ("threshold.calibrate={repeats: 5, boards: 5}", "not both"),
         ("source.target.distance_m=0.15", "a board drawn at"),
         ("matching.radius_mm=25.0", "at most 20 mm"),
+        ("sweep={matching.radius_mm: [5.0, 15.0]}", "is a rule of the study"),
+        ("sweep={threshold.calibrate.false_calls_per_m2: [4.0, 5.0]}", "is a rule of the study"),
+        ("sweep={threshold: [{k: 5.0}, {k: 6.0}]}", "is a rule of the study"),
     ],
 )
 def test_what_does_not_fit_together_is_told(tmp_path, changed, expected):
@@ -134,6 +138,41 @@ def test_a_study_s_threshold_is_set_by_the_wanted_rate():
     assert threshold_of(point_with(repeats=39), []) is None
     with pytest.raises(UserError, match="too few"):
         threshold_of(point_with(false_calls_per_m2=0.1), quiet)
+
+
+def test_each_board_has_its_own_noise_and_its_own_errors_of_nominal_poses(tmp_path):
+    (group,) = plan_of(load_experiment(written(tmp_path)), tmp_path).groups
+    labels = [
+        (task.role, task.repeat, *board_labels(task))
+        for batch in group.batches
+        for _, task in group.trials(batch, AT_5)
+    ]
+    assert len(set(labels)) == len(labels) == 12
+    assert labels[0] == ("calibration", 0, "board", 0)
+
+
+AT_5 = SimpleNamespace(get=lambda _digest, _given: 5.0)
+"""Any point's threshold."""
+
+
+def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monkeypatch):
+    """With two numbers of frames, one of which no hole-free run of ends: the other is judged all the same."""
+
+    def faulty(task: TrialTask) -> object:
+        if task.role == "calibration":
+            task = replace(task, points=tuple(point for point in task.points if point.frames == 2))
+        return run_trial(task)
+
+    monkeypatch.setattr(workers, "pool", here)
+    monkeypatch.setattr(run, "run_trial", faulty)
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    plan = plan_of(experiment, finished / ".cache" / "renders")
+    outcome = run_plan(plan, Journal(tmp_path), 1, lambda _: None)
+    (failure,) = outcome.failures
+    assert failure.what == "threshold of capture.frames=1"
+    tables = tables_of(outcome.records.values(), experiment)
+    assert set(tables.holes["frames"]) == {2}
+    assert len(tables.holes) == 4 * 5
 
 
 # ---- one board -------------------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ class TestValidity:
         assert "within 15 mm" in section(result, "What counts as a hit")
         calls = section(result, "Threshold and false calls")
         rate = result.limits[0].false_calls
-        assert f"{rate.calls} calls on 8 m²" in calls and "set for 1 false calls per m² on 60 hole-free runs" in calls
+        assert f"{rate.calls} calls on 8 m²" in calls and "set for a rate of 1 per m² on 60 hole-free runs" in calls
         assert "the rate wanted lies inside" in calls
 
     def test_a_rate_that_was_missed_is_said(self, study):

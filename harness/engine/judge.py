@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from detectors import load_detector
+from detectors import DETECTORS, load_detector
 from detectors.interface import Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
 from harness.engine.sight import Sight
 from harness.evaluation.match import match
@@ -78,9 +78,9 @@ def judge(
 
 
 def detector_for(sight: Sight, name: str, settings_json: str, *, hole_free: bool) -> Detector:
-    """The detector that is to see a cloud; one that tests the harness is handed the truth."""
+    """The detector that is to see a cloud. tofpod's own oracle is handed the truth; a plug-in never is."""
     detector = _detector(name, settings_json)
-    if not isinstance(detector, ToldTheTruth):
+    if not (isinstance(detector, ToldTheTruth) and DETECTORS.offer(name).built_in):
         return detector
     truth = (
         TrueDamage(sight.centre_in_cloud_m(damage), damage.diameter_m, sight.outlines[damage.id])

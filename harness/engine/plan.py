@@ -114,15 +114,21 @@ class Group:
         return point.config.repeats
 
     def trials(self, batch: Batch, thresholds: Mapping[str, float]) -> Iterator[tuple[str, TrialTask]]:
-        """(journal key, task) of each trial of a batch. ``thresholds`` by point digest, empty while calibrating."""
-        for repeat in range(max(self.repeats(batch, point) for point in self.points)):
+        """(journal key, task) of each trial of a batch. ``thresholds`` by point digest, empty while calibrating; a
+        point that got none is not judged."""
+        calibrating = batch in self.first
+        points = [one for one in self.points if calibrating or self._threshold(one, thresholds) is not None]
+        for repeat in range(max((self.repeats(batch, point) for point in points), default=0)):
             wanted = tuple(
-                _point_task(point, thresholds.get(point.digest, point.config.threshold.k))
-                for point in self.points
+                _point_task(point, self._threshold(point, thresholds))
+                for point in points
                 if repeat < self.repeats(batch, point)
             )
             task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
             yield self._key(batch, task), task
+
+    def _threshold(self, point: Point, thresholds: Mapping[str, float]) -> float | None:
+        return thresholds.get(point.digest, point.config.threshold.k)
 
     def _key(self, batch: Batch, task: TrialTask) -> str:
         asked = [[point.digest, point.variant, point.threshold] for point in task.points]

@@ -253,13 +253,26 @@ class _Run:
         """Each point's threshold; then what is judged by it begins."""
         group = self.plan.groups[number]
         for point in group.points:
-            found = threshold_of(point, self._quiet.get(point.digest, []))
+            found = self._threshold_of(point)
             if found is not None:
                 self.outcome.thresholds[point.digest] = found
-        if all(point.digest in self.outcome.thresholds for point in group.points):
+        if any(point.digest in self.outcome.thresholds for point in group.points):
             self._calibrated[number] = True
             for place in range(len(group.first), len(group.batches)):
                 self._begin_if_ready(number, place)
+
+    def _threshold_of(self, point: Point) -> float | None:
+        """A point's threshold; where failed trials left too few runs, or none, that is a failure of its own."""
+        try:
+            found = threshold_of(point, self._quiet.get(point.digest, []))
+        except UserError as error:
+            if not self.outcome.failures:
+                raise
+            self.outcome.failures.append(Failure(f"threshold of {point.label}", error.message))
+            return None
+        if found is None:
+            self.outcome.failures.append(Failure(f"threshold of {point.label}", "no hole-free run ended"))
+        return found
 
     def _tell(self) -> None:
         o = self.outcome

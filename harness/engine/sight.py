@@ -54,8 +54,8 @@ class Sight:
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
 
     def area_m2(self, pixels: np.ndarray) -> float:
-        """The face's area that the pixels (h, w) bool cover, tilt and perspective included; of a cloud without a grid
-        the whole face's, in the share of its points."""
+        """The face's area in plan that the pixels (h, w) bool cover, tilt and perspective included; of a cloud without
+        a grid the whole face's, in the share of its points."""
         there = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             size = self.target.board

@@ -64,7 +64,7 @@ def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int
         raise UserError(f"no trial of {experiment.config.name} succeeded: {_reasons(outcome)}")
     tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
     provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
-    _write_tables(folder, tables, provenance)
+    _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
     if experiment.config.study is None:
         _write_report(folder, experiment, outcome, tables, provenance)
         table, text = _final_table(tables)
@@ -154,8 +154,9 @@ def _indirect_noise_mm(views: list[NoiseFreeView]) -> dict[str, float]:
     return noise
 
 
-def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> None:
-    """Parquet with the provenance in its schema, the summary as CSV, the provenance as JSON."""
+def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any], *, is_study: bool) -> None:
+    """Parquet with the provenance in its schema, the summary as CSV (a study's boards have none hole by hole), the
+    provenance as JSON."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -173,7 +174,7 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any]) -> N
         stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
         with atomic_path(folder / f"{name}.parquet") as path:
             pq.write_table(stored, path)
-    if tables.sites.empty:
+    if not is_study:
         buffer = io.StringIO()
         summarise_holes(tables.holes, list(tables.axes["path"])).to_csv(buffer, index=False, float_format="%.6g")
         write_text(folder / "summary.csv", buffer.getvalue())

@@ -90,9 +90,13 @@ def _clouds(
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
     """The frames of one view in one trial. The first view's are those of an experiment that has no other."""
-    board = () if task.board is None else ("board", task.board)
     view = () if number == 0 else ("view", number)
-    return set_up.unit.capture(frames, task.seed, task.role, task.repeat, *board, *view)
+    return set_up.unit.capture(frames, task.seed, task.role, task.repeat, *board_labels(task), *view)
+
+
+def board_labels(task: TrialTask) -> tuple[str | int, ...]:
+    """What tells the random streams of a study's boards apart."""
+    return () if task.board is None else ("board", task.board)
 
 
 class _Judged:
@@ -106,7 +110,7 @@ class _Judged:
         self._done: dict[str, Judged] = {}
         self._maps = None
         if task.poses is not None:
-            labels = (task.role, task.repeat)
+            labels = (task.role, task.repeat, *board_labels(task))
             self._maps = MapMaker(set_ups, clouds, task.poses, labels, hole_free=self._hole_free)
 
     def rows(self, point: PointTask, seconds_frames: float) -> Record:

@@ -72,11 +72,21 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
         yield Problem("a study takes no sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
+    yield from _rule_axes(config, source)
     if calibrate is not None and calibrate.boards is None:
         place = source.place_of(("threshold", "calibrate"))
         yield Problem("a study's threshold is set on boards of their own", place, fix="write `boards: 60`")
     elif calibrate is not None and calibrate.boards is not None:
         yield from _too_few_boards(calibrate.boards, calibrate.false_calls_per_m2 or 0.0, target, source)
+
+
+def _rule_axes(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
+    """What is a hit and which rate of false calls is wanted are one study's rules, the same for all its set-ups."""
+    for path in config.sweep:
+        if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
+            message = f"`{path}` is a rule of the study and cannot be an axis of it"
+            fix = "run the study once for each value with --set, and compare them with harness.compare"
+            yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
 
 
 def _too_few_boards(boards: int, rate_per_m2: float, target: DrawnTargetConfig, source: Source) -> Iterator[Problem]:

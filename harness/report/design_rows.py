@@ -234,12 +234,14 @@ def notes(design: StudyDesign) -> list[str]:
             f"the {design.limit_name} to expect lies beyond the largest target of {size_text(high, design)}: it "
             "rests on the curve's shape there; make larger ones"
         )
-    found += [
-        f"the guess for {one.frames} frame{'s' * (one.frames > 1)} has {design.size_name} = "
-        f"{size_text(one.plan.true_size, design)} outside the sizes: its limit is extrapolated"
-        for one in design.frames
-        if not low <= one.plan.true_size <= high
-    ]
+    for one in design.frames:
+        at = f"the guess for {one.frames} frame{'s' * (one.frames > 1)} has"
+        if not low <= one.plan.true_size <= high:
+            size = size_text(one.plan.true_size, design)
+            found.append(f"{at} {design.size_name} = {size} outside the sizes: its limit is extrapolated")
+        elif one.curve.size_at(0.5) < low:
+            size = size_text(one.curve.size_at(0.5), design)
+            found.append(f"{at} a50 = {size} below the sizes: much of the rise is not inspected; make smaller targets")
     if not design.recommended.enough:
         found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for")
     return [

@@ -2,8 +2,8 @@
 
 Set-ups that differ in one axis alone stand in one line. Where they were judged on the same boards, the ratio of their
 a90 is taken draw by draw of boards, so that what boards do to both cancels; else every draw of one over every draw of
-the other. Each interval holds for itself: among
-twenty differences that are none, one is expected to be called beyond chance.
+the other. Each interval holds for itself, and is a little narrow: of differences that are none, on the same boards of
+eight damages, 9 % are called beyond chance with 20 boards and 8 % with 60, not 5 % (300 and 900 pairs of studies).
 """
 
 from __future__ import annotations

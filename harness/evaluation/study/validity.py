@@ -17,6 +17,8 @@ from harness.evaluation.study.record import StudyRecord
 
 Section = tuple[str, tuple[str, ...]]
 KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom", "dent": "spherical dents"}
+TESTS_THE_HARNESS = ("oracle", "blind")
+"""Detectors whose limits say something of the harness only."""
 RISE = (0.05, 0.95)
 """Between these the curve rises; sizes should reach past both, or the curve is known from one side."""
 
@@ -82,9 +84,7 @@ def _calls(record: StudyRecord, limit: SetUpLimit) -> str:
     where = f"{one.label}: threshold {number(one.threshold)}, {number(one.threshold_mm)} mm"
     if one.calibration_runs and record.false_calls_per_m2 is not None:
         wanted = number(record.false_calls_per_m2)
-        where += (
-            f", set for {wanted} false calls per m² on {one.calibration_runs} hole-free runs of boards of their own"
-        )
+        where += f", set for a rate of {wanted} per m² on {one.calibration_runs} hole-free runs of boards of their own"
     else:
         where += ", given and not calibrated"
     rate = limit.false_calls
@@ -93,7 +93,7 @@ def _calls(record: StudyRecord, limit: SetUpLimit) -> str:
     interval = rate.interval_per_m2
     found = (
         f"{where}. Found on other hole-free boards: {number(rate.rate_per_m2)} per m² "
-        f"({_span(interval.low, interval.high)}, 95 %), {rate.calls} calls on {number(rate.area_m2)} m²"
+        f"({_span(interval.low, interval.high)}, 95 %), {_counted(rate.calls, 'call')} on {number(rate.area_m2)} m²"
     )
     if record.false_calls_per_m2 is None or not one.calibration_runs:
         return f"{found}."
@@ -113,7 +113,7 @@ def _chance(limit: SetUpLimit, chance: ChanceHits) -> str:
 
 def _model(limit: SetUpLimit) -> str:
     label = limit.record.label
-    basis = f"{limit.targets} independent targets on {limit.boards} boards"
+    basis = f"{limit.targets} targets on {limit.boards} boards"
     if limit.statement is None:
         return f"{label}: no curve, as {limit.why}; {basis}. a90/95: {_bound(limit)}."
     text = f"{label}: {limit.statement.model}, of all links and axes the one with the least deviance; {basis}"
@@ -143,6 +143,11 @@ def _departures(
             "Targets were inspected more than once with new noise and count once each: the criterion of a90/95 is "
             "scaled by the number of inspections."
         )
+    if any(limit.record.calibration_runs for limit in limits):
+        said.append(
+            "Every limit is that of its threshold as it was calibrated: another draw of the calibration boards would "
+            "give another threshold, which is in no interval here."
+        )
     said += [*_few_targets(limits), *_few_sites(limits, chances), *_sizes_miss_the_rise(limits)]
     if any(limit.statement is not None for limit in limits):
         said.append(
@@ -158,7 +163,10 @@ def _departures(
         said.append(f"{len(limits)} limits stand side by side; each interval holds for itself, not for all at once.")
     failed = sum(limit.record.failed for limit in limits)
     if failed:
-        said.append(f"{failed} trials failed and are missing from what is counted.")
+        said.append(
+            f"{_counted(failed, 'trial')} failed and what they would have shown is missing from what is counted: "
+            "boards that a detector refuses are no misses of it."
+        )
     return tuple(said)
 
 
@@ -198,6 +206,8 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     source = facts.get("source", {})
     simulated = source.get("kind") == "simulated"
     said = ["An inspector, who can miss findings and doubt others: the POD is that of the program alone."]
+    if any(limit.record.detector in TESTS_THE_HARNESS for limit in limits):
+        said.insert(0, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness.")
     if source.get("target", {}).get("name") == "drawn":
         kind = source["target"].get("damage", {}).get("kind", "")
         only = f": all are {KINDS[kind]}" if kind in KINDS and not is_swept(facts, "source.target.damage.kind") else ""
@@ -212,6 +222,10 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     if any(limit.boards for limit in limits):
         said.append("Boards of another family: intervals are over boards drawn as these were.")
     return tuple(said)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _labels(limits: Sequence[SetUpLimit]) -> str:
