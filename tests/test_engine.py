@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
@@ -17,12 +16,15 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pandas as pd
 import pytest
+from serial_pool import serial_pool
 
+from harness.engine import run, workers
 from harness.engine.journal import Journal, without_nan
 from harness.engine.plan import plan_of
 from harness.engine.run import pending_counts
 from harness.engine.setup import SetUp
 from harness.engine.sight import sight_of_view
+from harness.engine.tables import tables_of
 from harness.engine.trial import run_trial
 from harness.experiment.load import load_experiment
 from scenes.target.declaration import TargetConfig
@@ -121,12 +123,13 @@ def test_report_is_one_file_without_outside_links(finished):
         assert outside not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")
 
 
-def test_one_process_gives_the_same_numbers(finished):
-    alone = finished.parent / "alone"
-    shutil.copytree(finished / ".cache", alone / ".cache")
-    done = sweep(alone, "--jobs", "1")
-    assert done.returncode == 0, done.stderr
-    pd.testing.assert_frame_equal(trials(finished), trials(alone), check_exact=True)
+def test_one_process_gives_the_same_numbers(finished, monkeypatch):
+    monkeypatch.setattr(workers, "pool", serial_pool)
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    plan = plan_of(experiment, finished / ".cache" / "renders")
+    outcome = run.run_plan(plan, Journal(finished.parent / "alone"), 1, lambda _: None)
+    alone = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
+    pd.testing.assert_frame_equal(trials(finished), alone.holes, check_exact=True)
 
 
 def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
@@ -282,29 +285,13 @@ def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
 
 def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
     """A trial that raises becomes a failure with its traceback; the other trials end. Run without workers."""
-    from contextlib import contextmanager
-
-    from harness.engine import run, workers
-
-    class Here:
-        def submit(self, work, *arguments):
-            future: Future[object] = Future()
-            try:
-                future.set_result(work(*arguments))
-            except Exception as error:
-                future.set_exception(error)
-            return future
-
-    @contextmanager
-    def here(_count):
-        yield Here()
 
     def faulty(task):
         if task.role == "damaged" and task.repeat == 1:
             raise ValueError("a bug of the detector")
         return run_trial(task)
 
-    monkeypatch.setattr(workers, "pool", here)
+    monkeypatch.setattr(workers, "pool", serial_pool)
     monkeypatch.setattr(run, "run_trial", faulty)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")

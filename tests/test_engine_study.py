@@ -5,9 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from serial_pool import serial_pool
 
 from detectors.interface import Detection
 from harness.engine import run, workers
@@ -163,7 +161,7 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
             task = replace(task, points=tuple(point for point in task.points if point.frames == 2))
         return run_trial(task)
 
-    monkeypatch.setattr(workers, "pool", here)
+    monkeypatch.setattr(workers, "pool", serial_pool)
     monkeypatch.setattr(run, "run_trial", faulty)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
@@ -341,23 +339,9 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     assert runs[runs.role != "calibration"].groupby("frames").threshold.nunique().eq(1).all()
 
 
-class Here:
-    """A pool without processes: work is done as it is submitted."""
-
-    def submit(self, work: Callable[..., object], *arguments: object) -> Future[object]:
-        future: Future[object] = Future()
-        future.set_result(work(*arguments))
-        return future
-
-
-@contextmanager
-def here(_count: int) -> Iterator[Here]:
-    yield Here()
-
-
 def judged(home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str) -> tuple[StudyRecord, Tables]:
     """A study run serially in this process, on the renders that are there, its journal in ``folder``."""
-    monkeypatch.setattr(workers, "pool", here)
+    monkeypatch.setattr(workers, "pool", serial_pool)
     experiment = load_experiment(home / "tiny.yaml", changes)
     plan = plan_of(experiment, home / "out" / ".cache" / "renders")
     outcome = run_plan(plan, Journal(folder), 1, lambda _: None)
