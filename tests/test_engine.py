@@ -180,7 +180,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
 def test_dry_run_counts_and_runs_nothing(finished):
     done = sweep(finished, "--dry-run")
     assert done.returncode == 0
-    assert "2 points in 1 set-ups" in done.stdout
+    assert "2 points, 1 set of frames" in done.stdout
     assert "renders: 2, 2 already there" in done.stdout
     fresh = finished.parent / "fresh"
     assert sweep(fresh, "--dry-run").returncode == 0
@@ -301,6 +301,25 @@ def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
     assert "Traceback" in failure.why
     assert failure.why.rstrip().endswith("ValueError: a bug of the detector")
     assert outcome.trials_done == 3
+
+
+def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, capsys):
+    from harness.engine import study
+
+    def faulty(task):
+        raise ValueError("a bug of the detector")
+
+    monkeypatch.setattr(workers, "pool", serial_pool)
+    monkeypatch.setattr(run, "run_trial", faulty)
+    out = finished.parent / "hopeless"
+    shutil.copytree(finished / ".cache", out / ".cache")
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    assert study.run_study(experiment, out, 1, "python -m harness.sweep tiny.yaml") == 1
+    told = capsys.readouterr().err
+    assert told.count("Traceback (most recent call last)") == 1
+    assert "ValueError: a bug of the detector" in told
+    assert told.rstrip().endswith("no trial of tiny succeeded; 4 failed, the first as above (detector 'thesis')")
+    assert not list(out.glob("tiny/*/report.html"))
 
 
 def test_changed_code_is_not_served_old_trials(finished, monkeypatch):

@@ -32,10 +32,16 @@ FAILURE_CHARACTERS = 4000
 
 @dataclass(frozen=True)
 class Failure:
-    """A trial or render that raised: what it was, and why."""
+    """A trial that raised: what it was, and why: a message, or of a bug the end of its traceback."""
 
     what: str
     why: str
+    is_bug: bool = False
+
+    @property
+    def in_short(self) -> str:
+        """One line: of a bug what the traceback ends with."""
+        return self.why.strip().splitlines()[-1] if self.is_bug else self.why
 
 
 @dataclass
@@ -164,7 +170,7 @@ class _Run:
             # A bug in one trial costs that trial; its traceback (the worker's, as text) goes into the failures.
             if isinstance(work, _Render):
                 raise
-            self._failed(work, "".join(traceback.format_exception(error))[-FAILURE_CHARACTERS:])
+            self._failed(work, "".join(traceback.format_exception(error))[-FAILURE_CHARACTERS:], is_bug=True)
             return
         if isinstance(work, _Render):
             self._rendered(work.job, *result)
@@ -177,9 +183,9 @@ class _Run:
             self._keep(work, record)
             self._trial_over(work)
 
-    def _failed(self, work: _Trial | _Examples, why: str) -> None:
+    def _failed(self, work: _Trial | _Examples, why: str, *, is_bug: bool = False) -> None:
         what = work.key if isinstance(work, _Trial) else f"example clouds of set-up {work.group}"
-        self.outcome.failures.append(Failure(what, why))
+        self.outcome.failures.append(Failure(what, why, is_bug))
         if isinstance(work, _Trial):
             self._trial_over(work)
 
@@ -293,6 +299,9 @@ def threshold_of(point: Point, quiet: Sequence[tuple[float, float]]) -> float | 
     thresholds, areas_m2 = np.array(quiet).T
     if calibrate is None or calibrate.false_calls_per_m2 is None:
         return float(thresholds.max())
+    if not areas_m2.mean() > 0:
+        message = f"the detector {point.config.detector.name!r} gave no score to any pixel of the hole-free boards"
+        raise UserError(message, fix="check its crop against the boards' poses")
     return threshold_for_rate(thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2).value
 
 

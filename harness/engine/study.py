@@ -8,7 +8,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -19,11 +19,13 @@ from harness.engine.run import Outcome, pending_counts, run_plan
 from harness.engine.tables import STUDY_ORDERS, Tables, tables_of
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment
+from harness.experiment.schema import SimulatedSource
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, write_text
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import INCH, MM
 from scenes.render.cache import read_view
+from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
 
@@ -38,7 +40,10 @@ def dry_run(experiment: Experiment, out: Path, jobs: int) -> int:
     """Say what would be run."""
     folder = experiment.folder(out)
     plan = plan_of(experiment, _cache(out))
-    print(f"{experiment.config.name}: valid; {len(experiment.points)} points in {len(plan.groups)} set-ups")
+    count = len(plan.groups)
+    print(
+        f"{experiment.config.name}: valid; {len(experiment.points)} points, {count} set{'s' if count != 1 else ''} of frames"
+    )
     for what, planned, there in pending_counts(plan, Journal(folder / "journal")):
         print(f"  {what}: {planned}, {there} already there")
     print(f"  trials of both kinds: {plan.trial_count}, on {jobs} processes")
@@ -61,7 +66,7 @@ def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
     if not outcome.records or not outcome.thresholds:
-        raise UserError(f"no trial of {experiment.config.name} succeeded: {_reasons(outcome)}")
+        return _nothing_to_report(experiment, outcome)
     tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
     provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
     _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
@@ -90,20 +95,38 @@ def _write_study(
     if not study.set_ups:
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     write_text(folder / "study.json", record_text(study))
-    table_one_mm = [size_in * INCH / MM for size_in in DIAMETERS_IN]
-    result = evaluate_study(study, tables, experiment.data, diameters_mm=table_one_mm)
+    result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
     examples = study_examples(plan, result.limits, outcome.thresholds)
     title = experiment.config.title or experiment.config.name
     write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
     return study_table(result), study_text(result)
 
 
+def _table_one_mm(experiment: Experiment) -> list[float]:
+    """The diameters of the thesis' holes, where any set-up's damage is drilled holes."""
+    targets = [cast("SimulatedSource", point.config.source).target for point in experiment.points]
+    drilled = any(isinstance(target, DrawnTargetConfig) and target.damage.kind != "dent" for target in targets)
+    return [size_in * INCH / MM for size_in in DIAMETERS_IN] if drilled else []
+
+
 def _cache(out: Path) -> Path:
     return out / ".cache" / "renders"
 
 
+def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
+    """Where every trial was refused that is the user's to mend; a bug keeps its traceback (once) and gives 1."""
+    name, detector = experiment.config.name, experiment.config.detector.name
+    bug = next((failure for failure in outcome.failures if failure.is_bug), None)
+    if bug is None:
+        raise UserError(f"no trial of {name} succeeded: {_reasons(outcome)}")
+    print(bug.why, file=sys.stderr)
+    count = len(outcome.failures)
+    print(f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})", file=sys.stderr)
+    return 1
+
+
 def _reasons(outcome: Outcome) -> str:
-    return "; ".join(sorted({failure.why for failure in outcome.failures})[:3]) or "nothing was planned"
+    return "; ".join(sorted({failure.in_short for failure in outcome.failures})[:3]) or "nothing was planned"
 
 
 def _provenance(

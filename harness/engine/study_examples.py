@@ -28,8 +28,8 @@ ROOM_MM = 12.0
 
 def study_examples(plan: Plan, limits: Sequence[SetUpLimit], thresholds: Mapping[str, float]) -> list[StudyExample]:
     """Of each of the first few set-ups the damages whose sizes lie nearest to 0.75, 1 and 1.25 of its limit: of a90/95
-    where that is demonstrated, else of the estimate of a90, a50 or the middle size. One view's clouds only: of maps
-    there are none."""
+    where that is demonstrated, else of the estimate of a90, a50 or the middle size; of smaller ones where that is too
+    near the largest size. One view's clouds only: of maps there are none."""
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in _points(plan)}
     examples = []
     for limit in limits[:MOST_SET_UPS]:
@@ -71,8 +71,10 @@ def _examples(group: Group, point: Point, limit: SetUpLimit, thresholds: Mapping
 
 
 def _limit_mm(limit: SetUpLimit) -> float:
-    sizes = (limit.a90_95.value, limit.a90_mm, limit.a50_mm, float(np.median(limit.record.inspected.diameter_mm)))
-    return next(size for size in sizes if np.isfinite(size))
+    seen_mm = limit.record.inspected.diameter_mm
+    sizes = (limit.a90_95.value, limit.a90_mm, limit.a50_mm, float(np.median(seen_mm)))
+    wanted = next(size for size in sizes if np.isfinite(size))
+    return min(wanted, float(seen_mm.max()) / max(SHARES.values()))
 
 
 def _chosen(seen: Inspected, limit_mm: float) -> dict[Where, int]:

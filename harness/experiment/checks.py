@@ -102,8 +102,11 @@ def _too_few_boards(boards: int, rate_per_m2: float, target: DrawnTargetConfig, 
 
 
 def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
-    target = simulated.target.declare()
-    mistake = _target_mistake(target)
+    try:
+        target = simulated.target.declare()
+        mistake = _target_mistake(target)
+    except UserError as error:  # a family of boards that are too full for their damage
+        mistake = error
     if mistake:
         place = source.place_of(("source", "target"))
         yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
@@ -138,6 +141,10 @@ def _drawn_problems(simulated: SimulatedSource, drawn: DrawnTargetConfig, source
     """Whether the camera sees every board that can be drawn. The first pose that it does not see whole is told."""
     for pose in drawn.extreme_poses():
         target = drawn.declare().model_copy(update={"pose": pose})
+        found = _camera_mistake(simulated.camera, target)
+        if found and found[0] != ("source", "target"):
+            yield from _camera_problems(simulated.camera, target, source)
+            return
         problems = list(_camera_problems(simulated.camera, target, source))
         if simulated.views is not None:
             problems += _view_problems(simulated, target, simulated.views, source)
