@@ -35,7 +35,7 @@ def detector_type(name: str) -> Any:
     """The class behind a name; its ``settings_type`` is the Config that validates its settings.
 
     Raises UserError on an unknown name (with the nearest one), on a name taken twice, and where a plug-in cannot be
-    imported or is no detector.
+    imported, is no detector, or calls itself otherwise.
     """
     from harness.vocabulary.config import Config
 
@@ -44,6 +44,10 @@ def detector_type(name: str) -> Any:
     settings_type = getattr(kind, "settings_type", None)
     if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):
         raise DETECTORS.broken(offer, "it has no `settings_type` that is a harness.vocabulary.config.Config")
+    called = getattr(kind, "name", None)
+    if isinstance(called, str) and called != name:
+        # results name a detector by itself, experiments by its offer
+        raise DETECTORS.broken(offer, f"it is called {called!r}, but offered as {name!r}")
     return kind
 
 

@@ -77,7 +77,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if experiment.config.study is None:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
-    baseline = _baseline(path, may_be_missing=options.update)
+    baseline = _baseline(path, update=options.update)
     code = run_study(experiment, options.out, options.jobs, command)
     if code not in (0, 1):
         return code
@@ -89,15 +89,23 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return _gate(comparison, path)
 
 
-def _baseline(path: Path, *, may_be_missing: bool) -> StudyRecord | None:
-    """Read before anything runs: a study takes minutes."""
+def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
+    """Read before anything runs: a study takes minutes. None where an ``update`` has none to compare with."""
     from harness.evaluation.study.record import read_record
 
-    if path.is_file():
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder", fix="name the baseline's file with --baseline, such as regression.json")
+    if not path.exists():
+        if update:
+            return None
+        raise UserError(f"{path}: there is no such baseline", fix="write one with --update, and commit it")
+    try:
         return read_record(path)
-    if may_be_missing:
+    except UserError as mistake:
+        if not update:
+            raise UserError(mistake.message, legal=mistake.legal, fix="write it anew with --update") from mistake
+        print(f"no comparison with the old baseline, which will be overwritten. {mistake.message}")
         return None
-    raise UserError(f"{path}: there is no such baseline", fix="write one with --update, and commit it")
 
 
 def _found(experiment: Experiment, out: Path) -> StudyRecord:

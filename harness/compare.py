@@ -8,9 +8,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
+    from harness.evaluation.study.record import StudyRecord
     from harness.evaluation.study.verdict import Comparison
 
 FILES = ("compare.json", "compare.html")
@@ -44,13 +45,28 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies
 
-    comparison = compare_studies(read_record(options.first), read_record(options.second))
+    first, second = read_record(options.first), read_record(options.second)
+    _refuse_where_nothing_is_paired(first, second)
+    comparison = compare_studies(first, second)
     print_comparison(comparison, as_json=options.json)
     if options.out is not None:
         write_comparison(comparison, options.out, command)
         # On stdout it would be no JSON any more.
         print(f"wrote {', '.join(str(options.out / name) for name in FILES)}", file=sys.stderr)
     return 0
+
+
+def _refuse_where_nothing_is_paired(first: StudyRecord, second: StudyRecord) -> None:
+    from harness.evaluation.study.paired_set_ups import paired_set_ups
+
+    if any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
+        return
+    both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
+    raise UserError(
+        f"nothing could be paired: no set-up of the two has the same name and frames: {both}",
+        legal="set-ups of the same name, or the same values on the axes, and the same frames; or one set-up in each",
+        fix="run both studies with the same `sweep`, or each with a single set-up",
+    )
 
 
 def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:

@@ -23,6 +23,10 @@ LEAST = 10
 """Fewer targets are no study: the same number of rows that python -m harness.pod asks for."""
 MOST = 10_000
 """Nobody makes more; beyond, a simulated study takes seconds."""
+FURTHEST = 2.0
+"""Times the largest size inspected: a90 beyond it is no plan's guess."""
+LEAST_SHARE = 0.1
+"""Of a50, for the smallest size: a curve against the size itself may begin to rise below 0."""
 REPEATED = 8
 """Targets of the repeats check: a single board of holes."""
 
@@ -156,17 +160,42 @@ def _from_study(options: argparse.Namespace) -> _Guess:
     if limit.statement is None:
         raise UserError(
             f"{options.study}: {record.label} has no curve to guess from: {limit.why}",
-            fix="tell a guess with --a50 and --a90, or name another set-up",
+            fix="tell a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up",
         )
+    curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.diameter_mm, record.unflawed.area_m2
-    sizes = (float(seen.min()), float(seen.max())) if options.sizes is None else tuple(options.sizes)
+    inspected = (float(seen.min()), float(seen.max()))
+    sizes = _holding_the_rise(curve, inspected, origin) if options.sizes is None else tuple(options.sizes)
+    if sizes != inspected and options.sizes is None:
+        origin += f"; sizes beyond the {inspected[0]:.4g} to {inspected[1]:.4g} mm that it inspected"
     area = float(boards.mean()) if len(boards) else None
-    return _Guess(limit.statement.curve, f"fitted to {study.name}, {record.label}", sizes, record.frames, area)
+    return _Guess(curve, origin, sizes, record.frames, area)
+
+
+def _holding_the_rise(curve: PodCurve, inspected: tuple[float, float], origin: str) -> tuple[float, float]:
+    """The sizes that a study inspected, widened to the curve's whole rise where they do not hold its a50 or its a90.
+
+    Raises UserError where that is further than `FURTHEST` times the largest: there the curve is a guess of nobody's.
+    """
+    from harness.evaluation.pod.design import RISE
+
+    (low, high), (a50, a90) = inspected, (curve.size_at(0.5), curve.size_at(0.9))
+    if not a50 > 0 or a90 > FURTHEST * high:
+        raise UserError(
+            f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm, and the study inspected {low:.4g} to "
+            f"{high:.4g} mm: it says too little about its rise",
+            fix="run the study with damage of other sizes, or tell a guess: --a50 SIZE --a90 SIZE --sizes FROM TO",
+        )
+    if not low < a50:
+        low = max(curve.size_at(RISE[0]), LEAST_SHARE * a50)
+    if not a90 < high:
+        high = min(max(high, curve.size_at(RISE[1])), FURTHEST * high)
+    return low, high
 
 
 def _set_up(study: StudyRecord, name: str | None) -> SetUpRecord:
     """The set-up of this label, or the only one."""
-    import difflib
+    from harness.vocabulary.declaration.diagnose import nearest
 
     by_label = {record.label: record for record in study.set_ups}
     if name is None and len(by_label) == 1:
@@ -176,10 +205,8 @@ def _set_up(study: StudyRecord, name: str | None) -> SetUpRecord:
     known = "; ".join(by_label)
     if name is None:
         raise UserError(f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."')
-    near = difflib.get_close_matches(name, by_label, n=1)
-    raise UserError(
-        f"{study.name} has no set-up {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""), legal=known
-    )
+    near = nearest(name, by_label)
+    raise UserError(f"{study.name} has no set-up {name!r}" + (f"; did you mean {near!r}?" if near else ""), legal=known)
 
 
 def _check(options: argparse.Namespace, guess: _Guess) -> None:
@@ -190,7 +217,9 @@ def _check(options: argparse.Namespace, guess: _Guess) -> None:
     if not (0 <= low < high < float("inf")):
         raise UserError(f"--sizes {low:g} {high:g}", legal="0 <= FROM < TO", fix="the smallest first")
     if not low < a50 < high:
-        raise UserError(f"--sizes {low:g} {high:g} do not hold a50 = {a50:.4g}", legal=f"FROM < {a50:.4g} < TO")
+        raise UserError(
+            f"--sizes {low:g} {high:g} do not hold a50 = {a50:.4g}", legal=f"FROM < {a50:.4g} < TO", fix="widen --sizes"
+        )
     if guess.curve.log_size and low == 0:
         raise UserError("--sizes from 0 under a logarithm", legal="FROM above 0")
     wrong = [number for number in options.targets if not LEAST <= number <= MOST]

@@ -29,16 +29,19 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m harness.ls",
         description="List detectors and cameras: tofpod's own and those that installed packages offer through the "
         "entry point groups tofpod.detectors and tofpod.cameras.",
-        epilog="examples: python -m harness.ls; python -m harness.ls detectors thesis; python -m harness.ls --json",
+        epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
+        "python -m harness.ls --json",
     )
     add = parser.add_argument
-    add("what", nargs="?", choices=tuple(LISTINGS), help="list one kind only")
+    add("what", nargs="?", help=f"list one kind only ({' or '.join(LISTINGS)}); or a name of either")
     add("name", nargs="?", help="show everything that can be set of this one")
     add("--json", action="store_true", help="as JSON, for programs")
     return parser
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.what is not None and options.what not in LISTINGS:
+        return _show_whichever(options)
     if options.name is not None:
         return _show(LISTINGS[options.what], options.name, as_json=options.json)
     chosen = {title: LISTINGS[title] for title in ([options.what] if options.what else LISTINGS)}
@@ -52,18 +55,46 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _show_whichever(options: argparse.Namespace) -> int:
+    """What is called so: a detector, a camera, or one of each. Raises UserError where it is neither."""
+    from harness.vocabulary.declaration.diagnose import nearest
+
+    word = options.what
+    named = [title for title, listing in LISTINGS.items() if word in listing.plug_ins().names()]
+    if options.name is not None or not named:
+        names = [name for listing in LISTINGS.values() for name in listing.plug_ins().names()]
+        legal = [*LISTINGS, *([] if options.name is not None else names)]
+        near = nearest(word, legal)
+        raise UserError(
+            f"there is nothing called {word!r} to list" + (f"; did you mean {near!r}?" if near else ""),
+            legal=", ".join(legal),
+            fix="python -m harness.ls lists all",
+        )
+    if options.json:
+        _print_json({title: _shown(LISTINGS[title], word) for title in named})
+        return 0
+    for title in named:
+        _show(LISTINGS[title], word, as_json=False)
+    return 0
+
+
 def _show(listing: Listing, name: str, *, as_json: bool) -> int:
     """One of them with all that can be set of it. Raises UserError where it is unknown, taken twice or broken."""
     from harness.vocabulary.seeds import canonical_json
 
-    row = {**_origin(listing.plug_ins().offer(name)), **listing.facts(name)}
-    settable = listing.settable(name)
+    row = _shown(listing, name)
     if as_json:
-        _print_json({**row, listing.settable_title: settable})
+        _print_json(row)
         return 0
     print("\n".join(_table([listing.cells(row)], indent="")))
+    settable = row[listing.settable_title]
     print("\n".join(_table([(one["path"], canonical_json(one["value"]), one["about"]) for one in settable])))
     return 0
+
+
+def _shown(listing: Listing, name: str) -> Row:
+    row = {**_origin(listing.plug_ins().offer(name)), **listing.facts(name)}
+    return {**row, listing.settable_title: listing.settable(name)}
 
 
 def _print_json(value: Any) -> None:
@@ -106,7 +137,7 @@ class Listing:
             return {**_origin(offer), **self.facts(offer.name)}
         except UserError as mistake:
             return _broken(offer, mistake)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
             return _broken(offer, self.plug_ins().broken(offer, f"{type(error).__name__}: {error}"))

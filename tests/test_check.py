@@ -5,6 +5,7 @@ The study itself is put in by hand here; `tests/test_check_mutations.py` runs wh
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from harness.experiment.load import load_experiment
 from harness.experiment.points import Experiment
 from harness.vocabulary.files import write_text
 from tests.synthetic_study import SetUp, Study, study_record
-from tests.validation.gate_power import Size, fails, share, study
+from tests.validation.gate_power import Change, Size, fails, share, study
 
 EXPERIMENT = Path(__file__).resolve().parents[1] / "experiments" / "regression.yaml"
 BOARDS = Study(boards=24, hole_free_boards=24, holes=6)
@@ -74,6 +75,33 @@ def test_update_writes_the_baseline_and_says_what_changes(program, capsys):
     said = capsys.readouterr().out
     assert "worse" in said and " → " in said and f"wrote {program.baseline}" in said
     assert read_record(program.baseline).set_ups[0].frames_digest == "b-1"
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (json.dumps({"record_version": 0}), "is a record of version 0"),
+        ('{"record_version": 1}', "is damaged: `name` is missing"),
+        ("<<<<<<< HEAD", "is no JSON"),
+    ],
+)
+def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(program, capsys, content, why):
+    program.baseline.write_text(content)
+    assert program(record()) == 2
+    said = capsys.readouterr().err
+    assert f"{program.baseline}: {why}" in said and "to do: write it anew with --update" in said
+    assert program.baseline.read_text() == content
+    assert program(record(), "--update") == 0
+    said = capsys.readouterr().out
+    assert "no comparison with the old baseline, which will be overwritten. " in said and why in said
+    assert f"wrote {program.baseline}" in said and len(read_record(program.baseline).set_ups) == 1
+    assert program(record()) == 0
+
+
+def test_a_folder_is_no_baseline(program, capsys):
+    program.baseline.mkdir()
+    assert program(record(), "--update") == 2
+    assert "is a folder" in capsys.readouterr().err
 
 
 def test_a_study_with_failed_trials_is_no_baseline(program, capsys):
@@ -137,9 +165,10 @@ def test_another_noise_seldom_fails_the_gate():
 
 
 def test_the_gate_sees_what_it_is_for():
-    """A third more, and a threshold shifted either way."""
+    """A third more, all of it or its steepness alone, and a threshold shifted either way."""
     size = Size(set_ups=1)
     baseline = study(size, 0, 1)
-    assert fails(baseline, study(size, 0, 2, gain=1.33**-2))
-    assert fails(baseline, study(size, 0, 2, bias=1.5))
-    assert fails(baseline, study(size, 0, 2, bias=1 / 1.5))
+    assert fails(baseline, study(size, 0, 2, Change(gain=1.33**-2)))
+    assert fails(baseline, study(size, 0, 2, Change(flatter=1.33)))
+    assert fails(baseline, study(size, 0, 2, Change(bias=1.5)))
+    assert fails(baseline, study(size, 0, 2, Change(bias=1 / 1.5)))

@@ -21,12 +21,23 @@ from tests.plug_in_packages import offer
 OWN_DETECTORS = ("blind", "oracle", "thesis")
 
 
+MINE = f"{__name__}:Mine"
+
+
 class Plain:
     """Says nothing of its settings."""
 
 
+class Mine(ThesisDetector):
+    """The thesis' by another name."""
+
+    name = "mine"
+
+
 class Raises(ThesisDetector):
     """Cannot be made."""
+
+    name = "raises"
 
     def __init__(self, settings: ThesisConfig) -> None:
         raise ZeroDivisionError("no luck")
@@ -51,9 +62,9 @@ def listed(capsys: pytest.CaptureFixture[str], kind: str) -> dict[str, list[dict
 
 def test_a_plug_in_is_found_without_importing_it_and_gone_when_uninstalled(monkeypatch, tmp_path):
     with monkeypatch.context() as patched:
-        offer(patched, tmp_path, "acme", detectors.GROUP, {"mine": "detectors.thesis:ThesisDetector", "off": "nope:X"})
+        offer(patched, tmp_path, "acme", detectors.GROUP, {"mine": MINE, "off": "nope:X"})
         assert detector_names() == ("blind", "mine", "off", "oracle", "thesis")
-        assert isinstance(load_detector("mine", {}), ThesisDetector)
+        assert isinstance(load_detector("mine", {}), Mine)
     assert detector_names() == OWN_DETECTORS
 
 
@@ -75,19 +86,19 @@ def test_installed_packages_are_read_once(monkeypatch):
 
 def test_a_name_taken_twice_is_an_error_that_names_both_and_leaves_others_alone(monkeypatch, tmp_path):
     offer(monkeypatch, tmp_path / "a", "acme", detectors.GROUP, {"thesis": "acme.found:Detector", "x": "p:A"})
-    offer(monkeypatch, tmp_path / "b", "bolt", detectors.GROUP, {"x": "q:B", "y": "detectors.thesis:ThesisDetector"})
+    offer(monkeypatch, tmp_path / "b", "bolt", detectors.GROUP, {"x": "q:B", "mine": MINE})
     told = str(mistake(load_detector, "thesis", {}))
     assert "2 detectors are called 'thesis'" in told
     assert "detectors.thesis:ThesisDetector (tofpod 0.1.0) and acme.found:Detector (acme 1.2)" in told
     assert "p:A (acme 1.2) and q:B (bolt 1.2)" in str(mistake(detector_type, "x"))
-    assert detector_type("y") is ThesisDetector
+    assert detector_type("mine") is Mine
 
 
 def test_one_offer_seen_twice_is_no_clash(monkeypatch, tmp_path):
-    entries = {"mine": "detectors.thesis:ThesisDetector"}
+    entries = {"mine": MINE}
     offer(monkeypatch, tmp_path / "a", "acme", detectors.GROUP, entries)
     offer(monkeypatch, tmp_path / "b", "acme-mirror", detectors.GROUP, entries)
-    assert detector_type("mine") is ThesisDetector
+    assert detector_type("mine") is Mine
 
 
 @pytest.mark.parametrize(
@@ -97,6 +108,7 @@ def test_one_offer_seen_twice_is_no_clash(monkeypatch, tmp_path):
         ("detectors.thesis:NoSuch", "AttributeError"),
         (f"{__name__}:Plain", "no `settings_type`"),
         ("detectors.thesis", "no `settings_type`"),
+        (MINE, "it is called 'mine', but offered as 'bad'"),
     ],
 )
 def test_a_broken_plug_in_is_told_with_its_package(monkeypatch, tmp_path, target, why):
@@ -104,6 +116,22 @@ def test_a_broken_plug_in_is_told_with_its_package(monkeypatch, tmp_path, target
     told = str(mistake(load_detector, "bad", {}))
     assert f"detector 'bad' ({target}, of the package acme-tools 1.2) cannot be loaded" in told
     assert why in told and "repair or uninstall the package acme-tools" in told
+
+
+@pytest.fixture
+def quitting(monkeypatch, tmp_path) -> None:
+    """A plug-in whose module ends the interpreter."""
+    (tmp_path / "acme_quits.py").write_text("import sys\nsys.exit('no licence')\n")
+    monkeypatch.delitem(sys.modules, "acme_quits", raising=False)
+    offer(monkeypatch, tmp_path, "acme-quits", detectors.GROUP, {"quits": "acme_quits:Detector", "mine": MINE})
+
+
+def test_a_plug_in_that_ends_the_program_on_import_is_broken(quitting, capsys):
+    told = str(mistake(detector_type, "quits"))
+    assert "of the package acme-quits 1.2) cannot be loaded: SystemExit: no licence" in told
+    rows = listed(capsys, "detectors")
+    assert "SystemExit: no licence" in rows["quits"][0]["broken"]
+    assert "broken" not in rows["mine"][0] and rows["thesis"][0]["version"] == 3
 
 
 def test_what_is_wrong_with_a_built_in_one_keeps_its_traceback(monkeypatch):
@@ -117,6 +145,12 @@ def test_the_nearest_name_is_told_and_it_may_be_a_plug_in(monkeypatch, tmp_path)
     error = mistake(detector_type, "wavlet")
     assert error.message == "there is no detector 'wavlet'; did you mean 'wavelet'?"
     assert error.legal == "blind, oracle, thesis, wavelet" and "tofpod.detectors" in (error.fix or "")
+
+
+def test_a_part_of_a_name_finds_it():
+    assert "did you mean 'realsense_l515'?" in mistake(load_camera, "l515").message
+    assert "did you mean 'azure_kinect_nfov'?" in mistake(load_camera, "Azure").message
+    assert "did you mean" not in mistake(load_camera, "nf").message, "two letters are in too many words"
 
 
 # ---------------------------------------------------------------- cameras
@@ -224,6 +258,29 @@ def test_a_named_camera_shows_every_number_with_its_source(capsys):
     assert numbers["lens.fx_px"]["value"] == facts.lens.fx_px.value
     assert numbers["lens.fx_px"]["about"].endswith(facts.lens.fx_px.source)
     assert set(numbers) == set(cameras.number_paths(facts.to_data()))
+
+
+def test_a_name_alone_is_looked_for_in_both_lists(acme_camera, monkeypatch, capsys):
+    assert main(["thesis"]) == 0
+    alone = capsys.readouterr().out
+    assert main(["detectors", "thesis"]) == 0
+    assert capsys.readouterr().out == alone
+    offer(monkeypatch, acme_camera.parent / "more", "more", detectors.GROUP, {"mine": MINE, "kinect_v2": "no_such:X"})
+    assert main(["acme_tof", "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)) == ["cameras"]
+    offer(monkeypatch, acme_camera.parent / "camera", "mine", cameras.GROUP, {"mine": "acme_cameras:MINE"})
+    (acme_camera.parent / "mine.yaml").write_text(acme_camera.read_text().replace("name: acme_tof", "name: mine", 1))
+    monkeypatch.setattr(sys.modules["acme_cameras"], "MINE", acme_camera.parent / "mine.yaml", raising=False)
+    assert main(["mine", "--json"]) == 0
+    both = json.loads(capsys.readouterr().out)
+    assert (both["detectors"]["package"], both["cameras"]["columns"]) == ("more", 512)
+
+
+def test_what_is_neither_a_kind_nor_a_name(capsys):
+    for words, near in ((["thesys"], "thesis"), (["l515"], "realsense_l515"), (["detector", "thesis"], "detectors")):
+        assert main(words) == 2
+        told = capsys.readouterr().err
+        assert f"there is nothing called {words[0]!r} to list; did you mean {near!r}?" in told and "legal: " in told
 
 
 def test_mistakes_are_one_message(capsys, monkeypatch, tmp_path):

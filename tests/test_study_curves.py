@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from harness.evaluation.study.axes import FRAMES, axis_lines, difference
 from harness.evaluation.study.chance import chance_hits
 from harness.evaluation.study.curves import free_response, pixel_curves, roc_curves
 from harness.evaluation.study.limit import SetUpLimit, limit_of
+from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.surface import surface_of
 from harness.evaluation.study.table_one import pod_at
 
@@ -120,7 +122,35 @@ class TestFreeResponse:
         assert curve.at == (curve.false_calls_per_m2[here], curve.found[here])
         assert curve.at[1] == loud.holes["detected"].mean()
         assert curve.found_low[here] < curve.at[1] < curve.found_high[here]
-        assert curve.area_m2 == pytest.approx(60 * 0.25)
+        assert curve.area_m2 == pytest.approx(30 * 0.25)
+
+    def test_the_rate_is_that_of_hole_free_boards_alone(self, loud):
+        """So it is the table's, though damaged boards have false calls of their own."""
+        curve = free_response(loud.operating, loud.runs, loud.holes, 6.0)
+        runs = loud.runs[loud.runs["role"] == "hole_free"]
+        assert curve.at[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
+        more = loud.operating.copy()
+        more.loc[more["role"] == "damaged", "findings"] += 7
+        again = free_response(more, loud.runs, loud.holes, 6.0)
+        assert np.array_equal(again.false_calls_per_m2, curve.false_calls_per_m2)
+
+    def test_what_folds_back_is_left_out(self):
+        """Calls 0, 2, 1, 2, 3, 1 as the threshold falls from 6 to 1: at 4 and at 1 there are fewer than before."""
+        grid, calls = [6.0, 5.0, 4.0, 3.0, 2.0, 1.0], [0, 2, 1, 2, 3, 1]
+        free = pd.DataFrame({"role": "hole_free", "board": 9, "threshold": grid, "findings": calls, "hits": 0})
+        hits = pd.DataFrame(
+            {"role": "damaged", "board": 0, "threshold": grid, "findings": 9, "hits": [0, 1, 1, 1, 2, 0]}
+        )
+        runs = pd.DataFrame({"role": ["hole_free", "damaged"], "inspected_m2": 0.5, "false_calls": [2, 8]})
+        holes = pd.DataFrame({"board": 0, "true_diameter_mm": 5.0, "signal": [7.0, 2.5], "detected": [True, False]})
+        curve = free_response(pd.concat([free, hits]), runs, holes, 6.0, draws=10)
+        assert curve.threshold.tolist() == [6.0, 5.0, 3.0, 2.0]
+        assert curve.false_calls_per_m2.tolist() == [0.0, 4.0, 4.0, 6.0]
+        assert curve.found.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.at == (4.0, 0.5)
+
+    def test_none_without_hole_free_boards(self, loud):
+        runs = loud.runs[loud.runs["role"] == "damaged"]
+        assert free_response(loud.operating, runs, loud.holes, 6.0) is None
 
     def test_false_calls_fall_as_their_scores_do(self, loud):
         """Scores are exponential, so the logarithm of the rate falls by 1 in a unit of threshold."""
@@ -202,6 +232,43 @@ class TestSurface:
     def test_depth_that_does_not_matter_has_no_slope(self):
         surface, _ = surface_of(study_record(self.study()).set_ups[0])
         assert surface.depth_slope_interval.low < 0 < surface.depth_slope_interval.high
+
+    def drawn(self, predictor: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> SetUpRecord:
+        """Hits of chance expit(predictor(ln a, ln d)) on the study's damage."""
+        record = study_record(self.study()).set_ups[0]
+        seen = record.inspected
+        chance = special.expit(predictor(np.log(seen.diameter_mm), np.log(seen.depth_mm)))
+        hit = np.random.default_rng(5).random(len(chance)) < chance
+        return dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
+
+    def test_an_interaction_that_grows_with_both_is_kept(self):
+        surface, why = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d))
+        assert why == "" and surface.note == "" and len(surface.b) == 4 and surface.interaction_p < 0.05
+
+    @pytest.mark.parametrize(
+        ("slopes", "falling"),
+        [((-4.0, 1.0, 4.0), "diameter"), ((1.0, -4.0, 3.0), "depth"), ((-4.0, -5.0, 5.0), "diameter and depth")],
+    )
+    def test_one_that_falls_inside_what_was_inspected_is_left_out(self, slopes, falling):
+        """At the least depth, ln 2, the slope along ln a is -4 + 4 * 0.69; so in the first case POD falls there."""
+        along, across, product = slopes
+        record = self.drawn(lambda a, d: -4.0 + along * a + across * d + product * a * d)
+        surface, why = surface_of(record, draws=50)
+        assert why == "" and len(surface.b) == 3 and surface.interaction_p < 0.05
+        assert (
+            surface.note
+            == f"with an interaction POD would fall with {falling} inside what was inspected: fitted without"
+        )
+        pod = surface.pod(*np.meshgrid(np.geomspace(1, 14, 30), np.geomspace(2, 10, 30)))
+        assert np.all(np.diff(pod, axis=1) >= 0)
+
+    def test_a_chance_that_falls_with_diameter_has_none(self):
+        surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))
+        assert surface is None and why == "the chance of detection does not grow with diameter"
+
+    def test_a_chance_that_falls_with_depth_is_said(self):
+        surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)
+        assert surface.note == "POD falls with depth" and surface.depth_slope < 0
 
     def test_refused_where_depth_does_not_vary(self):
         surface, why = surface_of(study_record(Study(hole_free_boards=0)).set_ups[0])

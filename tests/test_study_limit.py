@@ -129,7 +129,41 @@ class TestWithoutACurve:
         limit = limit_of(with_hits(small, size > 6.0))
         gap = (size[size <= 6].max(), size[size > 6].min())
         assert limit.statement is not None and np.isfinite(limit.a90_draws_mm).all()
-        assert np.median(limit.a90_draws_mm) == pytest.approx(np.mean(gap), abs=0.6)
+        assert np.median(limit.a50_draws_mm) == pytest.approx(np.mean(gap), abs=0.6)
+        assert np.all(limit.a50_draws_mm < limit.a90_draws_mm)
+
+    @pytest.mark.parametrize("seed", range(12))
+    def test_apart_too_estimates_lie_inside_their_intervals(self, seed):
+        """Draws are fitted as the study is; with the middle of the gap for a90 its interval lies below it in every one
+        of these."""
+        record = set_up(Study(boards=10, hole_free_boards=0, seed=seed))
+        limit = limit_of(with_hits(record, record.inspected.diameter_mm > 5.5), draws=200)
+        for size, interval in (
+            (limit.a50_mm, limit.a50_interval_mm),
+            (limit.a90_mm, limit.a90_interval_mm),
+        ):
+            assert interval.low <= size <= interval.high
+
+    def test_few_boards_that_were_all_found_are_no_boards_that_matter(self, small):
+        """20 boards cannot demonstrate what takes 29; that says nothing of what damages of one board share."""
+        limit = limit_of(with_hits(small, np.ones(120, bool)))
+        assert np.isinf(limit.over_boards_mm) and np.isnan(limit.design_effect) and not limit.boards_matter
+
+
+class TestWhatWasInspected:
+    def test_sizes_beyond_the_largest_are_told(self, small):
+        limit = limit_of(small)
+        assert limit.largest_mm == small.inspected.diameter_mm.max() == 14.0
+        assert (limit.beyond(14.0), limit.beyond(14.01), limit.beyond(np.inf)) == (False, True, True)
+        assert np.isnan(limit_of(first_rows(small, 0)).largest_mm)
+
+    def test_depths_that_share_a_curve_are_noted(self, small):
+        note = "mm: one curve over all depths"
+        assert not any(note in one for one in limit_of(small).statement.notes)
+        deep = set_up(Study(boards=15, hole_free_boards=0, depths_mm=(0.65, 5.0)))
+        depths = deep.inspected.depth_mm
+        expected = f"depths from {depths.min():.3g} to {depths.max():.3g} {note}"
+        assert limit_of(deep).statement.notes.count(expected) == 1
 
 
 class TestFalseCalls:
@@ -198,6 +232,23 @@ class TestBoardsDrawnAgain:
             fit = fit_hit_miss(seen.diameter_mm[again], seen.hit[again], link=link, log_size=log_size)
             assert drawn[0, k] == pytest.approx(fit.curve.size_at(0.5), rel=1e-5)
             assert drawn[1, k] == pytest.approx(fit.curve.size_at(0.9), rel=1e-5)
+
+    @pytest.mark.parametrize("link", LINKS)
+    @pytest.mark.parametrize("repeats", [1, 3])
+    def test_a_draw_whose_hits_and_misses_are_apart_is_the_penalised_fit_of_its_boards(self, small, link, repeats):
+        """cloglog and loglog have two maxima in some draws, and the fit as the draw takes the higher one."""
+        size, board = (np.repeat(of, repeats) for of in (small.inspected.diameter_mm, small.inspected.board))
+        hole, hit = np.repeat(small.inspected.hole, repeats), size > 5.5
+        curve = fit_hit_miss(size, hit, link=link).curve
+        drawn = refitted_sizes(targets_of(board, hole, size, hit), curve, (0.5, 0.9), 6)
+        for k, weight in enumerate(row_weights(board, 6).astype(int)):
+            again = np.repeat(np.arange(len(size)), weight)
+            copy = np.concatenate([np.arange(times) for times in weight])
+            names = [f"{board[row]}:{hole[row]}:{of}" for row, of in zip(again, copy, strict=True)]
+            fit = fit_hit_miss(size[again], hit[again], link=link, inspections=names)
+            assert fit.method == "Firth" and fit.repeats == repeats
+            assert drawn[0, k] == pytest.approx(fit.curve.size_at(0.5), rel=1e-4)
+            assert drawn[1, k] == pytest.approx(fit.curve.size_at(0.9), rel=1e-4)
 
     def test_a_draw_of_repeats_is_the_fit_of_their_rows(self, repeated):
         seen = repeated.inspected

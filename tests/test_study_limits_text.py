@@ -22,10 +22,12 @@ from harness.report.study_examples_figure import examples_figure, framed_pixels
 from harness.report.study_pod_figures import MOST_PANELS, curves_figure, with_room
 from harness.report.study_rows import (
     interval_text,
+    limit_notes,
     limit_rows,
     limit_sentence,
     study_answer,
     unbroken,
+    unmeasured,
     with_interval,
 )
 from harness.report.study_terminal import HEADS, study_table, study_text
@@ -62,7 +64,8 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
         said = limit_sentence(limit)
         assert said.startswith(f"{limit.record.label}: damage of {limit.a90_95.value:.2f} mm is found 90 % of the time")
         assert limit.false_calls is not None
-        assert f"at {limit.false_calls.rate_per_m2:.2g} false calls per m²" in said
+        rate = f"{limit.false_calls.rate_per_m2:.2g}"
+        assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in said
     assert study_answer(two) == " ".join(limit_sentence(limit) for limit in two)
 
 
@@ -70,8 +73,9 @@ def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit
     said = study_answer([*two, *two, nothing_found])
     assert said.startswith(f"Of 5 set-ups, the smallest limit (a90/95) is {two[1].a90_95.value:.2f} mm (50 frames)")
     assert f"the largest {two[0].a90_95.value:.2f} mm (1 frame)" in said
-    assert said.endswith("; 1 of 5 set-ups demonstrates no limit.")
-    assert study_answer([nothing_found] * 4) == "None of 4 set-ups demonstrates a limit (a90/95)."
+    assert said.endswith("; 1 of 5 set-ups demonstrates no limit within the sizes inspected.")
+    none = "None of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
+    assert study_answer([nothing_found] * 4) == none
     assert study_answer([]) == "No set-up was inspected, so there is no answer."
 
 
@@ -80,7 +84,56 @@ def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> N
     assert (row.a50, row.a90, row.a90_95, row.over_boards) == ("none", "none", "not demonstrated", "not demonstrated")
     assert row.why.startswith("every target was missed")
     assert not row.demonstrated
-    assert "a90/95 is not demonstrated (every target was missed" in limit_sentence(nothing_found)
+    assert "a90/95 is not demonstrated: every target was missed" in limit_sentence(nothing_found)
+
+
+def test_the_answer_is_without_statistics(two: list[SetUpLimit]) -> None:
+    why = "not demonstrated: a chance that does not grow with size fits too (ratio 1.79 <= 3.84)"
+    limit = replace(two[0], a90_95=replace(two[0].a90_95, value=np.inf, why=why))
+    said = limit_sentence(limit)
+    assert said.startswith("1 frame: a90/95 is not demonstrated: the hits do not grow clearly with diameter; ")
+    assert "3.84" not in said
+    assert "(ratio 1.79 <= 3.84)" in limit_rows([limit])[0].why
+
+
+def test_sizes_beyond_those_inspected_are_no_numbers(two: list[SetUpLimit]) -> None:
+    limit = replace(
+        two[0],
+        a90_95=replace(two[0].a90_95, value=9.468e4),
+        over_boards=replace(two[0].over_boards, value=9.468e4),
+        a50_interval_mm=Interval(4.2, 17.0),
+        a90_mm=21.0,
+        a90_interval_mm=Interval(15.0, np.inf),
+    )
+    row = limit_rows([limit])[0]
+    assert (row.a90_95, row.over_boards, row.a90) == ((">\u00a014",) * 3)
+    assert row.a50 == f"{limit.a50_mm:.2f} (4.20 to >\u00a014)"
+    assert not row.demonstrated
+    assert not row.over_demonstrated
+    assert "lies beyond the largest size inspected, 14 mm" in row.why
+    assert "no limit (a90/95) within the sizes inspected (1 to 14 mm); " in limit_sentence(limit)
+    wide = limit_rows([replace(limit, a90_interval_mm=Interval(12.0, np.inf))])[0].a90
+    assert wide == ">\u00a014 (12.00 to >\u00a014)"
+    terminal = study_text(result_of([limit]))
+    assert "14 mm" in terminal
+    assert "e+" not in terminal
+    assert "> 14  > 14" in re.sub(r"\s\s+", "  ", terminal.replace("\u00a0", " "))
+
+
+def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> None:
+    failed = [replace(one, record=replace(one.record, failed=3)) for one in two]
+    failed[1] = replace(failed[1], a90_95=replace(failed[1].a90_95, value=np.inf, why="not demonstrated: of a ceiling"))
+    notes = limit_notes(limit_rows(failed))
+    assert notes[0] == "every set-up: 3 trials failed and are missing"
+    assert notes[1] == "50 frames: of a ceiling"
+    assert limit_notes(limit_rows(two[:1])) == []
+    assert limit_notes([]) == []
+
+
+def test_notes_of_statements_lose_sizes_that_nobody_inspected() -> None:
+    note = "a90 = 204.3 lies outside the sizes inspected (10.45 to 37.56)"
+    assert unmeasured(note) == "a90 lies outside the sizes inspected (10.45 to 37.56)"
+    assert unmeasured("a slope of = 2 stays") == "a slope of = 2 stays"
 
 
 def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLimit) -> None:
@@ -170,6 +223,7 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
     ]
     assert (distance.title, distance.values, distance.numeric) == ("distance (m)", (0.5, 1.0), True)
     assert (camera.values, camera.numeric) == (("a", "b"), False)
+    assert list(camera.lines) == [f"distance={at} m, {n}" for at in ("0.5", "1") for n in ("1 frame", "50 frames")]
     assert list(distance.lines) == ["a, 1 frame", "a, 50 frames", "b, 1 frame", "b, 50 frames"]
     assert distance.lines["b, 50 frames"].limits == (limits[5], limits[7])
     rows = axis_rows(distance)
@@ -180,6 +234,27 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
     assert rows[1][-1].endswith(" *") == step.beyond_chance
     figure = axis_figure(distance, "axis-1")
     assert f"a, 1 frame: 0.5 m: {limits[0].a90_mm:.2f} mm, 1 m: {limits[2].a90_mm:.2f} mm" in figure
+
+
+def test_an_axis_ends_at_a_little_more_than_the_largest_size(two: list[SetUpLimit]) -> None:
+    """One bound of 95 m does not press all others to the ground; it is an arrow."""
+    far = replace(two[0], a90_mm=9.5e4, a90_interval_mm=Interval(5.0, np.inf), a90_95=replace(two[0].a90_95, value=1e6))
+    (group,) = axis_groups(axis_lines([far, two[1]]))
+    figure = axis_figure(group, "axis-1")
+    texts = re.findall(r"<!-- (.*?) -->", figure)
+    assert max(float(text) for text in texts if re.fullmatch(r"[\d.]+", text) and text not in ("1", "50")) <= 1.3 * 14
+    assert {"no limit", "goes on beyond", "largest size inspected"} <= set(texts)
+    assert "1 frame: > 14 mm" in figure.replace("\u00a0", " ").replace("&gt;", ">")
+    (group,) = axis_groups(axis_lines(two))
+    assert not {"no limit", "goes on beyond"} & set(re.findall(r"<!-- (.*?) -->", axis_figure(group, "axis-1")))
+
+
+def test_sizes_that_are_all_equal_have_an_axis(recwarn: pytest.WarningsRecorder) -> None:
+    record = study_record(Study(set_ups=(SetUp(),), boards=20, hole_free_boards=12)).set_ups[0]
+    same = replace(record.inspected, diameter_mm=np.full_like(record.inspected.diameter_mm, 6.0))
+    figure = curves_figure([limit_of(replace(record, inspected=same), draws=50)])
+    assert "all sizes are 6" in figure
+    assert [str(one.message) for one in recwarn] == []
 
 
 def test_no_axis_without_two_values(two: list[SetUpLimit]) -> None:
@@ -250,4 +325,7 @@ def test_examples_say_what_came_of_them() -> None:
     assert "6.2 mm, below the limit, missed: no pixel was judged" in figure
     assert "6.2 mm, at the limit, hit: score 6.12, threshold 4.5" in figure
     assert "stroke: #ff00ff" in figure
+    without = examples_figure("examples-1", [missed, example()], "1 frame", by_limit=False)
+    assert "6.2 mm, smaller, missed" in without
+    assert "the limit" not in without
     assert "stroke: #ff00ff" not in examples_figure("e", [example(detected=np.zeros((21, 21), bool))], "1 frame")

@@ -191,10 +191,10 @@ def test_validity_is_the_results_own(whole: StudyResult, page: str) -> None:
 
 def test_where_nothing_is_found_the_page_says_so() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0))))
-    assert headings(page) == [name for name in SECTIONS if name != "Limits against what was varied"]
-    assert "a90/95 is not demonstrated (every target was missed" in words(page)
+    left_out = ("Limits against what was varied", "Diameter and depth")
+    assert headings(page) == [name for name in SECTIONS if name not in left_out]
+    assert "a90/95 is not demonstrated: every target was missed" in words(page)
     assert "no curve" in section(page, "The thesis' holes")
-    assert "No surface: every damage fared alike" in section(page, "Diameter and depth")
     assert "No example was kept." in page
     assert "nan" not in words(page).split()
 
@@ -205,6 +205,38 @@ def test_where_everything_is_found_the_bound_needs_no_curve() -> None:
     assert result.limits[0].a90_95.demonstrated
     assert unbroken(limit_sentence(result.limits[0])) in page
     assert "all found: binomial on the 29 smallest" in section(page, "Detection limits")
+
+
+def test_depths_without_a_surface_say_why() -> None:
+    page = html(judged(small(SetUp(a50_mm=60.0), depths_mm=(2.0, 10.0))))
+    assert "No surface: every damage fared alike" in section(page, "Diameter and depth")
+
+
+@pytest.fixture(scope="module")
+def beyond() -> StudyResult:
+    """Half of the largest damage is found: every a90/95 lies beyond the 14 mm inspected, some with a50 within."""
+    set_ups = [SetUp(frames=n, a50_mm=size) for n, size in ((1, 14.0), (10, 13.0), (50, 11.0))]
+    return judged(small(*set_ups, depths_mm=(2.0, 10.0)))
+
+
+def test_no_number_on_the_page_lies_beyond_the_sizes_inspected(beyond: StudyResult) -> None:
+    page = html(beyond, (example(where="at"),))
+    largest = beyond.limits[0].largest_mm
+    assert all(limit.beyond(limit.a90_95.value) for limit in beyond.limits)
+    answer = re.search(r'class="answer">(.*?)</p>', page)
+    assert answer is not None
+    assert (
+        answer[1].replace("\u00a0", " ").count(f"no limit (a90/95) within the sizes inspected (1 to {largest:.3g}") == 3
+    )
+    rows = section(page, "Detection limits")
+    assert rows.replace("&gt;", ">").count(f"> {largest:.3g}") >= 9
+    for part in ("Detection limits", "Limits against what was varied", "Diameter and depth", "Signal against size"):
+        sizes = [float(one) for one in re.findall(r"\d+\.\d\d\b", section(page, part).partition("p-values")[0])]
+        assert max(sizes) <= largest, part
+        assert "e+" not in section(page, part)
+        assert "∞" not in section(page, part)
+    assert f"a90/95: > {largest:.3g} mm" in page.replace("&gt;", ">")
+    assert "6.2 mm, middle, hit" in page
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +253,7 @@ def test_one_set_up_has_no_axis_and_one_depth_no_surface(single_page: str) -> No
     page = single_page
     assert 'id="axis-1"' not in page
     assert 'id="surface"' not in page
-    assert "No surface: depth does not vary" in section(page, "Diameter and depth")
+    assert "Diameter and depth" not in headings(page)
     # Of a single set-up the ROC is drawn by classes of size.
     assert "a90 and above" in section(page, "Operating curves")
 
@@ -240,7 +272,7 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
     assert "No hole-free board was inspected" in text
     assert "none: given" in text
     assert "Thresholds were given, not calibrated" in text
-    assert "No sizes were asked for." in page
+    assert "The thesis' holes" not in headings(page)
 
 
 def test_the_same_input_gives_the_same_file(tmp_path: Path, single: StudyResult, single_page: str) -> None:

@@ -101,6 +101,19 @@ class TestStudy:
         assert not result.limits[0].a90_95.demonstrated and result.set_ups[0].surface is None
         assert "not demonstrated" in section(result, "The model and what it stands on")
 
+    def test_signals_that_are_all_alike_are_judged_by_hits(self, study):
+        """As of the oracle, which gives every damage the same score."""
+        record, tables = study_record(study), study_tables(study)
+        one = record.set_ups[0]
+        alike = np.ones(len(one.inspected.hit), bool)
+        inspected = dataclasses.replace(one.inspected, hit=alike, signal=np.full(len(alike), 1.0))
+        oracle = dataclasses.replace(one, threshold=0.5, inspected=inspected)
+        none = dataclasses.replace(tables, sites=tables.sites.iloc[:0])
+        result = evaluate_study(dataclasses.replace(record, set_ups=(oracle,)), none, FACTS, draws=50)
+        limit = result.limits[0]
+        assert limit.a90_95.demonstrated and limit.signals is None
+        assert limit.signals_why == "the signals do not vary: all 256 between the limits are 1"
+
 
 class TestValidity:
     def test_varied_and_held(self, result):
@@ -146,6 +159,20 @@ class TestValidity:
         said = section(evaluate_study(failed, study_tables(study), {}, draws=50), "Departures from MIL-HDBK-1823A")
         assert "fewer than 60 targets (40)" in said and "3 trials failed" in said and "largest size" in said
         assert "share boards" not in said and "simulated" not in said and "more than once" not in said
+
+    def test_depths_under_one_curve_depart(self, result):
+        depths = np.concatenate([one.record.inspected.depth_mm for one in result.limits])
+        span = f"Depths from {number(depths.min())} to {number(depths.max())} mm share one curve"
+        assert span in section(result, "Departures from MIL-HDBK-1823A")
+        flat = evaluate_study(study_record(), Tables(*[pd.DataFrame()] * 6), {}, draws=50)
+        assert "share one curve" not in section(flat, "Departures from MIL-HDBK-1823A")
+
+    def test_a_limit_beyond_what_was_inspected_has_no_number(self):
+        study = Study((SetUp(a50_mm=13.0),), boards=16, hole_free_boards=0)
+        result = evaluate_study(study_record(study), Tables(*[pd.DataFrame()] * 6), {}, draws=50)
+        limit = result.limits[0]
+        assert limit.beyond(limit.a90_95.value) and limit.a90_95.demonstrated
+        assert "a90/95: more than 14 mm" in section(result, "The model and what it stands on")
 
     def test_all_found_names_its_rule(self, study):
         sighted = dataclasses.replace(study, set_ups=(SetUp(a50_mm=-9.0),))

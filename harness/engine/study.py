@@ -40,10 +40,8 @@ def dry_run(experiment: Experiment, out: Path, jobs: int) -> int:
     """Say what would be run."""
     folder = experiment.folder(out)
     plan = plan_of(experiment, _cache(out))
-    count = len(plan.groups)
-    print(
-        f"{experiment.config.name}: valid; {len(experiment.points)} points, {count} set{'s' if count != 1 else ''} of frames"
-    )
+    sets = f"{len(plan.groups)} set{'s' if len(plan.groups) != 1 else ''} of frames"
+    print(f"{experiment.config.name}: valid; {len(experiment.points)} points, {sets}")
     for what, planned, there in pending_counts(plan, Journal(folder / "journal")):
         print(f"  {what}: {planned}, {there} already there")
     print(f"  trials of both kinds: {plan.trial_count}, on {jobs} processes")

@@ -35,11 +35,16 @@ RULE = (
     "first time. x: measured with another stick. < and >: in the first, in the second study only."
 )
 TESTS = (
-    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is of a sign-flip "
-    "test in which boards, not damages, are the units; where the studies have different boards, of boards drawn again "
-    "for each. The p of false calls is of such a test too on identical frames; on others it allows for the luck that "
-    "each study had with the calibration of its threshold. Both are one-sided, of being worse, and adjusted. 95 %: "
-    "interval of the change of a90 over boards drawn again."
+    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
+    "of two, with boards, not damages, as the units: of a sign-flip test of hits, and, where a90 has changed by more "
+    f"than {100 * (MARGIN - 1):.0f} % and hits do not decide, of a test of a90 itself, for which the two results of "
+    "each board are exchanged or not and both curves are fitted again; (a90) marks where that one is the smaller. It "
+    "alone sees a curve that flattens: small damages won, large ones lost. Where the studies have different boards, p "
+    "is of boards drawn again for each (500 draws), and below 0.002 a matter of their outermost draws. The p of false "
+    "calls is of a sign-flip test where frames and threshold are the same; else it allows for the luck that each study "
+    "had with the calibration of its threshold, and where the frames are the same and the thresholds are not, both "
+    "tests must agree. All are one-sided, of being worse, and adjusted. 95 %: interval of the change of a90 over "
+    "boards drawn again."
 )
 
 
@@ -66,7 +71,7 @@ def cells(row: ComparedSetUps) -> tuple[str, ...]:
         _interval(row),
         _both(row, lambda limit: limit.a90_95.value),
         f"-{row.hits.only_first} +{row.hits.only_second}" if row.hits else "–",
-        p_text(row.limit_p[0]) if row.limit else "–",
+        _limit_p(row),
         " → ".join(f"{rate:.2f}" for rate in row.calls.rates_per_m2) if row.calls else "–",
         p_text(row.calls_p[0]) if row.calls else "–",
     )
@@ -133,6 +138,11 @@ def _both(row: ComparedSetUps, size_mm: Callable[[SetUpLimit], float]) -> str:
     return " → ".join("–" if limit is None else mm(size_mm(limit)) for limit in (row.first, row.second))
 
 
+def _limit_p(row: ComparedSetUps) -> str:
+    test = row.limit_test(0)
+    return f"{p_text(row.limit_p[0])}{' (a90)' if test == 'a90' else ''}" if test else "–"
+
+
 def _percent(row: ComparedSetUps) -> str:
     """Growth of a90 in per cent; a dash where either has none."""
     return f"{100 * (row.limit.ratio - 1):+.1f} %" if row.limit and np.isfinite(row.limit.ratio) else "–"
@@ -161,7 +171,10 @@ def _row_data(row: ComparedSetUps) -> dict[str, Any]:
             "paired": row.limit.paired,
             "bootstrap_p": {"grown": row.limit.grown_p, "shrunk": row.limit.shrunk_p},
             "decides": dict(zip(("worse", "better"), row.limit_p, strict=True)),
+            "decided_by": {side: row.limit_test(at) for at, side in enumerate(("worse", "better"))},
         }
+    if row.swap is not None:
+        data["a90_swap"] = {**vars(row.swap), "ratio": finite(row.swap.ratio)}
     if row.hits is not None:
         data["hits"] = {**vars(row.hits), "boards_p": row.hits.boards_p}
     if row.calls is not None:

@@ -83,9 +83,11 @@ def _curve(axes: Axes, statement: PodStatement) -> None:
     axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
 
-def draw_pod(axes: Axes, statement: PodStatement, bound: Bound, strength: float = 0.6) -> None:
+def draw_pod(
+    axes: Axes, statement: PodStatement, bound: Bound, strength: float = 0.6, most: float = float("inf")
+) -> None:
     """Curve, band, data (strokes of opacity ``strength``) and the sizes read off, ``bound`` among them, without words
-    at the axes; the height leaves room for the data."""
+    at the axes; the height leaves room for the data. Sizes beyond ``most`` are named as such and not drawn."""
     curve, sizes = statement.curve, statement.sizes
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
@@ -100,7 +102,7 @@ def draw_pod(axes: Axes, statement: PodStatement, bound: Bound, strength: float 
         ("a90", statement.a90, POD, ORANGE),
         ("a90/95", bound.value, POD, RED),
     ):
-        _mark(axes, statement, name, value, pod, colour)
+        _mark(axes, statement, name, value, pod, colour, most)
     hits_in_view(axes, STRIPE + 0.06 if statement.signal is None else 0.03)
 
 
@@ -120,16 +122,17 @@ def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
     axes.set_yticks(np.linspace(0, 1, 6))
 
 
-def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: float, colour: str) -> None:
+def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: float, colour: str, most: float) -> None:
     text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
+    if most < value < np.inf:
+        text = f"> {most:.3g} {statement.unit}"
     label = plain(f"{name}: {text}")
-    if np.isfinite(value) and statement.sizes[0] <= value <= statement.sizes[-1]:
+    if statement.sizes[0] <= value <= min(statement.sizes[-1], most):
         axes.plot([value, value], [0, pod], color=colour, lw=1.1)
         axes.plot([value], [pod], "o", color=colour, ms=6, mec="white", mew=0.8, label=label, zorder=5)
     else:
-        axes.plot(
-            [], [], "o", color=colour, ms=6, label=label if not np.isfinite(value) else f"{label}, off this figure"
-        )
+        told = not np.isfinite(value) or value > most
+        axes.plot([], [], "o", color=colour, ms=6, label=label if told else f"{label}, not shown")
 
 
 def _signals(axes: Axes, statement: PodStatement) -> None:

@@ -18,7 +18,6 @@ from harness.report.study_rows import (
     bound_text,
     estimate_text,
     interval_text,
-    mm_text,
     name_of,
     percent_text,
     with_interval,
@@ -73,8 +72,8 @@ def axis_note(group: AxisGroup) -> str:
     rows = sum(len(line.values) for line in group.lines.values())
     cut = f" The first {SHOWN_ROWS} of {rows} rows are shown." if rows > SHOWN_ROWS else ""
     return (
-        f"Ratio of a90 with its 95 % interval over boards ({paired}); {beyond} of {len(steps)} beyond chance (*), "
-        f"each interval taken for itself.{cut}"
+        f"Ratio of a90 with its 95 % interval over boards ({paired}); {beyond} of {len(steps)} leave out 1 (*). Each "
+        f"interval is taken for itself and a little narrow: of ratios that are 1, 8 to 9 % get a *, not 5 %.{cut}"
     )
 
 
@@ -127,7 +126,7 @@ def _line_rows(group: AxisGroup, label: str, line: AxisLine) -> Iterator[tuple[s
             axis_value(group.path, value),
             estimate_text(limit, limit.a50_mm, limit.a50_interval_mm),
             estimate_text(limit, limit.a90_mm, limit.a90_interval_mm),
-            bound_text(limit.a90_95),
+            bound_text(limit.a90_95, limit.largest_mm),
             "" if step is None else _step(step),
         )
 
@@ -136,13 +135,14 @@ def _step(step: Difference) -> str:
     beyond = " *" if step.beyond_chance else ""
     if not np.isfinite(step.ratio):
         return f"no a90 {'here' if np.isnan(step.to.a90_mm) else 'above'}{beyond}"
+    if all(one.beyond(one.a90_mm) for one in (step.frm, step.to)):
+        return f"both beyond{beyond}"
     return f"× {step.ratio:.2f} ({interval_text(step.interval)}){beyond}"
 
 
 def _of_depth(surface: PodSurface, at: int) -> str:
     low, high = float(surface.a90_low_mm[at]), float(surface.a90_high_mm[at])
-    ends = "" if np.isnan(low) else f" ({mm_text(low)} to {mm_text(high)})"
-    return f"{mm_text(float(surface.a90_mm[at]))}{ends}"
+    return with_interval(float(surface.a90_mm[at]), Interval(low, high), most=surface.diameter_range_mm[1])
 
 
 def _cell(row: SizeRow) -> SizeCell:

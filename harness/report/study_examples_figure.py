@@ -21,12 +21,16 @@ WHERES: tuple[Where, ...] = get_args(Where)
 MOST_DOWN = 3
 """Examples of one place under each other."""
 TITLES: dict[Where, str] = {"below": "Below the limit", "at": "At the limit", "above": "Above the limit"}
+SIZES: dict[Where, str] = {"below": "Smaller", "at": "Middle", "above": "Larger"}
+"""Titles where no limit lies within the sizes inspected."""
 SCALE_BAR_MM = (1, 2, 5, 10, 20, 50)
 PANEL_IN = 2.5
 
 
-def examples_figure(name: str, examples: Sequence[StudyExample], title: str) -> str:
-    """One set-up's examples: places below, at and above the limit across, those of a place down."""
+def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, by_limit: bool = True) -> str:
+    """One set-up's examples: places below, at and above the limit across (smaller, middle and larger ones where there
+    is no limit to go by, not ``by_limit``), those of a place down."""
+    titles = TITLES if by_limit else SIZES
     columns = [(where, _chosen(examples, where)) for where in WHERES]
     down = max(len(line) for _, line in columns)
     norm = residual_norm(max(_deepest(one) for _, line in columns for one in line))
@@ -40,11 +44,11 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str) -> 
             for axes in panels[len(line) :, across]:
                 axes.set_visible(False)
             if line:
-                panels[0, across].set_title(f"{TITLES[where]}\n{_size_text(line[0])}", fontsize=9.5)
+                panels[0, across].set_title(f"{titles[where]}\n{_size_text(line[0])}", fontsize=9.5)
         residual_bar(figure, picture, "distance behind the surface (mm)", ax=panels, shrink=0.8, pad=0.02)
 
     size = (PANEL_IN * len(columns) + 1.4, (PANEL_IN + 0.62) * down + 0.3)
-    said = "; ".join(_words(one) for _, line in columns for one in line)
+    said = "; ".join(_words(one, titles[one.where]) for _, line in columns for one in line)
     return svg(name, size, f"{title}: {said}.", draw)
 
 
@@ -61,8 +65,8 @@ def _chosen(examples: Sequence[StudyExample], where: Where) -> list[StudyExample
     return sorted((e for e in examples if e.where == where), key=lambda e: (e.diameter_mm, e.board))[:MOST_DOWN]
 
 
-def _words(example: StudyExample) -> str:
-    return f"{example.diameter_mm:.1f} mm, {TITLES[example.where].lower()}, {example_text(example)}"
+def _words(example: StudyExample, title: str) -> str:
+    return f"{example.diameter_mm:.1f} mm, {title.lower()}, {example_text(example)}"
 
 
 def _panel(axes: Axes, example: StudyExample, norm: SymLogNorm) -> AxesImage:

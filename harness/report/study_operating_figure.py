@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import shorten
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STYLES = ("-", "--", ":", "-.")
-LONGEST_NAME = 48
+LONGEST_NAME = 60
+"""Characters of a set-up on one line of the legend."""
 
 
 def operating_figure(results: Sequence[SetUpResult]) -> str:
@@ -29,14 +30,16 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
     def draw(figure: Figure) -> None:
         left, middle, right = figure.subplots(1, 3)
         for number, result in enumerate(results):
-            label = plain(shorten(name_of(result.limit), LONGEST_NAME, placeholder="…"))
+            label = plain(fill(name_of(result.limit), LONGEST_NAME))
             _roc(left, result, COLOURS[number], label, by_size=len(results) == 1)
             _free_response(middle, result, COLOURS[number], label)
             _overlap(right, result, COLOURS[number], label)
-        _finish(left, middle, right, by_size=len(results) == 1)
+        has_large = any(one.free_response and one.free_response.large_found is not None for one in results)
+        _finish(left, middle, right, by_size=len(results) == 1, has_large=has_large)
         figure.legend(*middle.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    return svg("operating", (10.6, 4.3 + 0.12 * len(results)), _alt(results), draw)
+    lines = sum(-(-len(name_of(one.limit)) // LONGEST_NAME) for one in results)
+    return svg("operating", (10.6, 4.3 + 0.13 * lines), _alt(results), draw)
 
 
 def _roc(axes: Axes, result: SetUpResult, colour: str, label: str, *, by_size: bool) -> None:
@@ -71,7 +74,7 @@ def _overlap(axes: Axes, result: SetUpResult, colour: str, label: str) -> None:
     axes.plot(x, y, color=colour, lw=1.6, label=area)
 
 
-def _finish(left: Axes, middle: Axes, right: Axes, *, by_size: bool) -> None:
+def _finish(left: Axes, middle: Axes, right: Axes, *, by_size: bool, has_large: bool) -> None:
     left.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls=":")
     left.set(xlabel="share of unflawed places above", ylabel="share of damages above", xlim=(-0.02, 1), ylim=(0, 1.02))
     left.set_title("ROC over places" + ("" if by_size else ", all sizes"))
@@ -81,9 +84,10 @@ def _finish(left: Axes, middle: Axes, right: Axes, *, by_size: bool) -> None:
         texts = labels if by_size else [label.rpartition(": ")[2] for label in labels]
         title = "area under the curve"
         left.legend(handles, texts, loc="lower right", fontsize=8, title=title, title_fontsize=8)
-    middle.set(xscale="log", ylim=(0, 1.02), xlabel="false calls per m²", ylabel="share of damages found")
+    middle.set(xscale="log", ylim=(0, 1.02), xlabel="false calls per m², hole-free", ylabel="share of damages found")
     plain_numbers(middle.xaxis, (1,))
-    middle.plot([], [], color=GREY, lw=1.2, ls="--", label="damages of a50 and more")
+    if has_large:
+        middle.plot([], [], color=GREY, lw=1.2, ls="--", label="damages of a50 and more")
     middle.plot([], [], "o", color=GREY, ms=6, label="threshold in use")
     middle.set_title("Free-response curve")
     right.set(xlim=(0, PRO_LIMIT), ylim=(0, 1.02))

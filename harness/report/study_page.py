@@ -7,8 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import StudyResult
+from harness.evaluation.study.surface import depth_varies
 from harness.report.page_parts import closing_sections, template
+from harness.report.set_ups_figures import COLOURS
 from harness.report.study_axes_figure import AxisGroup, axis_figure, axis_groups
 from harness.report.study_axes_rows import (
     SURFACE_HEADS,
@@ -23,7 +26,7 @@ from harness.report.study_example import StudyExample
 from harness.report.study_examples_figure import examples_figure
 from harness.report.study_operating_figure import operating_figure
 from harness.report.study_pod_figures import MOST_PANELS, curves_figure, signals_figure, with_room
-from harness.report.study_rows import limit_rows, name_of, study_answer, unbroken
+from harness.report.study_rows import is_within_sizes, limit_notes, limit_rows, name_of, study_answer, unbroken
 from harness.report.study_surface_figure import surface_figure
 from harness.report.study_tables import (
     CHANCE_HEADS,
@@ -69,6 +72,7 @@ def study_html(
 ) -> str:
     """The page as text; see `write_study_report`."""
     limits = result.limits
+    rows = limit_rows(limits)
     surfaces = [(one.limit, one.surface) for one in result.set_ups if one.surface is not None]
     groups = axis_groups(result.axes)
     shown = _examples_by_set_up(result, examples)
@@ -76,9 +80,11 @@ def study_html(
         title=title,
         answer=unbroken(study_answer(limits)),
         rule=_rule(result),
-        limits=[replace(row, name=unbroken(row.name)) for row in limit_rows(limits)],
+        limits=[replace(row, name=unbroken(row.name)) for row in rows],
+        limit_notes=[unbroken(note) for note in limit_notes(rows)],
         most_panels=MOST_PANELS,
         axes=[_axis(group, _axis_name(number)) for number, group in enumerate(groups)],
+        has_depths=any(depth_varies(limit.record.inspected.depth_mm) for limit in limits),
         surface_heads=SURFACE_HEADS,
         surface_rows=surface_rows(surfaces),
         surface_notes=_without_surface(result),
@@ -94,7 +100,7 @@ def study_html(
         operating_heads=OPERATING_HEADS,
         operating_rows=operating_rows(result.set_ups),
         operating_notes=operating_notes(result.set_ups),
-        examples=[(head, name) for name, (head, _) in shown.items()],
+        examples=[(name_of(limit), name) for name, (limit, _) in shown.items()],
         size_tables=size_tables(limits, [one.sizes for one in result.set_ups]),
         validity=result.validity,
         figures=_figures(result, groups, shown),
@@ -103,7 +109,7 @@ def study_html(
 
 
 def _figures(
-    result: StudyResult, groups: Sequence[AxisGroup], examples: Mapping[str, tuple[str, Sequence[StudyExample]]]
+    result: StudyResult, groups: Sequence[AxisGroup], examples: Mapping[str, tuple[SetUpLimit, Sequence[StudyExample]]]
 ) -> dict[str, str]:
     """The figures that the data allow, as SVG text by name."""
     shown = with_room(result.set_ups)
@@ -122,7 +128,10 @@ def _figures(
         figures["signals"] = signals_figure(signals)
     if curved:
         figures["operating"] = operating_figure(curved)
-    return figures | {name: examples_figure(name, some, head) for name, (head, some) in examples.items()}
+    return figures | {
+        name: examples_figure(name, some, name_of(limit), by_limit=is_within_sizes(limit))
+        for name, (limit, some) in examples.items()
+    }
 
 
 def _rule(result: StudyResult) -> str:
@@ -138,7 +147,12 @@ def _axis_name(number: int) -> str:
 
 
 def _axis(group: AxisGroup, name: str) -> dict[str, Any]:
-    caption = "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95."
+    caption = (
+        "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95. What lies far beyond the "
+        "largest size inspected (dotted) is an arrow. No limit: a90/95 is not demonstrated within the sizes inspected."
+    )
+    if len(group.lines) > len(COLOURS):
+        caption += f" The first {len(COLOURS)} of {len(group.lines)} lines; the table goes on."
     if not group.numeric:
         caption += " The values have no order."
     return {
@@ -153,14 +167,14 @@ def _axis(group: AxisGroup, name: str) -> dict[str, Any]:
 
 def _examples_by_set_up(
     result: StudyResult, examples: Sequence[StudyExample]
-) -> dict[str, tuple[str, list[StudyExample]]]:
+) -> dict[str, tuple[SetUpLimit, list[StudyExample]]]:
     """Name of the figure -> the set-up and its examples, of those set-ups with room on the page."""
     found = []
     for one in with_room(result.set_ups):
         record = one.limit.record
         some = [e for e in examples if (e.variant, e.frames) == (record.variant, record.frames)]
         if some:
-            found.append((name_of(one.limit), some))
+            found.append((one.limit, some))
     return {f"examples-{number + 1}": pair for number, pair in enumerate(found)}
 
 

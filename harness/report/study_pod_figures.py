@@ -35,15 +35,15 @@ def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
 
 def curves_figure(limits: Sequence[SetUpLimit]) -> str:
     """A panel for each set-up: hits and misses, the curve with its band, a50, a90 and a90/95, on one scale of sizes."""
-    low = min(_span(limit)[0] for limit in limits)
-    high = max(_span(limit)[1] for limit in limits)
+    span = _span(limits)
 
     def draw(axes: Axes, limit: SetUpLimit) -> None:
         if limit.statement is None:
             _without_curve(axes, limit)
         else:
-            draw_pod(axes, limit.statement, limit.a90_95, strength=min(0.6, 150 / max(limit.inspections, 1)))
-        axes.set(xlim=(low, high), xlabel="diameter (mm)", ylabel="probability of detection")
+            strength = min(0.6, 150 / max(limit.inspections, 1))
+            draw_pod(axes, limit.statement, limit.a90_95, strength, most=limit.largest_mm)
+        axes.set(xlim=span, xlabel="diameter (mm)", ylabel="probability of detection")
 
     return _panels("curves", limits, draw, " ".join(limit_sentence(limit) for limit in limits))
 
@@ -54,7 +54,7 @@ def signals_figure(limits: Sequence[SetUpLimit]) -> str:
     def draw(axes: Axes, limit: SetUpLimit) -> None:
         assert limit.signals is not None
         draw_signals(axes, limit.signals)
-        axes.set(xlabel="diameter (mm)", ylabel="highest score at the damage")
+        axes.set(xlim=_span([limit]), xlabel="diameter (mm)", ylabel="highest score at the damage")
 
     names = "; ".join(name_of(limit) for limit in limits)
     return _panels("signals", limits, draw, f"Score of each damage against its diameter, with the threshold: {names}.")
@@ -88,8 +88,11 @@ def _without_curve(axes: Axes, limit: SetUpLimit) -> None:
     axes.text(0.5, 0.5, plain(words), transform=axes.transAxes, ha="center", va="center", color=GREY, fontsize=9)
 
 
-def _span(limit: SetUpLimit) -> tuple[float, float]:
-    if limit.statement is not None:
-        return float(limit.statement.sizes[0]), float(limit.statement.sizes[-1])
-    sizes = limit.record.inspected.diameter_mm
-    return (float(sizes.min()), float(sizes.max())) if len(sizes) else (0.0, 1.0)
+def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
+    """The sizes inspected with 4 % of them on either side; of a single size a tenth of it."""
+    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    if not len(sizes):
+        return 0.0, 1.0
+    low, high = float(sizes.min()), float(sizes.max())
+    margin = 0.04 * (high - low) or 0.1 * abs(high) or 0.5
+    return (max(low - margin, 0.5 * low) if low > 0 else low - margin), high + margin

@@ -39,8 +39,8 @@ def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
 
     size = (5.2 * across, 3.9 * down + 0.7) if across > 1 else (8.6, 5.2)
     said = "; ".join(
-        f"{name_of(limit)}: a90 {mm_text(surface.a90_mm[0])} mm at {surface.depth_mm[0]:.3g} mm depth, "
-        f"{mm_text(surface.a90_mm[-1])} mm at {surface.depth_mm[-1]:.3g} mm"
+        f"{name_of(limit)}: a90 {mm_text(surface.a90_mm[0], limit.largest_mm)} mm at {surface.depth_mm[0]:.3g} mm "
+        f"depth, {mm_text(surface.a90_mm[-1], limit.largest_mm)} mm at {surface.depth_mm[-1]:.3g} mm"
         for limit, surface in surfaces
     )
     return svg("surface", size, f"Probability of detection over diameter and depth. {said}.", draw)

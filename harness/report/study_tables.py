@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.evaluation.intervals import Interval
+from harness.evaluation.pod.false_calls import FalseCallRate
 from harness.evaluation.pod.statement import CONFIDENCE, PodStatement
 from harness.evaluation.study.chance import ChanceHits
 from harness.evaluation.study.curves import PRO_LIMIT
@@ -14,7 +15,7 @@ from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.result import SetUpResult
 from harness.report.page_parts import mm
-from harness.report.study_rows import bound_text, mm_text, name_of, percent_text, with_interval
+from harness.report.study_rows import bound_text, mm_text, name_of, percent_text, unmeasured, with_interval
 
 CHANCE_HEADS = (
     "set-up",
@@ -56,7 +57,7 @@ def threshold_rows(limits: Sequence[SetUpLimit]) -> Rows:
                 f"{record.threshold:.3g}",
                 mm(record.threshold_mm),
                 str(record.calibration_runs) if record.calibration_runs else "none: given",
-                "–" if calls is None else f"{calls.calls} on {calls.area_m2:.3g} m²",
+                "–" if calls is None else _counted(calls),
                 "–" if calls is None else with_interval(calls.rate_per_m2, calls.interval_per_m2),
                 f"{over.low:.2f} to {over.high:.2f}" if over.known else "–",
             )
@@ -71,10 +72,10 @@ def signal_rows(limits: Sequence[SetUpLimit]) -> Rows:
             name_of(limit),
             str(len(limit.signals.size)),
             limit.signals.model,
-            mm_text(limit.signals.a50),
-            mm_text(limit.signals.a90),
-            bound_text(limit.signals.bound),
-            bound_text(limit.a90_95),
+            mm_text(limit.signals.a50, limit.largest_mm),
+            mm_text(limit.signals.a90, limit.largest_mm),
+            bound_text(limit.signals.bound, limit.largest_mm),
+            bound_text(limit.a90_95, limit.largest_mm),
         )
         for limit in limits
         if limit.signals is not None
@@ -92,8 +93,11 @@ def signal_tests(limits: Sequence[SetUpLimit]) -> tuple[tuple[str, ...], Rows]:
 def signal_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Why a set-up has no regression, and what to know of one that it has."""
     notes = [f"{name_of(limit)}: no regression: {limit.signals_why}" for limit in limits if limit.signals is None]
-    seen = [(limit, limit.signals.notes) for limit in limits if limit.signals is not None and limit.signals.notes]
-    return notes + [f"{name_of(limit)}: {'; '.join(of_fit)}" for limit, of_fit in seen]
+    for limit in limits:
+        of_fit = () if limit.signals is None else limit.signals.notes
+        said = [unmeasured(note) for note in of_fit]
+        notes += [f"{name_of(limit)}: {'; '.join(said)}"] if said else []
+    return notes
 
 
 def operating_rows(results: Sequence[SetUpResult]) -> Rows:
@@ -143,6 +147,10 @@ def threshold_note(record: StudyRecord) -> str:
         "(Wilks 1941), keeps to that rate. A threshold is itself an estimate: the rate on other boards scatters about "
         "the wanted one."
     )
+
+
+def _counted(calls: FalseCallRate) -> str:
+    return f"{calls.calls} call{'' if calls.calls == 1 else 's'} on {calls.area_m2:.3g} m²"
 
 
 def _tests(statement: PodStatement) -> list[tuple[str, str]]:

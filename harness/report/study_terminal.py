@@ -6,12 +6,21 @@ from typing import TYPE_CHECKING
 
 from harness.evaluation.study.result import StudyResult
 from harness.report.page_parts import aligned
-from harness.report.study_rows import LimitRow, limit_rows, study_answer
+from harness.report.study_rows import LimitRow, limit_notes, limit_rows, study_answer
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-HEADS = ("set-up", "a50", "a90", "a90/95", "over boards", "calls/m² (95 %)", "targets", "boards")
+HEADS = (
+    "set-up",
+    "a50 (mm)",
+    "a90 (mm)",
+    "a90/95 (mm)",
+    "over boards (mm)",
+    "calls/m² (95 %)",
+    "targets",
+    "boards",
+)
 
 
 def study_table(result: StudyResult) -> Table:
@@ -20,13 +29,13 @@ def study_table(result: StudyResult) -> Table:
     from rich.text import Text
 
     # No box, and no wrapping but of names: eight columns then fit a terminal of 100.
-    title = "detection limits in mm: found 50 and 90 % of the time, and 90 % with 95 % confidence"
+    title = "detection limits: found 50 and 90 % of the time, and 90 % with 95 % confidence"
     table = Table(title=title, box=None, pad_edge=False, collapse_padding=True)
     for head in HEADS:
         first = head == HEADS[0]
         table.add_column(head, justify="left" if first else "right", no_wrap=not first, overflow="fold")
     for row in limit_rows(result.limits):
-        colours = {HEADS.index("a90/95"): "bold green" if row.demonstrated else "bold red"}
+        colours = {HEADS.index("a90/95 (mm)"): "bold green" if row.demonstrated else "bold red"}
         table.add_row(*(Text(text, style=colours.get(at, "")) for at, text in enumerate(_cells(row))))
     return table
 
@@ -35,7 +44,7 @@ def study_text(result: StudyResult) -> str:
     """`study_table` as plain lines, then what to know beside it, then the answer."""
     rows = limit_rows(result.limits)
     table = aligned([list(HEADS), *(list(_cells(row)) for row in rows)])
-    notes = [f"{row.name}: {row.why}" for row in rows if row.why]
+    notes = limit_notes(rows)
     return "\n".join([*table, *([""] if notes else []), *notes, "", study_answer(result.limits)])
 
 

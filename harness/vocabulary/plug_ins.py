@@ -5,7 +5,6 @@ Names are looked up without importing anything; only what is asked for is import
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -70,10 +69,12 @@ class PlugIns:
         """
         found = [offer for offer in self.offers() if offer.name == name]
         if not found:
+            from harness.vocabulary.declaration.diagnose import nearest
+
             names = self.names()
-            near = difflib.get_close_matches(name, names, n=1)
+            near = nearest(name, names)
             raise UserError(
-                f"there is no {self.noun} {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
+                f"there is no {self.noun} {name!r}" + (f"; did you mean {near!r}?" if near else ""),
                 legal=", ".join(names),
                 fix=self.fix or f"install the package that offers it through the entry point group {self.group!r}",
             )
@@ -94,8 +95,8 @@ class PlugIns:
             for part in filter(None, attribute.split(".")):
                 found = getattr(found, part)
             return found
-        # whatever a foreign module does on import, the mistake is that it is installed here
-        except Exception as error:
+        # whatever a foreign module does on import, sys.exit() too, the mistake is that it is installed here
+        except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
             raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error

@@ -3,8 +3,9 @@
 Whole studies are drawn from a model of a detector: a damage's score grows with its area, times the luck of its place
 (the same whenever the board is inspected again) and of its board, plus noise of each inspection; the highest false
 score of a hole-free board is Gumbel distributed. Thresholds are calibrated on boards of their own, as a study does it,
-so the luck of that calibration is in the result. The baseline and the study differ in noise, in nothing, or in the
-detector's gain, by which a90 grows as its inverse square root.
+so the luck of that calibration is in the result. The baseline and the study differ in noise alone; or also in the
+detector's gain, by which a90 grows as its inverse square root; or in how much luck places have, by which the curve
+flattens about the same a50; or in the threshold that it finds at.
 """
 
 from __future__ import annotations
@@ -23,12 +24,18 @@ if __name__ == "__main__":
 from harness.evaluation.pod.false_calls import threshold_for_rate
 from harness.evaluation.study.paired import hits_change
 from harness.evaluation.study.paired_calls import calls_change
+from harness.evaluation.study.paired_swap import ENOUGH, swap_change
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
-from harness.evaluation.study.verdict import ALPHA, compare_studies
+from harness.evaluation.study.verdict import ALPHA, LIMIT_TESTS, compare_studies
 
 AREA_M2 = 0.054
+NORMAL_90 = 1.2816
+"""The normal distribution's 90th percentile."""
 RATE_PER_M2 = 2.0
+FEW_TOSSES = 499
+"""The verdict's test of a90 begins with the same tosses: where these are enough for it, it ends with the same p."""
 GROWTHS = (1.05, 1.10, 1.15, 1.20, 1.30)
+FLATTER = (1.10, 1.20, 1.30)
 SHIFTS = (1 / 1.5, 0.85, 1.15, 1.5)
 
 
@@ -54,28 +61,40 @@ class Model:
 class Size:
     """Boards with damage, damages on each, hole-free boards to judge and to calibrate, set-ups: of regression.yaml."""
 
-    boards: int = 30
+    boards: int = 40
     holes: int = 10
-    hole_free_boards: int = 20
-    calibration_boards: int = 20
+    hole_free_boards: int = 40
+    calibration_boards: int = 40
     set_ups: int = 2
 
 
-def study(size: Size, boards_seed: int, noise_seed: int, gain: float = 1.0, bias: float = 1.0) -> StudyRecord:
-    """A study; ``bias``: the detector finds at this multiple of the threshold that it was calibrated to."""
-    set_ups = tuple(_set_up(size, boards_seed, noise_seed, place, gain, bias) for place in range(size.set_ups))
+@dataclass(frozen=True)
+class Change:
+    """What became of the detector: its ``gain``; ``flatter``: growth of a90 over a50 by more luck of places; ``bias``:
+    it finds at this multiple of the threshold that it was calibrated to."""
+
+    gain: float = 1.0
+    flatter: float = 1.0
+    bias: float = 1.0
+
+
+def study(size: Size, boards_seed: int, noise_seed: int, change: Change = Change()) -> StudyRecord:
+    """A study of the detector as it is, or as it became by ``change``."""
+    set_ups = tuple(_set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups))
     return StudyRecord("model", "", 15.0, RATE_PER_M2, {}, set_ups)
 
 
-def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, gain: float, bias: float) -> SetUpRecord:
+def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: Change) -> SetUpRecord:
     model = Model()
+    # Scores grow as the diameter squared: ln(a90 / a50) is half the 90th percentile of the luck's logarithm.
+    place = model.place + 2 * np.log(change.flatter) / NORMAL_90
     of_boards, noise = (np.random.default_rng(key) for key in ((boards_seed, 1), (boards_seed, noise_seed, number, 2)))
     n = size.boards * size.holes
     board = np.repeat(np.arange(size.boards), size.holes)
     diameter = of_boards.uniform(2.0, 8.0, n)
-    luck = model.place * of_boards.standard_normal(n)
+    luck = place * of_boards.standard_normal(n)
     luck += model.of_board * of_boards.standard_normal(size.boards)[board]
-    signal = gain * model.score_at_6_mm * (diameter / 6.0) ** 2 * np.exp(luck)
+    signal = change.gain * model.score_at_6_mm * (diameter / 6.0) ** 2 * np.exp(luck)
     signal = np.abs(signal + model.noise * noise.standard_normal(n))
     calibration, judged = (
         model.false_score + model.false_spread * noise.gumbel(size=count)
@@ -96,40 +115,44 @@ def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, gain: fl
         failed=0,
         targets_digest=str(boards_seed),
         frames_digest=f"{boards_seed} {noise_seed}",
-        inspected=Inspected(board, names, repeat, diameter, zero, zero, zero, signal > bias * threshold, signal),
+        inspected=Inspected(board, names, repeat, diameter, zero, zero, zero, signal > change.bias * threshold, signal),
         unflawed=Unflawed(
             np.arange(size.hole_free_boards),
             np.zeros(size.hole_free_boards, int),
-            (judged > bias * threshold).astype(int),
+            (judged > change.bias * threshold).astype(int),
             np.full(size.hole_free_boards, AREA_M2),
         ),
     )
 
 
 def fails(baseline: StudyRecord, found: StudyRecord) -> bool:
-    """Whether the gate fails; curves are fitted only where a test lets it (a second each)."""
+    """Whether the gate fails; the verdict is asked only where a test lets it (a second each)."""
     comparison = compare_studies(baseline, found) if _may_fail(baseline, found) else None
     return comparison is not None and any(row.is_worse for row in comparison.rows)
 
 
 def _may_fail(baseline: StudyRecord, found: StudyRecord) -> bool:
     """Necessary for a failure by a test where both have the same boards: Holm's smallest p is below its level."""
-    smallest = 1.0
-    for one, other in zip(baseline.set_ups, found.set_ups, strict=True):
-        if one.targets_digest != other.targets_digest:
-            return True
-        hits, calls = hits_change(one.inspected, other.inspected), calls_change(one, other, RATE_PER_M2)
-        smallest = min([smallest, *([hits.fewer_p] if hits else []), *([calls.more_p] if calls else [])])
-    return smallest * 2 * len(found.set_ups) < ALPHA
+    pairs = list(zip(baseline.set_ups, found.set_ups, strict=True))
+    if any(one.targets_digest != other.targets_digest for one, other in pairs):
+        return True
+    questions = 2 * len(pairs)
+    calls = (calls_change(one, other, RATE_PER_M2) for one, other in pairs)
+    if any(one is not None and questions * one.more_p < ALPHA for one in calls):
+        return True
+    hits = (hits_change(one.inspected, other.inspected) for one, other in pairs)
+    if any(one is not None and questions * LIMIT_TESTS * one.fewer_p < ALPHA for one in hits):
+        return True
+    swaps = (swap_change(one.inspected, other.inspected, FEW_TOSSES) for one, other in pairs)
+    return any(one is not None and one.grown_p <= 0.5 * ENOUGH / (FEW_TOSSES + 1) for one in swaps)
 
 
-def share(size: Size, times: int, gain: float = 1.0, bias: float = 1.0, *, other_boards: bool = False) -> float:
+def share(size: Size, times: int, change: Change = Change(), *, other_boards: bool = False) -> float:
     """Share of ``times`` checks that fail, each with boards and noise of its own."""
     failing = 0
     for draw in range(times):
         boards = 2 * draw
-        found = study(size, boards + other_boards, 2, gain, bias)
-        failing += fails(study(size, boards, 1), found)
+        failing += fails(study(size, boards, 1), study(size, boards + other_boards, 2, change))
     return failing / times
 
 
@@ -137,16 +160,19 @@ def main() -> None:
     """Print what stands in the documentation of `harness.check`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quiet", type=int, default=2000, help="checks in which nothing changes but the noise")
-    parser.add_argument("--changed", type=int, default=60, help="checks for each change")
+    parser.add_argument("--changed", type=int, default=60, help="checks for each change, and on other boards")
     options = parser.parse_args()
     began, size = time.perf_counter(), Size()
     print(size)
-    print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet} checks fail", flush=True)
+    changes = {
+        **{f"a90 grows by {growth:.2f}": Change(gain=growth**-2) for growth in GROWTHS},
+        **{f"a90 grows by {growth:.2f}, a50 does not": Change(flatter=growth) for growth in FLATTER},
+        **{f"finds at {shift:.2f} of its threshold": Change(bias=shift) for shift in SHIFTS},
+    }
+    for what, change in changes.items():
+        print(f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail", flush=True)
+    print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet}", flush=True)
     print(f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}", flush=True)
-    for growth in GROWTHS:
-        print(f"a90 grows by {growth:.2f}: {share(size, options.changed, gain=growth**-2):.2f}", flush=True)
-    for shift in SHIFTS:
-        print(f"finds at {shift:.2f} of its threshold: {share(size, options.changed, bias=shift):.2f}", flush=True)
     print(f"{time.perf_counter() - began:.0f} s")
 
 

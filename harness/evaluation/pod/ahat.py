@@ -26,6 +26,8 @@ from harness.vocabulary.errors import UserError
 
 LEAST_TARGETS = 40
 """MIL-HDBK-1823A: independent targets that an a-hat study should have at least."""
+SAME = 1e-9
+"""Share of the largest signal within which signals differ by rounding alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +97,15 @@ def fit_ahat(
 
     Signals <= ``left`` are at the noise floor, signals >= ``right`` saturated. ``inspections`` (n,): which target a row
     inspects, where a target was measured more than once. UserError: not finite, sizes or signals <= 0 under a
-    logarithm, a decision outside the limits, too few signals between them, a signal that does not grow with size.
+    logarithm, a decision outside the limits, too few signals between them, signals that are all alike or do not grow
+    with size.
     """
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
     target = _targets(sizes, signals, inspections)
     _check_limits(decision, left, right)
     below = np.zeros(len(signals), bool) if left is None else signals <= left
     above = np.zeros(len(signals), bool) if right is None else signals >= right
+    _check_variation(signals[~(below | above)])
     at_limit = np.clip(signals, -np.inf if left is None else left, np.inf if right is None else right)
     x = _axis("sizes", sizes, log_size)
     y = _axis("signals", at_limit, log_signal)
@@ -238,6 +242,15 @@ def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
     if np.any(values <= 0):
         raise UserError(f"{name} <= 0 have no logarithm (smallest {values.min():.6g})", legal="values above 0")
     return np.log(values)
+
+
+def _check_variation(signals: np.ndarray) -> None:
+    """Signals between the limits that differ by rounding alone have no slope and no scatter."""
+    if len(signals) > 1 and np.ptp(signals) <= SAME * np.abs(signals).max():
+        raise UserError(
+            f"the signals do not vary: all {len(signals)} between the limits are {signals[0]:.6g}",
+            fix="take hits and misses instead: signals that are all alike say nothing of size",
+        )
 
 
 def _check_limits(decision: float, left: float | None, right: float | None) -> None:

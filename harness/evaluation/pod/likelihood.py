@@ -118,15 +118,46 @@ def maximum(data: HitsAndMisses) -> tuple[float, float]:
 
 
 def penalised_maximum(data: HitsAndMisses) -> tuple[float, float]:
-    """(b0, b1) of the largest penalised likelihood, which is finite for separated data too (`data.penalty`)."""
-    start = [float(link_ppf(data.link, np.mean(data.hit))), 1.0]
-    found = optimize.minimize(
-        lambda place: -float(data.value(place[0], place[1])),
-        start,
-        method="Nelder-Mead",
-        options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 5000, "maxfev": 5000},
+    """(b0, b1) of the largest penalised likelihood, which is finite for separated data too (`data.penalty`). Under
+    cloglog and loglog it can have several maxima: the higher one is taken from a flat start and from the best of
+    `steep_starts`."""
+    flat = np.array([float(link_ppf(data.link, np.mean(data.hit))), 1.0])
+    steep = steep_starts(float(data.z[~data.hit].max()), float(data.z[data.hit].min()))
+    best_steep = steep[int(np.argmax([data.value(*one) for one in steep]))]
+    found = [
+        optimize.minimize(
+            lambda place: -float(data.value(place[0], place[1])),
+            start,
+            method="Nelder-Mead",
+            options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 5000, "maxfev": 5000},
+        )
+        for start in (flat, best_steep)
+    ]
+    best = min(found, key=lambda one: float(one.fun))
+    return float(best.x[0]), float(best.x[1])
+
+
+def steep_starts(below: np.ndarray | float, above: np.ndarray | float) -> np.ndarray:
+    """(k, 2, ...) intercepts and slopes of curves of several widths through both ends and the middle of the gap between
+    the largest miss ``below`` and the smallest hit ``above``, in sizes of unit spread."""
+    gap = np.asarray(above, float) - below
+    return np.array(
+        [
+            (-slope * (below + share * gap), slope * np.ones_like(gap))
+            for slope in np.geomspace(1.5, 150.0, 9)
+            for share in (0.0, 0.5, 1.0)
+        ]
     )
-    return float(found.x[0]), float(found.x[1])
+
+
+def slope_of_log_density(link: str, predictor: np.ndarray) -> np.ndarray:
+    """d ln f / dt at t = ``predictor``, f the link's density."""
+    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
+    if link == "logit":
+        return np.asarray(-np.tanh(0.5 * t))
+    if link == "probit":
+        return np.asarray(-t)
+    return np.asarray(1.0 - np.exp(t) if link == "cloglog" else np.exp(-t) - 1.0)
 
 
 def profile(data: HitsAndMisses, z0: float, predictor: float) -> float:

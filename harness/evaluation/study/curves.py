@@ -2,8 +2,9 @@
 
 - ROC: signals of damages against signals of the same places on boards without damage. Signals are the highest scores
   within the hit radius, so a larger radius raises both.
-- Free-response curve (FROC): share of damages found against false calls per square metre of face, of damaged and
-  hole-free boards together (Chakraborty, Medical Physics 16 (1989), 561). Second findings of one are false calls.
+- Free-response curve (FROC): share of the damages of damaged boards that were found, against false calls per square
+  metre of hole-free boards (Chakraborty, Medical Physics 16 (1989), 561, counts them on all images). Beside damage
+  there are second findings and rims of it, which hole-free face does not have: the rate is the table's and the gate's.
 - AU-PRO: mean share of each damage's pixels above a threshold against the share of undamaged pixels above it,
   integrated to a false-positive rate of 0.3 and divided by it (Bergmann et al., Int. J. Computer Vision 129 (2021),
   1038, section 4.3); and the area under the ROC of pixels. Judged pixels only.
@@ -48,7 +49,7 @@ class FreeResponse:
     """At ``threshold`` (k,), descending: ``false_calls_per_m2`` (k,), ``found`` (k,) share of all damages,
     ``found_low`` and ``found_high`` (k,) its interval over boards. ``large_found`` (k,): share of those of a50 and more
     whose signal is above it, None without them. ``at``: (false calls per m2, found) at the threshold in use;
-    ``area_m2`` inspected.
+    ``area_m2`` of hole-free boards inspected.
     """
 
     threshold: np.ndarray
@@ -101,36 +102,36 @@ def free_response(
     a50_mm: float,
     draws: int = DRAWS,
 ) -> FreeResponse | None:
-    """The free-response curve of one set-up; None where no damage was inspected or no other threshold was counted.
+    """The free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
+    threshold was counted.
 
-    It ends where lower thresholds no longer give more false calls: below, findings run into one another, down to one
-    that covers the board.
+    Thresholds with fewer false calls than a higher one has are left out: that far down findings run into one another,
+    to one that covers the board, and the curve would fold back.
     """
-    if operating.empty or holes.empty:
+    free = runs[runs["role"] == "hole_free"] if len(runs) else runs
+    if operating.empty or holes.empty or free.empty:
         return None
-    judged = runs[runs["role"].isin(("damaged", "hole_free"))]
-    area_m2 = float(judged["inspected_m2"].sum())
-    by_threshold = operating.groupby("threshold", sort=True)[["findings", "hits"]].sum().iloc[::-1]
-    calls = (by_threshold["findings"] - by_threshold["hits"]).to_numpy(float)
-    kept = int(calls.argmax()) + 1 if calls.any() else len(calls)
-    thresholds = by_threshold.index.to_numpy(float)[:kept]
+    area_m2 = float(free["inspected_m2"].sum())
+    flawless = operating[operating["role"] == "hole_free"].groupby("threshold", sort=True)["findings"].sum().iloc[::-1]
+    calls = flawless.to_numpy(float)
+    kept = calls >= np.maximum.accumulate(calls)
+    thresholds = flawless.index.to_numpy(float)[kept]
     damaged = operating[operating["role"] == "damaged"]
     of_board = holes.groupby("board", sort=True).size()
     # A board that was too full for any damage has runs, and no inspections.
     counted = damaged.pivot_table("hits", "board", "threshold", "sum", sort=True).reindex(of_board.index, fill_value=0)
-    hits, inspections = counted.to_numpy(float)[:, ::-1][:, :kept], of_board.to_numpy(float)
+    hits, inspections = counted[thresholds].to_numpy(float), of_board.to_numpy(float)
     low, high = _columns_percentiles(_shares(hits, inspections, draws))
     size, signal = holes["true_diameter_mm"].to_numpy(float), _signal(holes)
     large = signal[size >= a50_mm]
-    detections, matched = int(judged["detections"].sum()), int(holes["detected"].sum())
     return FreeResponse(
         threshold=thresholds,
-        false_calls_per_m2=calls[:kept] / area_m2,
+        false_calls_per_m2=calls[kept] / area_m2,
         found=hits.sum(axis=0) / inspections.sum(),
         found_low=low,
         found_high=high,
         large_found=(large[:, None] > thresholds).mean(axis=0) if len(large) else None,
-        at=((detections - matched) / area_m2, matched / len(holes)),
+        at=(int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean())),
         area_m2=area_m2,
     )
 

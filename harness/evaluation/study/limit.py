@@ -10,7 +10,7 @@ covers 86 % with 20 boards and 94 % with 60 even there (300 studies, ``tests/val
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from harness.evaluation.study.over_boards import (
     targets_of,
 )
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.evaluation.study.surface import depth_varies
 from harness.vocabulary.errors import UserError
 
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
@@ -89,14 +90,25 @@ class SetUpLimit:
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     @property
+    def largest_mm(self) -> float:
+        """The largest diameter inspected, NaN without any. Of what lies beyond it the curve alone speaks."""
+        seen = self.record.inspected.diameter_mm
+        return float(seen.max()) if len(seen) else np.nan
+
+    def beyond(self, size_mm: float) -> bool:
+        """Whether a size (an estimate, a bound or the end of an interval) lies beyond ``largest_mm``."""
+        return bool(size_mm > self.largest_mm)
+
+    @property
     def over_boards_mm(self) -> float:
         """The size of ``over_boards``."""
         return self.over_boards.value
 
     @property
     def boards_matter(self) -> bool:
-        """Whether the limit over boards is more than 10 % above a90/95."""
-        return bool(self.over_boards_mm > WIDER * self.a90_95.value)
+        """Whether the limit over boards is more than 10 % above a90/95 by a design effect: where that is unknown, as of
+        boards that were all found, the number of boards is to blame and not what they have in common."""
+        return bool(np.isfinite(self.design_effect) and self.over_boards_mm > WIDER * self.a90_95.value)
 
 
 def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np.nan) -> SetUpLimit:
@@ -160,9 +172,16 @@ def _statement(record: SetUpRecord) -> tuple[PodStatement | None, str]:
     if not len(seen.hit):
         return None, "no damage was inspected"
     try:
-        return state_hits(_rows(record, seen.hit, np.ones(len(seen.hit), bool)), unit="mm"), ""
+        stated = state_hits(_rows(record, seen.hit, np.ones(len(seen.hit), bool)), unit="mm")
     except UserError as error:
         return None, error.message
+    return replace(stated, notes=(*stated.notes, *_over_depths(seen))), ""
+
+
+def _over_depths(seen: Inspected) -> tuple[str, ...]:
+    if not depth_varies(seen.depth_mm):
+        return ()
+    return (f"depths from {seen.depth_mm.min():.3g} to {seen.depth_mm.max():.3g} mm: one curve over all depths",)
 
 
 def _signals(record: SetUpRecord, noise_floor: float) -> tuple[PodStatement | None, str]:

@@ -14,7 +14,8 @@ import numpy as np
 
 from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval
 from harness.evaluation.pod.curve import PodCurve, link_ppf
-from harness.evaluation.pod.likelihood import LARGEST_PREDICTOR, logs_of_link
+from harness.evaluation.pod.likelihood import logs_of_link, slope_of_log_density
+from harness.evaluation.study.penalised import penalised_maxima
 from harness.vocabulary.seeds import random_stream
 
 DRAWS = 500
@@ -71,32 +72,58 @@ def percentiles(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
 
 
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
-    """(len(pods), draws) sizes in mm with these PODs, ``curve``'s link and axis refitted to boards drawn again.
-
-    Without an estimate in a draw: infinite where nothing is found or the chance does not grow with size; the smallest
-    size inspected where everything is found; where hits and misses do not overlap, the middle of the gap.
-    """
+    """(len(pods), draws) sizes in mm with these PODs, ``curve``'s link and axis refitted to boards drawn again as
+    `harness.evaluation.pod.hit_miss` fits one study: by Firth's penalty where hits and misses do not overlap."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre, spread = float(x.mean()), float(x.std()) or 1.0
     z = (x - centre) / spread
     weights = row_weights(targets.board, draws)
     hits, misses = weights * targets.hits, weights * (targets.inspections - targets.hits)
-    largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
-    smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
-    at: np.ndarray = np.full((len(pods), draws), np.inf)
-    at[:, largest_miss == -np.inf] = z.min()
-    apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & (largest_miss <= smallest_hit)
-    at[:, apart] = 0.5 * (largest_miss + smallest_hit)[apart]
-    overlap = (largest_miss > smallest_hit).nonzero()[0]
     start = np.array([(centre - curve.mu) / curve.sigma, spread / curve.sigma])
-    design = np.column_stack([np.ones_like(z), z])
-    b0, b1 = weighted_maxima(design, hits[overlap], misses[overlap], curve.link, start).T
-    levels = np.asarray(link_ppf(curve.link, np.array(pods)))[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at[:, overlap] = np.where(b1 > 0, (levels - b0) / b1, np.inf)
+    repeats = (weights @ targets.inspections) / weights.sum(axis=1)
+    at = fitted_sizes(z, hits, misses, curve.link, start, pods, repeats)
     back = centre + spread * at
     with np.errstate(over="ignore"):
         return np.exp(back) if curve.log_size else back
+
+
+def fitted_sizes(
+    z: np.ndarray,
+    hits: np.ndarray,
+    misses: np.ndarray,
+    link: str,
+    start: np.ndarray,
+    pods: tuple[float, ...],
+    repeats: np.ndarray | None = None,
+) -> np.ndarray:
+    """(len(pods), draws) sizes with these PODs, by curves fitted to each draw's ``hits`` and ``misses`` (draws, n) at
+    sizes ``z`` (n,); ``start`` (2,): coefficients that the search begins with.
+
+    Without an estimate in a draw: infinite where nothing is found or the chance does not grow with size; the smallest
+    size inspected where everything is found. Where hits and misses do not overlap, the curve by Firth's penalised
+    likelihood with ``repeats`` (draws,) inspections of a target; the middle of the gap, for all PODs, without them.
+    """
+    largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
+    smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
+    at: np.ndarray = np.full((len(pods), len(hits)), np.inf)
+    at[:, largest_miss == -np.inf] = z.min()
+    apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & (largest_miss <= smallest_hit)
+    levels = np.asarray(link_ppf(link, np.array(pods)))[:, None]
+    if repeats is None:
+        at[:, apart] = 0.5 * (largest_miss + smallest_hit)[apart]
+    elif apart.any():
+        at[:, apart] = _crossings(penalised_maxima(z, hits[apart], misses[apart], link, repeats[apart]), levels)
+    overlap = (largest_miss > smallest_hit).nonzero()[0]
+    design = np.column_stack([np.ones_like(z), z])
+    at[:, overlap] = _crossings(weighted_maxima(design, hits[overlap], misses[overlap], link, start), levels)
+    return at
+
+
+def _crossings(b: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """(levels, draws) sizes at which curves ``b`` (draws, 2) reach predictors ``levels`` (k, 1); infinite if flat."""
+    b0, b1 = b.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(b1 > 0, (levels - b0) / b1, np.inf)
 
 
 def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
@@ -158,22 +185,12 @@ def weighted_maxima(
         ahead = moving[better]
         place[ahead], best[ahead] = trial[better], np.maximum(value[better], best[ahead])
         up, down = np.exp(logs.log_density - logs.log_hit), np.exp(logs.log_density - logs.log_miss)
-        bend = _slope_of_log_density(link, predictor)
+        bend = slope_of_log_density(link, predictor)
         slope = k * up - m * down
         weight = k * up * np.maximum(up - bend, 0.0) + m * down * np.maximum(down + bend, 0.0)
         step[ahead] = _steps(design, slope[better], weight[better])
         moving = moving[np.abs(step[moving]).max(axis=1) > 1e-7 * (1.0 + np.abs(place[moving]).max(axis=1))]
     return place
-
-
-def _slope_of_log_density(link: str, predictor: np.ndarray) -> np.ndarray:
-    """d ln f / dt at t = ``predictor``, f the link's density."""
-    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
-    if link == "logit":
-        return np.asarray(-np.tanh(0.5 * t))
-    if link == "probit":
-        return -t
-    return np.asarray(1.0 - np.exp(t) if link == "cloglog" else np.exp(-t) - 1.0)
 
 
 def _steps(design: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -35,6 +35,11 @@ class HitsChange:
     more_p: float
 
     @property
+    def sides(self) -> tuple[float, float]:
+        """p of (worse, better)."""
+        return self.fewer_p, self.more_p
+
+    @property
     def boards_p(self) -> float:
         """The test over boards, two-sided: what decides."""
         return min(1.0, 2 * min(self.fewer_p, self.more_p))
@@ -45,7 +50,10 @@ class LimitChange:
     """a90 of the second set-up over and less that of the first.
 
     ``interval_mm``: 95 % percentiles of the difference over boards drawn again: the same boards for both where
-    ``paired``, else independently. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown (shrunk).
+    ``paired``, else independently. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown (shrunk), and
+    with 500 draws never below 1/501 where paired. Unpaired it is a share of all 250,000 pairs of draws; of a share
+    below 1/501 each the tails of both are no more than their few outermost draws: significance there is a matter of
+    the two distributions hardly overlapping, not of a p known to its digits.
     """
 
     ratio: float
@@ -54,6 +62,11 @@ class LimitChange:
     grown_p: float
     shrunk_p: float
     paired: bool
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """p of (worse, better)."""
+        return self.grown_p, self.shrunk_p
 
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:

@@ -4,18 +4,24 @@ Two honest calibrations for one wanted rate give two different true rates: with 
 threshold, the chance that a new board calls is Beta(4, 57) distributed (Wilks 1941), half its mean to either side. A
 test of two Poisson counts that ignores it is called at 5 % in 20 % of honest pairs with 240 hole-free boards each. So
 the test that decides gives each set-up its own draw of that distribution, and asks how many of all boards that called
-are the second's. On identical frames both had the same luck, as far as they score alike: there the signs of each
-board's difference are tossed instead, and smaller changes show.
+are the second's. On identical frames with the same threshold both had the same luck: there the signs of each board's
+difference are tossed instead, and smaller changes show. Identical frames alone are not enough: a detector that scores
+otherwise has luck of its own on them, and of two equally good ones with 240 boards each, that toss alone calls 6 % at
+0.1 %. So where detector, version, settings or anything else moved the threshold, both tests must agree.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from harness.evaluation.study.paired import sign_flip
 from harness.evaluation.study.record import SetUpRecord, Unflawed
+
+SAME = 1e-6
+"""Relative difference of one threshold from machine to machine."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +30,9 @@ class CallsChange:
     (first, second).
 
     ``counts_p``: conditional binomial test of two Poisson counts, two-sided (Przyborowski and Wilenski 1940), as if
-    thresholds were known. ``more_p``, ``fewer_p``: one-sided, they decide: over boards, and over draws of the
-    calibration unless the frames are ``identical``.
+    thresholds were known. ``more_p``, ``fewer_p``: one-sided, they decide. They toss the signs of boards where frames
+    and threshold are the same (``way`` "signs"); allow for two draws of the calibration on different frames
+    ("calibrations"); and are the larger of both on identical frames with calibrated thresholds that differ ("both").
     """
 
     calls: tuple[int, int]
@@ -35,7 +42,12 @@ class CallsChange:
     counts_p: float
     more_p: float
     fewer_p: float
-    identical: bool
+    way: Literal["signs", "calibrations", "both"]
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """p of (worse, better)."""
+        return self.more_p, self.fewer_p
 
     @property
     def rates_per_m2(self) -> tuple[float, float]:
@@ -62,12 +74,20 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     ranks = tuple(_rank(record, wanted_per_m2) for record in (first, second))
     boards, calling = zip(*(_calling(table) for table in tables), strict=True)
     counts = float(binomtest(calls[1], sum(calls), areas[1] / sum(areas)).pvalue) if sum(calls) else 1.0
-    identical = first.frames_digest == second.frames_digest
-    if identical:
-        fewer, more = sign_flip(_gained(*tables))
-    else:
-        fewer, more = _tails(_share(boards, sum(calling), ranks), calling[1], sum(calling))
-    return CallsChange(calls, areas, boards, calling, counts, more, fewer, identical)  # type: ignore[arg-type]
+    way = _way(first, second)
+    by_signs = sign_flip(_gained(*tables)) if way != "calibrations" else (0.0, 0.0)
+    by_draws = _tails(_share(boards, sum(calling), ranks), calling[1], sum(calling)) if way != "signs" else (0.0, 0.0)
+    fewer, more = (max(pair) for pair in zip(by_signs, by_draws, strict=True))
+    return CallsChange(calls, areas, boards, calling, counts, more, fewer, way)  # type: ignore[arg-type]
+
+
+def _way(first: SetUpRecord, second: SetUpRecord) -> Literal["signs", "calibrations", "both"]:
+    """Scores on identical frames are alike if the calibration took the same number for threshold, which two ways of
+    scoring do by chance only where scores are few whole numbers. A given threshold had no luck."""
+    if first.frames_digest != second.frames_digest:
+        return "calibrations"
+    given = not first.calibration_runs and not second.calibration_runs
+    return "signs" if given or np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0) else "both"
 
 
 def _gained(first: Unflawed, second: Unflawed) -> np.ndarray:

@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from harness.evaluation.study.record_form import mistake_in
 from harness.vocabulary.errors import UserError
 
 RECORD_VERSION = 1
 """Raised when a field's meaning, or what counts as a hit, changes: records of two versions cannot be compared."""
+LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
+AGAIN = "run the study again, which writes the file anew; it is not made to be edited by hand"
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,35 +113,34 @@ def record_text(record: StudyRecord) -> str:
 def read_record(path: Path) -> StudyRecord:
     """The record at ``path``: a file, or a result folder with its ``study.json``.
 
-    Raises UserError where there is none, where it is no record, and where it is of another version.
+    Raises UserError where there is none, where it is no record or a damaged one (with set-up and field), and where
+    it is of another version.
     """
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = json.loads(file.read_text())
+        data = json.loads(file.read_text("utf-8"))
     except OSError as error:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
-    except ValueError as error:
-        raise UserError(f"{file}: is no JSON ({error})") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{file}: is no JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
-        raise UserError(f"{file}: is no study's record", legal="a study.json, or a baseline that --update wrote")
+        raise UserError(f"{file}: is no study's record", legal=LEGAL)
     if data["record_version"] != RECORD_VERSION:
         raise UserError(
             f"{file}: is a record of version {data['record_version']}",
             legal=f"version {RECORD_VERSION}",
             fix="run the study again with this version of tofpod",
         )
-    try:
-        set_ups = tuple(_set_up(one) for one in data["set_ups"])
-        return StudyRecord(
-            **{f.name: data[f.name] for f in fields(StudyRecord) if f.name != "set_ups"}, set_ups=set_ups
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{file}: is damaged: {error!r}", fix="run the study again") from error
+    if wrong := mistake_in(data):
+        raise UserError(f"{file}: is damaged: {wrong}", fix=AGAIN)
+    named = {field.name: data[field.name] for field in fields(StudyRecord) if field.name != "set_ups"}
+    return StudyRecord(**named, set_ups=tuple(_set_up(one) for one in data["set_ups"]))
 
 
 def _set_up_data(one: SetUpRecord) -> dict[str, Any]:
     data = {field.name: getattr(one, field.name) for field in fields(one)}
+    data["threshold_mm"] = None if np.isnan(one.threshold_mm) else one.threshold_mm
     return {**data, "inspected": _columns(one.inspected), "unflawed": _columns(one.unflawed)}
 
 
@@ -149,10 +151,9 @@ def _columns(table: Inspected | Unflawed) -> dict[str, list[Any]]:
 
 def _set_up(data: Mapping[str, Any]) -> SetUpRecord:
     plain = {f.name: data[f.name] for f in fields(SetUpRecord) if f.name not in ("inspected", "unflawed")}
+    plain["threshold_mm"] = np.nan if plain["threshold_mm"] is None else plain["threshold_mm"]
     inspected = Inspected(**{f.name: _array(f.name, data["inspected"][f.name]) for f in fields(Inspected)})
     unflawed = Unflawed(**{f.name: _array(f.name, data["unflawed"][f.name]) for f in fields(Unflawed)})
-    if len({len(getattr(inspected, f.name)) for f in fields(Inspected)}) > 1:
-        raise ValueError("columns of different lengths")
     return SetUpRecord(**plain, inspected=inspected, unflawed=unflawed)
 
 

@@ -1,8 +1,10 @@
 """POD over diameter and depth, where a study varies both: blind holes and dents.
 
-F^-1(POD) = b0 + b1 ln a + b2 ln d, and with b3 ln a ln d where a likelihood ratio test at 5 % asks for it; logit or
-probit, whichever has less deviance. a = diameter, d = depth of removed material. Extrapolation beyond the sizes and
-depths inspected is not meant. Not modelled: floor and ceiling; a bound by likelihood ratio (intervals are over boards).
+F^-1(POD) = b0 + b1 ln a + b2 ln d, and with b3 ln a ln d where a likelihood ratio test at 5 % asks for it and POD still
+grows with both everywhere inside what was inspected: few damages can bend a surface so that it falls where there are
+none. Logit or probit, whichever has less deviance. a = diameter, d = depth of removed material. Extrapolation beyond
+the sizes and depths inspected is not meant. Not modelled: floor and ceiling; a bound by likelihood ratio (intervals are
+over boards).
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ class PodSurface:
     last. ``depth_mm`` (k,), ``a90_mm`` (k,) with ``a90_low_mm``, ``a90_high_mm`` (k,) 95 % percentiles over boards,
     which hold the truth in some 87 % of studies of 30 boards; infinite where none. ``depth_slope``: minus d ln a90 /
     d ln depth (b2 / b1, with an interaction at mean ln a and ln d), with its interval. ``diameter_range_mm``,
-    ``depth_range_mm``: inspected."""
+    ``depth_range_mm``: inspected. ``note``: what to know beside it, "" where there is nothing."""
 
     link: str
     b: np.ndarray
@@ -44,6 +46,7 @@ class PodSurface:
     depth_slope_interval: Interval
     diameter_range_mm: tuple[float, float]
     depth_range_mm: tuple[float, float]
+    note: str = ""
 
     def pod(self, diameter_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """POD at diameters and depths of a common shape."""
@@ -56,7 +59,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     seen = record.inspected
     if not len(seen.hit) or seen.hit.all() or not seen.hit.any():
         return None, "every damage fared alike: there is no surface to fit"
-    if seen.depth_mm.min() <= 0 or seen.depth_mm.max() < LEAST_RATIO * seen.depth_mm.min():
+    if seen.depth_mm.min() <= 0 or not depth_varies(seen.depth_mm):
         return None, f"depth does not vary: {seen.depth_mm.min():g} to {seen.depth_mm.max():g} mm"
     if np.ptp(seen.diameter_mm) == 0:
         return None, f"diameter does not vary: {seen.diameter_mm[0]:g} mm"
@@ -67,10 +70,31 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     plain = min((_fit(a, d, seen.hit, link, False) for link in LINKS), key=lambda fit: fit.deviance)
     crossed = _fit(a, d, seen.hit, plain.link, True) if not _separated(_design(a, d, True), seen.hit) else None
     p = np.nan if crossed is None else _chi2_tail(max(plain.deviance - crossed.deviance, 0.0) / repeats)
-    chosen = crossed if crossed is not None and p < 0.05 else plain
-    if _slopes(chosen.b[None], a.mean(), d.mean())[0][0] <= 0:
+    bent = crossed if crossed is not None and p < 0.05 else None
+    falling = "" if bent is None else _falling(bent.b, a, d)
+    chosen = plain if bent is None or falling else bent
+    if plain.b[1] <= 0 and chosen is plain:
         return None, "the chance of detection does not grow with diameter"
-    return _surface(record, chosen, p, draws), ""
+    return _surface(record, chosen, p, draws, _note(plain, falling) if chosen is plain else ""), ""
+
+
+def _falling(b: np.ndarray, a: np.ndarray, d: np.ndarray) -> str:
+    """With which of the two POD falls somewhere between the least and the largest ln a and ln d, "" with neither. The
+    slope along the one is linear in the other, so its ends tell."""
+    along = min(_slopes(b[None], 0.0, end)[0][0] for end in (d.min(), d.max()))
+    across = min(_slopes(b[None], end, 0.0)[1][0] for end in (a.min(), a.max()))
+    return " and ".join(name for name, slope in (("diameter", along), ("depth", across)) if slope < 0)
+
+
+def _note(plain: _Fit, falling: str) -> str:
+    if falling:
+        return f"with an interaction POD would fall with {falling} inside what was inspected: fitted without"
+    return "POD falls with depth" if plain.b[2] < 0 else ""
+
+
+def depth_varies(depth_mm: np.ndarray) -> bool:
+    """Whether depths (n,) differ enough to matter."""
+    return bool(len(depth_mm) and depth_mm.max() >= LEAST_RATIO * depth_mm.min())
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +124,7 @@ def _maxima(
     return weighted_maxima(z, hits, misses, link, first) @ back.T
 
 
-def _surface(record: SetUpRecord, fit: _Fit, p: float, draws: int) -> PodSurface:
+def _surface(record: SetUpRecord, fit: _Fit, p: float, draws: int, note: str) -> PodSurface:
     seen = record.inspected
     a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
     crossed = len(fit.b) > 3
@@ -126,6 +150,7 @@ def _surface(record: SetUpRecord, fit: _Fit, p: float, draws: int) -> PodSurface
         depth_slope_interval=percentiles(slope[1:]) if many else UNKNOWN,
         diameter_range_mm=(float(seen.diameter_mm.min()), float(seen.diameter_mm.max())),
         depth_range_mm=(float(seen.depth_mm.min()), float(seen.depth_mm.max())),
+        note=note,
     )
 
 

@@ -14,6 +14,7 @@ from harness.evaluation.study.chance import ChanceHits
 from harness.evaluation.study.held import held_sentences, is_swept, number, swept_sentences, varied_sentences
 from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit
 from harness.evaluation.study.record import StudyRecord
+from harness.evaluation.study.surface import depth_varies
 
 Section = tuple[str, tuple[str, ...]]
 KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom", "dent": "spherical dents"}
@@ -73,9 +74,9 @@ def _hits(record: StudyRecord, limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
         f"A damage is hit where the centre of a finding lies within {radius} mm of its own; the closest pairs first, "
         "each finding for one damage at most. The radius was fixed beforehand and is the same for all sizes"
     )
-    smaller = [one for one in limits if _largest(one) / 2 > record.hit_radius_mm]
+    smaller = [one for one in limits if one.largest_mm / 2 > record.hit_radius_mm]
     if smaller:
-        return (f"{rule}.", f"The largest damages, up to {number(_largest(smaller[0]))} mm, reach beyond that radius.")
+        return (f"{rule}.", f"The largest damages, up to {number(smaller[0].largest_mm)} mm, reach beyond that radius.")
     return (f"{rule}.",)
 
 
@@ -115,13 +116,14 @@ def _model(limit: SetUpLimit) -> str:
     label = limit.record.label
     basis = f"{limit.targets} targets on {limit.boards} boards"
     if limit.statement is None:
-        return f"{label}: no curve, as {limit.why}; {basis}. a90/95: {_bound(limit)}."
+        return f"{label}: no curve, as {limit.why}; {basis}. a90/95: {_size(limit, limit.a90_95.value)}."
     text = f"{label}: {limit.statement.model}, of all links and axes the one with the least deviance; {basis}"
     if np.isfinite(limit.design_effect):
         text += f"; boards multiply the variance of a90 by {number(limit.design_effect)}"
+    bounds = [_size(limit, value) for value in (limit.a90_95.value, limit.over_boards_mm)]
     text += (
-        f". a90/95: {_bound(limit)} with damages of one board as independent, {_size(limit.over_boards_mm)} with that "
-        "factor in it, where it is above 1"
+        f". a90/95: {bounds[0]} with damages of one board as independent, {bounds[1]} with that factor in it, where it "
+        "is above 1"
     )
     return f"{text}{': damages of one board are alike, quote the larger' if limit.boards_matter else ''}."
 
@@ -148,7 +150,7 @@ def _departures(
             "Every limit is that of its threshold as it was calibrated: another draw of the calibration boards would "
             "give another threshold, which is in no interval here."
         )
-    said += [*_few_targets(limits), *_few_sites(limits, chances), *_sizes_miss_the_rise(limits)]
+    said += [*_over_depths(limits), *_few_targets(limits), *_few_sites(limits, chances), *_sizes_miss_the_rise(limits)]
     if any(limit.statement is not None for limit in limits):
         said.append(
             "The model is the one with the least deviance, and its bound is that of this one model: that the same data "
@@ -168,6 +170,19 @@ def _departures(
             "boards that a detector refuses are no misses of it."
         )
     return tuple(said)
+
+
+def _over_depths(limits: Sequence[SetUpLimit]) -> list[str]:
+    """The handbook's curve has one size; depth is a second one."""
+    depths = [one.record.inspected.depth_mm for one in limits if one.statement]
+    varied = [one for one in depths if depth_varies(one)]
+    if not varied:
+        return []
+    span = _span(min(float(one.min()) for one in varied), max(float(one.max()) for one in varied))
+    return [
+        f"Depths from {span} mm share one curve over diameter: a50, a90 and a90/95 are those of the depths as they "
+        "were drawn together, not those of any one depth."
+    ]
 
 
 def _few_targets(limits: Sequence[SetUpLimit]) -> list[str]:
@@ -191,12 +206,12 @@ def _sizes_miss_the_rise(limits: Sequence[SetUpLimit]) -> list[str]:
     for limit in limits:
         if limit.statement is None:
             continue
-        low, high = (float(limit.statement.curve.pod(np.array(size))) for size in (_smallest(limit), _largest(limit)))
+        low, high = (float(limit.statement.curve.pod(np.array(size))) for size in (_smallest(limit), limit.largest_mm))
         if low > RISE[0]:
             said.append(f"{limit.record.label}: the smallest size inspected is found with a POD of {_percent(low)}.")
         if high < RISE[1]:
             said.append(f"{limit.record.label}: the largest size inspected is found with a POD of {_percent(high)}.")
-        if limit.a90_95.demonstrated and limit.a90_95.value > _largest(limit):
+        if limit.a90_95.demonstrated and limit.beyond(limit.a90_95.value):
             said.append(f"{limit.record.label}: a90/95 lies beyond the largest size inspected, by the curve alone.")
     return said
 
@@ -236,16 +251,11 @@ def _smallest(limit: SetUpLimit) -> float:
     return float(limit.record.inspected.diameter_mm.min(initial=np.inf))
 
 
-def _largest(limit: SetUpLimit) -> float:
-    return float(limit.record.inspected.diameter_mm.max(initial=-np.inf))
-
-
-def _bound(limit: SetUpLimit) -> str:
-    return _size(limit.a90_95.value)
-
-
-def _size(value: float) -> str:
-    return f"{number(value)} mm" if np.isfinite(value) else "not demonstrated"
+def _size(limit: SetUpLimit, value: float) -> str:
+    """A bound; of one that no inspection bears out only that it lies beyond them."""
+    if not np.isfinite(value):
+        return "not demonstrated"
+    return f"more than {number(limit.largest_mm)} mm" if limit.beyond(value) else f"{number(value)} mm"
 
 
 def _span(low: float, high: float) -> str:

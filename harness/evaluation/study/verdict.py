@@ -1,9 +1,15 @@
 """Whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks.
 
-Worse is a set-up whose a90 has grown by more than `MARGIN` while fewer damages are found than chance explains, or that
-calls falsely that much oftener than chance explains; or that has no limit any more. The test is by Holm's step-down
-over both questions of all set-ups at `ALPHA`, so a comparison of many set-ups raises no more false alarms than one of
-few. The margin covers what no test here does: each set-up draws its own calibration of the threshold.
+Worse is a set-up whose a90 has grown by more than `MARGIN` and by more than chance explains, or that calls falsely that
+much oftener than chance explains; or that has no limit any more. The test is by Holm's step-down over both questions of
+all set-ups at `ALPHA`, so a comparison of many set-ups raises no more false alarms than one of few. The margin covers
+what no test here does: each set-up draws its own calibration of the threshold.
+
+On the same boards two tests answer the question of the limit, and its p is twice the smaller one's (Bonferroni): that
+of hits (`harness.evaluation.study.paired`), which is strong where the whole curve moves, and that of a90 itself
+(`harness.evaluation.study.paired_swap`), which sees a curve that flattens. The second takes seconds, and is asked only
+where a90 has changed by more than the margin and the first does not decide; unasked, its p is taken as 1. On other
+boards the bootstrap of a90 answers (`harness.evaluation.study.paired.LimitChange`).
 """
 
 from __future__ import annotations
@@ -19,6 +25,7 @@ from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.paired import HitsChange, LimitChange, hits_change, limit_change
 from harness.evaluation.study.paired_calls import CallsChange, calls_change
 from harness.evaluation.study.paired_set_ups import Pair, differences, not_comparable, paired_set_ups
+from harness.evaluation.study.paired_swap import SwapChange, swap_change
 from harness.evaluation.study.record import StudyRecord
 
 MARGIN = 1.10
@@ -26,6 +33,11 @@ MARGIN = 1.10
 ALPHA = 0.001
 """Level of the tests for a whole comparison. As low as this because each set-up's luck with the calibration of its
 threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
+LIMIT_TESTS = 2
+"""Of hits and of a90: by so much each one's p is multiplied."""
+TOSSES_PER_QUESTION, MOST_TOSSES = 5_000, 50_000
+"""So many that four tosses as far out still convict one of that many questions. Of more than 50 questions, those of 25
+set-ups, none is decided by the test of a90: it would take a minute for each."""
 
 Mark = Literal[
     "worse", "better", "as good", "not significant", "newly failing", "newly working", "no limit",
@@ -50,8 +62,8 @@ SIGNS: dict[Mark, str] = {
 class ComparedSetUps:
     """One set-up of two studies. ``why``: the reason of ``mark``, in words; ``changed``: what differs between the two.
 
-    ``limit_p``, ``calls_p``: adjusted p of (worse, better); the sign-flip test over boards where both have the same,
-    the bootstrap of a90 where each has its own; and the test of false calls. 1 where there is no test.
+    ``swap``: the test of a90 on the same boards, None where it was not asked. ``limit_p``, ``calls_p``: adjusted p of
+    (worse, better), of a90 and of false calls; 1 where there is no test.
     """
 
     first: SetUpLimit | None
@@ -60,6 +72,7 @@ class ComparedSetUps:
     limit: LimitChange | None
     hits: HitsChange | None
     calls: CallsChange | None
+    swap: SwapChange | None = None
     limit_p: tuple[float, float] = (1.0, 1.0)
     calls_p: tuple[float, float] = (1.0, 1.0)
     mark: Mark = "as good"
@@ -70,6 +83,15 @@ class ComparedSetUps:
         """Set-up and frames, of both where they differ."""
         labels = [limit.record.label for limit in (self.first, self.second) if limit is not None]
         return " → ".join(dict.fromkeys(labels))
+
+    def limit_test(self, side: int) -> Literal["hits", "a90", "bootstrap", ""]:
+        """Which test ``limit_p[side]`` is of: the one with the smaller p; empty where there is none."""
+        if self.limit is None:
+            return ""
+        if self.hits is None:
+            return "bootstrap"
+        of_a90 = 1.0 if self.swap is None else self.swap.sides[side]
+        return "a90" if of_a90 < self.hits.sides[side] else "hits"
 
     @property
     def is_worse(self) -> bool:
@@ -93,6 +115,8 @@ class Comparison:
 def compare_studies(first: StudyRecord, second: StudyRecord) -> Comparison:
     """``second`` against ``first``. Deterministic."""
     rows = [_measured(first, second, pair) for pair in paired_set_ups(first, second)]
+    questions = sum(p is not None for row in rows for p in _p_values(row))
+    rows = [_with_swap(row, questions) for row in rows]
     worse, better = (_adjusted(rows, side) for side in (0, 1))
     judged = []
     for row in rows:
@@ -130,6 +154,19 @@ def _measured(first: StudyRecord, second: StudyRecord, pair: Pair) -> ComparedSe
     )
 
 
+def _with_swap(row: ComparedSetUps, questions: int) -> ComparedSetUps:
+    """The row with the test of a90 where it is asked, as one of so many ``questions``."""
+    if row.hits is None or row.first is None or row.second is None:
+        return row
+    growth = _growth(row.first, row.second)
+    # Comparisons with NaN are false: without both limits there is nothing to ask.
+    beyond = (growth > MARGIN, growth < 1 / MARGIN)
+    if not any(beyond) or LIMIT_TESTS * questions * row.hits.sides[beyond.index(True)] < ALPHA:
+        return row
+    tosses = min(TOSSES_PER_QUESTION * questions, MOST_TOSSES) - 1
+    return replace(row, swap=swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
+
+
 def _adjusted(rows: list[ComparedSetUps], side: int) -> Iterator[float]:
     """Adjusted p of each row's limit and false calls in turn; ``side`` 0: worse, 1: better. A question that was not
     asked is no member of the family."""
@@ -140,10 +177,12 @@ def _adjusted(rows: list[ComparedSetUps], side: int) -> Iterator[float]:
 
 def _p_values(row: ComparedSetUps) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
     """(worse, better) of the limit and of false calls."""
-    calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
+    calls = None if row.calls is None else row.calls.sides
     if row.hits is not None:
-        return (row.hits.fewer_p, row.hits.more_p), calls
-    return None if row.limit is None else (row.limit.grown_p, row.limit.shrunk_p), calls
+        of_a90 = row.swap.sides if row.swap else (1.0, 1.0)
+        worse, better = (min(1.0, LIMIT_TESTS * min(pair)) for pair in zip(row.hits.sides, of_a90, strict=True))
+        return (worse, better), calls
+    return None if row.limit is None else row.limit.sides, calls
 
 
 def _judged(row: ComparedSetUps) -> ComparedSetUps:

@@ -21,6 +21,9 @@ from harness.vocabulary.declaration.yaml_source import KeyPath, Source
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 """Booleans of YAML 1.1, text in YAML 1.2."""
 
+LEAST_HELD = 3
+"""Letters of a word that is looked for within others: fewer are in too many."""
+
 C = TypeVar("C", bound=Config)
 
 
@@ -67,9 +70,13 @@ def problems_of(error: ValidationError, declared: Declared, source: Source, base
 
 
 def nearest(word: object, words: Iterable[object], cutoff: float = 0.6) -> str | None:
-    """The likeliest of ``words`` that the user meant, whatever the case and dashes; None where none is near."""
+    """The likeliest of ``words`` that the user meant, whatever the case and dashes: one spelt nearly so, else the
+    shortest that holds the word (three letters at least), as realsense_l515 holds l515. None where there is neither."""
     folded = {str(one).lower().replace("-", "_"): str(one) for one in words}
-    found = difflib.get_close_matches(str(word).lower().replace("-", "_"), folded, n=1, cutoff=cutoff)
+    sought = str(word).lower().replace("-", "_")
+    found = difflib.get_close_matches(sought, folded, n=1, cutoff=cutoff)
+    if not found and len(sought) >= LEAST_HELD:
+        found = sorted((one for one in folded if sought in one), key=lambda one: (len(one), one))
     return folded[found[0]] if found else None
 
 
