@@ -159,6 +159,14 @@ def test_the_committed_baseline_is_of_the_committed_study():
 # --- the rule, on whole studies drawn from a model (tests/validation/gate_power.py prints more of them) ---------------
 
 
+def test_what_the_gate_sees_is_measured_on_studies_as_large_as_its_own(experiment):
+    config, size = experiment.config, Size()
+    assert (config.study.boards, config.study.hole_free_boards) == (size.boards, size.hole_free_boards)
+    assert config.threshold.calibrate.boards == size.calibration_boards
+    assert config.source.target.damage.per_board == size.holes
+    assert len(experiment.points) == size.set_ups
+
+
 def test_another_noise_seldom_fails_the_gate():
     """Of 150 checks with no cause no more than 6 (4 %) fail: were the rate 1 %, more would with probability 1e-3."""
     assert share(Size(set_ups=1), 150) <= 0.04

@@ -238,6 +238,7 @@ def test_alike_signals_of_one_target_are_seen() -> None:
         ({"signal": np.arange(11.0)}, "one of each a row"),
         ({"signal": [3, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5, 8][::-1]}, "does not grow"),
         ({"signal": 2 + np.arange(12.0)}, "exactly on a line"),
+        ({"signal": np.full(12, 6.1)}, "do not vary: all 12 between the limits are 6.1"),
         ({"signal": np.repeat([0.0, 99.0], 6)}, "too few"),
         ({"inspections": ["a"] * 12}, "more than one size"),
     ],

@@ -119,8 +119,8 @@ def maximum(data: HitsAndMisses) -> tuple[float, float]:
 
 def penalised_maximum(data: HitsAndMisses) -> tuple[float, float]:
     """(b0, b1) of the largest penalised likelihood, which is finite for separated data too (`data.penalty`). Under
-    cloglog and loglog it can have several maxima: the higher one is taken from a flat start and from the best of
-    `steep_starts`."""
+    cloglog and loglog it can have several maxima: the higher one is taken from a flat start, from the first and from
+    the best of `steep_starts`."""
     flat = np.array([float(link_ppf(data.link, np.mean(data.hit))), 1.0])
     steep = steep_starts(float(data.z[~data.hit].max()), float(data.z[data.hit].min()))
     best_steep = steep[int(np.argmax([data.value(*one) for one in steep]))]
@@ -131,23 +131,20 @@ def penalised_maximum(data: HitsAndMisses) -> tuple[float, float]:
             method="Nelder-Mead",
             options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 5000, "maxfev": 5000},
         )
-        for start in (flat, best_steep)
+        for start in (flat, steep[0], best_steep)
     ]
     best = min(found, key=lambda one: float(one.fun))
     return float(best.x[0]), float(best.x[1])
 
 
 def steep_starts(below: np.ndarray | float, above: np.ndarray | float) -> np.ndarray:
-    """(k, 2, ...) intercepts and slopes of curves of several widths through both ends and the middle of the gap between
-    the largest miss ``below`` and the smallest hit ``above``, in sizes of unit spread."""
+    """(k, 2, ...) intercepts and slopes of curves that rise between the largest miss ``below`` and the smallest hit
+    ``above``, in sizes of unit spread: the first with predictors -1.5 and 1.5 there (where they are not too close), the
+    others of several widths through both ends and the middle."""
     gap = np.asarray(above, float) - below
-    return np.array(
-        [
-            (-slope * (below + share * gap), slope * np.ones_like(gap))
-            for slope in np.geomspace(1.5, 150.0, 9)
-            for share in (0.0, 0.5, 1.0)
-        ]
-    )
+    fitting = np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0)
+    widths = [(slope * np.ones_like(gap), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
+    return np.array([(-slope * (below + share * gap), slope) for slope, share in ((fitting, 0.5), *widths)])
 
 
 def slope_of_log_density(link: str, predictor: np.ndarray) -> np.ndarray:

@@ -62,13 +62,14 @@ def penalised_maxima(z: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: 
     draws = _Draws(z, hits, misses, repeats, link)
     below, above = np.where(misses > 0, z, -np.inf).max(axis=1), np.where(hits > 0, z, np.inf).min(axis=1)
     starts = steep_starts(below, above).transpose(0, 2, 1)
-    heights = np.array([draws.value_and_step(start)[0] for start in starts])
-    steep, height = _climbed(draws, starts[heights.argmax(axis=0), np.arange(len(hits))])
+    rows = np.arange(len(hits))
     if link in ("logit", "probit"):
-        return steep
+        return _climbed(draws, starts[0])[0]
     share = hits.sum(axis=1) / (hits + misses).sum(axis=1)
-    flat, other = _climbed(draws, np.column_stack([np.asarray(link_ppf(link, share)), np.ones(len(hits))]))
-    return np.where((other > height)[:, None], flat, steep)
+    flat = np.column_stack([np.asarray(link_ppf(link, share)), np.ones(len(hits))])
+    heights = np.array([draws.value_and_step(start)[0] for start in starts])
+    found = [_climbed(draws, start) for start in (flat, starts[0], starts[heights.argmax(axis=0), rows])]
+    return np.array([place for place, _ in found])[np.argmax([height for _, height in found], axis=0), rows]
 
 
 def _climbed(draws: _Draws, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
