@@ -79,6 +79,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     experiment = load_experiment(options.experiment, options.overrides)
     if experiment.config.study is None:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
+    _refuse_too_few_boards(experiment)
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
     baseline = _baseline(path, update=options.update)
     code = run_study(experiment, options.out, options.jobs, command)
@@ -90,6 +91,20 @@ def _run(options: argparse.Namespace, command: str) -> int:
         return _update(path, found, trials_failed=code == 1)
     assert comparison is not None
     return _gate(comparison, path)
+
+
+def _refuse_too_few_boards(experiment: Experiment) -> None:
+    """With these no loss could ever be told from chance, and the gate would pass everything."""
+    from harness.evaluation.study.verdict import ALPHA, fewest_boards
+
+    study, set_ups = experiment.config.study, len(experiment.points)
+    needed = fewest_boards(set_ups)
+    if study is not None and study.boards < needed:
+        raise UserError(
+            f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail",
+            legal=f"at least {needed} boards for {set_ups} set-up{'s' if set_ups > 1 else ''}",
+            fix="raise study.boards: 40 are needed to see a90 grow by 15 %",
+        )
 
 
 def _baseline(path: Path, *, update: bool) -> StudyRecord | None:

@@ -36,9 +36,26 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
     add("second", type=Path, metavar="B", help="likewise; what is asked is whether B is worse or better than A")
+    add(
+        "--alpha",
+        type=_level,
+        default=0.05,
+        metavar="P",
+        help="level of the tests, all set-ups together (default: 0.05)",
+    )
     add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
     return parser
+
+
+def _level(text: str) -> float:
+    try:
+        level = float(text)
+    except ValueError:
+        level = 0.0
+    if not 1e-6 <= level <= 0.5:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a level from 1e-6 to 0.5")
+    return level
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
@@ -47,7 +64,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
     first, second = read_record(options.first), read_record(options.second)
     _refuse_where_nothing_is_paired(first, second)
-    comparison = compare_studies(first, second)
+    comparison = compare_studies(first, second, options.alpha)
     print_comparison(comparison, as_json=options.json)
     if options.out is not None:
         write_comparison(comparison, options.out, command)

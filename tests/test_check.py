@@ -180,3 +180,9 @@ def test_the_gate_sees_what_it_is_for():
     assert fails(baseline, study(size, 0, 2, Change(flatter=1.33)))
     assert fails(baseline, study(size, 0, 2, Change(bias=1.5)))
     assert fails(baseline, study(size, 0, 2, Change(bias=1 / 1.5)))
+
+
+def test_a_check_that_could_not_fail_is_refused(capsys):
+    """Before anything runs: with five boards even a loss on every one of them may be chance."""
+    assert check.main([str(EXPERIMENT), "--set", "study.boards=5"]) == 2
+    assert "at least 13 boards for 2 set-ups" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from harness.evaluation.study.paired import hits_change, limit_change, mcnemar, 
 from harness.evaluation.study.paired_calls import calls_change
 from harness.evaluation.study.paired_set_ups import not_comparable, paired_set_ups
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
-from harness.evaluation.study.verdict import ALPHA, Comparison, compare_studies, holm
+from harness.evaluation.study.verdict import ALPHA, Comparison, compare_studies, fewest_boards, holm
 from harness.report.compare_page import compare_html
 from harness.report.compare_rows import HEADS, cells, compare_table, compare_text
 from tests.synthetic_study import SetUp, Study, study_record
@@ -422,3 +422,11 @@ def test_the_program_names_a_users_mistakes(tmp_path, capsys):
     for name, word in (("none", "cannot be read"), ("old.json", "version 0"), ("no.json", "no study's record")):
         assert compare.main([str(tmp_path / name), str(tmp_path)]) == 2
         assert word in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("set_ups", [1, 2, 6])
+def test_so_many_boards_and_no_fewer_can_convict(set_ups):
+    """Of a study in which every board has lost, the smallest p that the rule can give."""
+    for boards, convicts in ((fewest_boards(set_ups), True), (fewest_boards(set_ups) - 1, False)):
+        hits_p, _ = sign_flip(np.full(boards, -1))
+        assert (2 * hits_p * 2 * set_ups < ALPHA) == convicts

@@ -9,7 +9,7 @@ from harness.evaluation.intervals import UNKNOWN
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.verdict import ComparedSetUps, Comparison
 from harness.report.compare_figure import compare_svg
-from harness.report.compare_rows import HEADS, LEFT, RULE, TESTS, answer, cells, remarks
+from harness.report.compare_rows import HEADS, LEFT, TESTS, answer, cells, remarks, rule
 from harness.report.page_parts import mm, template
 from harness.report.study_rows import estimate_text
 
@@ -27,7 +27,7 @@ def compare_html(comparison: Comparison, command: str) -> str:
         left=LEFT,
         rows=[(CLASSES.get(row.mark, "open"), cells(row)) for row in comparison.rows],
         sizes=[_sizes(row) for row in comparison.rows],
-        rule=RULE,
+        rule=rule(comparison),
         tests=TESTS,
         origins=list(
             zip(("study", "commit", "seed"), _origin(comparison.first), _origin(comparison.second), strict=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.evaluation.pod.statement import finite
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.verdict import ALPHA, MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
+from harness.evaluation.study.verdict import MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
 from harness.report.page_parts import aligned, mm
 
 if TYPE_CHECKING:
@@ -28,12 +28,6 @@ COLOURS: Mapping[Mark, str] = {
     "better": "green",
     "newly working": "green",
 }
-RULE = (
-    f"Worse (+): a90, or the rate of false calls, has grown by more than {100 * (MARGIN - 1):.0f} %, and a test says "
-    f"that it is not by chance (p < {ALPHA:g} by Holm over all set-ups and both questions). Better (-): likewise for "
-    "a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed trials. *: a limit for the "
-    "first time. x: measured with another stick. < and >: in the first, in the second study only."
-)
 TESTS = (
     "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
     "of two, with boards, not damages, as the units: of a sign-flip test of hits, and, where a90 has changed by more "
@@ -46,6 +40,17 @@ TESTS = (
     "tests must agree. All are one-sided, of being worse, and adjusted. 95 %: interval of the change of a90 over "
     "boards drawn again."
 )
+
+
+def rule(comparison: Comparison) -> str:
+    """What the marks mean."""
+    return (
+        f"Worse (+): a90, or the rate of false calls, has grown by more than {100 * (MARGIN - 1):.0f} %, and a test "
+        f"says that it is not by chance (p < {comparison.alpha:g} by Holm over all set-ups and both questions). Better "
+        "(-): likewise for a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed "
+        "trials. *: a limit for the first time. x: measured with another stick. < and >: in the first, in the second "
+        "study only."
+    )
 
 
 def answer(comparison: Comparison) -> str:
@@ -114,7 +119,7 @@ def compare_data(comparison: Comparison) -> dict[str, Any]:
     return {
         "first": _study(comparison.first),
         "second": _study(comparison.second),
-        "rule": {"margin": MARGIN, "alpha": ALPHA},
+        "rule": {"margin": MARGIN, "alpha": comparison.alpha},
         "worse": [row.label for row in comparison.rows if row.is_worse],
         "set_ups": [_row_data(row) for row in comparison.rows],
     }

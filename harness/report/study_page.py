@@ -87,7 +87,7 @@ def study_html(
         has_depths=any(depth_varies(limit.record.inspected.depth_mm) for limit in limits),
         surface_heads=SURFACE_HEADS,
         surface_rows=surface_rows(surfaces),
-        surface_notes=_without_surface(result),
+        surface_notes=_surface_notes(result),
         chance_heads=CHANCE_HEADS,
         chance_rows=chance_rows(result.set_ups),
         threshold_heads=THRESHOLD_HEADS,
@@ -178,15 +178,16 @@ def _examples_by_set_up(
     return {f"examples-{number + 1}": pair for number, pair in enumerate(found)}
 
 
-def _without_surface(result: StudyResult) -> list[str]:
-    """Why there is no surface over diameter and depth, set-ups with one reason together."""
-    reasons: dict[str, list[str]] = {}
+def _surface_notes(result: StudyResult) -> list[str]:
+    """Why there is no surface over diameter and depth, or what to know beside one; set-ups of one reason together."""
+    reasons: dict[tuple[str, str], list[str]] = {}
     for one in result.set_ups:
-        if one.surface is None:
-            reasons.setdefault(one.surface_why, []).append(name_of(one.limit))
+        reason = ("No surface", one.surface_why) if one.surface is None else ("Surface", one.surface.note)
+        reasons.setdefault(reason, []).append(name_of(one.limit))
     notes = []
-    for why, labels in reasons.items():
-        some = ", ".join(labels) if len(labels) <= MOST_NAMED else f"{len(labels)} of {len(result.set_ups)} set-ups"
-        every = len(labels) == len(result.set_ups)
-        notes.append(f"No surface{'' if every else f' for {some}'}: {why}.")
+    for (what, why), labels in reasons.items():
+        if why:
+            some = ", ".join(labels) if len(labels) <= MOST_NAMED else f"{len(labels)} of {len(result.set_ups)} set-ups"
+            every = len(labels) == len(result.set_ups)
+            notes.append(f"{what}{'' if every else f' for {some}'}: {why}.")
     return notes

@@ -31,8 +31,8 @@ from harness.evaluation.study.record import StudyRecord
 MARGIN = 1.10
 """Growth of a90, or of the rate of false calls, up to which nothing is worse (and shrinkage, nothing better)."""
 ALPHA = 0.001
-"""Level of the tests for a whole comparison. As low as this because each set-up's luck with the calibration of its
-threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
+"""Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
+its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
 LIMIT_TESTS = 2
 """Of hits and of a90: by so much each one's p is multiplied."""
 TOSSES_PER_QUESTION, MOST_TOSSES = 5_000, 50_000
@@ -101,28 +101,35 @@ class ComparedSetUps:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two studies, set-up by set-up."""
+    """Two studies, set-up by set-up; ``alpha``: level of the tests for all of them together."""
 
     first: StudyRecord
     second: StudyRecord
     rows: tuple[ComparedSetUps, ...]
+    alpha: float = ALPHA
 
     def marked(self, *marks: Mark) -> tuple[ComparedSetUps, ...]:
         """Rows with one of these marks."""
         return tuple(row for row in self.rows if row.mark in marks)
 
 
-def compare_studies(first: StudyRecord, second: StudyRecord) -> Comparison:
+def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
+    """Shared boards from which on the tests can convict one of so many set-ups at all: if every board is worse, one
+    toss in 2^boards says as much, and that p is multiplied by the tests of a limit and by all set-ups' questions."""
+    return int(np.floor(np.log2(LIMIT_TESTS * 2 * set_ups / alpha))) + 1
+
+
+def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
     """``second`` against ``first``. Deterministic."""
     rows = [_measured(first, second, pair) for pair in paired_set_ups(first, second)]
     questions = sum(p is not None for row in rows for p in _p_values(row))
-    rows = [_with_swap(row, questions) for row in rows]
+    rows = [_with_swap(row, questions, alpha) for row in rows]
     worse, better = (_adjusted(rows, side) for side in (0, 1))
     judged = []
     for row in rows:
         limits, calls = ((next(worse), next(better)) for _ in range(2))
-        judged.append(_judged(replace(row, limit_p=limits, calls_p=calls)))
-    return Comparison(first, second, tuple(judged))
+        judged.append(_judged(replace(row, limit_p=limits, calls_p=calls), alpha))
+    return Comparison(first, second, tuple(judged), alpha)
 
 
 def holm(p_values: Iterable[float]) -> np.ndarray:
@@ -154,14 +161,14 @@ def _measured(first: StudyRecord, second: StudyRecord, pair: Pair) -> ComparedSe
     )
 
 
-def _with_swap(row: ComparedSetUps, questions: int) -> ComparedSetUps:
+def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSetUps:
     """The row with the test of a90 where it is asked, as one of so many ``questions``."""
     if row.hits is None or row.first is None or row.second is None:
         return row
     growth = _growth(row.first, row.second)
     # Comparisons with NaN are false: without both limits there is nothing to ask.
     beyond = (growth > MARGIN, growth < 1 / MARGIN)
-    if not any(beyond) or LIMIT_TESTS * questions * row.hits.sides[beyond.index(True)] < ALPHA:
+    if not any(beyond) or LIMIT_TESTS * questions * row.hits.sides[beyond.index(True)] < alpha:
         return row
     tosses = min(TOSSES_PER_QUESTION * questions, MOST_TOSSES) - 1
     return replace(row, swap=swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
@@ -185,7 +192,7 @@ def _p_values(row: ComparedSetUps) -> tuple[tuple[float, float] | None, tuple[fl
     return None if row.limit is None else row.limit.sides, calls
 
 
-def _judged(row: ComparedSetUps) -> ComparedSetUps:
+def _judged(row: ComparedSetUps, alpha: float) -> ComparedSetUps:
     """The row with its mark. What fails comes first: a better limit does not excuse more false calls."""
     if row.limit is None or row.first is None or row.second is None:
         return row
@@ -193,16 +200,16 @@ def _judged(row: ComparedSetUps) -> ComparedSetUps:
         return replace(row, mark="newly failing", why=why)
     growth = _growth(row.first, row.second)
     # One rule both ways: more than the margin, and not by chance.
-    if growth > MARGIN and row.limit_p[0] < ALPHA:
+    if growth > MARGIN and row.limit_p[0] < alpha:
         return replace(row, mark="worse", why=_grown(row.first, row.second))
-    if row.calls is not None and row.calls.ratio > MARGIN and row.calls_p[0] < ALPHA:
+    if row.calls is not None and row.calls.ratio > MARGIN and row.calls_p[0] < alpha:
         before, now = row.calls.rates_per_m2
         return replace(row, mark="worse", why=f"false calls {before:.2f} → {now:.2f} per m²")
     if np.isnan(growth):
         if why := _lost(row.second, row.first):
             return replace(row, mark="newly working", why=f"before: {why}")
         return replace(row, mark="no limit", why=row.second.why)
-    if growth < 1 / MARGIN and row.limit_p[1] < ALPHA:
+    if growth < 1 / MARGIN and row.limit_p[1] < alpha:
         return replace(row, mark="better", why=_grown(row.first, row.second))
     if not 1 / MARGIN <= growth <= MARGIN:
         return replace(row, mark="not significant", why=_grown(row.first, row.second))
