@@ -8,14 +8,17 @@ shared: they depend on neither detector, nor the sensor's noise, nor its seed.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from serial_pool import serial_pool
 
+from harness import check
+from harness.engine import workers
 from tests.mutated_detectors import write_mutants
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,35 +47,35 @@ class Checked:
 
 
 class Gate:
-    """The program with a baseline, results and renders of its own."""
+    """The program with a baseline, results and renders of its own; its trials run in this process, which saves the
+    start of four for each check."""
 
     def __init__(self, home: Path) -> None:
         self.home = home
-        plug_ins = str(write_mutants(home / "plug_ins"))
-        paths = [plug_ins, *filter(None, [os.environ.get("PYTHONPATH")])]
-        self.environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
     def check(self, *changed: str, update: bool = False) -> Checked:
-        command = [sys.executable, "-m", "harness.check", "experiments/regression.yaml"]
-        command += ["--baseline", str(self.home / "baseline.json"), "--out", str(self.home / "results")]
+        arguments = [str(ROOT / "experiments" / "regression.yaml"), "--baseline", str(self.home / "baseline.json")]
+        arguments += ["--out", str(self.home / "results"), *(["--update"] if update else [])]
         for one in (*SMALLER, *changed):
-            command += ["--set", one]
-        done = subprocess.run(
-            [*command, *(["--update"] if update else [])],
-            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
-        said = done.stdout + done.stderr
-        written = [line.split(": ", 1)[1] for line in done.stdout.splitlines() if line.startswith("comparison with")]
+            arguments += ["--set", one]
+        with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as errors:
+            code = check.main(arguments)
+        lines = out.getvalue().splitlines()
+        written = [line.split(": ", 1)[1] for line in lines if line.startswith("comparison with")]
         data = json.loads(Path(written[0]).with_name("compare.json").read_text()) if written else {}
-        return Checked(done.returncode, said, data)
+        return Checked(code, out.getvalue() + errors.getvalue(), data)
 
 
 @pytest.fixture(scope="module")
-def gate(tmp_path_factory: pytest.TempPathFactory) -> Gate:
-    gate = Gate(tmp_path_factory.mktemp("gate"))
-    first = gate.check(update=True)
-    assert first.code == 0, first.said
-    return gate
+def gate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gate]:
+    home = tmp_path_factory.mktemp("gate")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(write_mutants(home / "plug_ins")))
+        patch.setattr(workers, "pool", serial_pool)
+        gate = Gate(home)
+        first = gate.check(update=True)
+        assert first.code == 0, first.said
+        yield gate
 
 
 @pytest.mark.parametrize(
