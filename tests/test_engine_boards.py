@@ -1,0 +1,140 @@
+"""What a study asks of one board, and where lines of sight meet its face."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from detectors.interface import Detection
+from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
+from harness.engine.judge import Judgement
+from harness.engine.setup import met_on_face
+from harness.engine.sight import Sight
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Region
+from scenes.target.custom import BoardConfig, SphereConfig
+from scenes.target.declaration import TargetConfig
+from scenes.target.face import face_of
+from scenes.target.pose import T_camera_board_of
+from scenes.target.truth import truth_of
+
+
+def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
+    """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far from both 5."""
+    target = TargetConfig.from_data(
+        {
+            "name": "custom",
+            "board": {"width_mm": 100, "height_mm": 60, "thickness_mm": 10},
+            "holes": [
+                {"id": 1, "diameter_mm": 6, "centre_mm": [-30, 0]},
+                {"id": 2, "diameter_mm": 4, "centre_mm": [30, 0]},
+            ],
+        }
+    )
+    T_board_cloud = np.eye(4)
+    x, y = np.meshgrid(np.arange(-49.5, 50) * 1e-3, np.arange(-29.5, 30) * 1e-3)
+    points = np.stack([x, y, np.zeros(x.shape)], axis=-1)
+    none, zeros = np.full(x.shape, np.nan), np.zeros(x.shape, np.uint8)
+    region = Region(0, x.shape[0], 0, x.shape[1])
+    cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
+    places = points[..., :2]
+    truth = truth_of(target, T_camera_board_of(target.pose))
+    outlines = {
+        d.id: np.flatnonzero(np.linalg.norm(places - d.centre_board_m[:2], axis=-1) < d.diameter_m / 2) for d in truth
+    }
+    undamaged = np.ones(x.shape, bool)
+    undamaged.ravel()[np.concatenate(list(outlines.values()))] = False
+    sight = Sight(cloud, T_board_cloud, target, truth, outlines, places, undamaged, {1: 0.01, 2: 0.01})
+    score = np.zeros(x.shape)
+    score[:, 90:] = np.nan
+    score[29, 19], score[10, 50] = 9.0, 5.0
+    hit, call = (Detection(score[at], np.array([at[0] * 100 + at[1]]), points[at]) for at in ((29, 19), (10, 50)))
+
+    class Found:
+        def find(self, cloud: Cloud, evidence: object, threshold: float) -> tuple[Detection, ...]:
+            return tuple(one for one in (hit, call) if one.score > threshold)
+
+    evidence = SimpleNamespace(score=score)
+    judgement = Judgement(
+        run={"threshold": threshold},
+        holes=[{"hole": "1"}, {"hole": "2"}],
+        detector=Found(),  # type: ignore[arg-type]
+        evidence=evidence,  # type: ignore[arg-type]
+        detections=(hit, call),
+        places_m=np.array([points[29, 19, :2], points[10, 50, :2]]),
+        pairs={0: 0},
+    )
+    return sight, judgement
+
+
+def test_what_a_damaged_board_gives():
+    sight, judgement = sight_and_judgement()
+    rows = study_rows(sight, judgement, 0.01, hole_free=False)
+    assert [row["signal"] for row in rows.holes] == [9.0, 0.0]
+    assert rows.run["inspected_m2"] == pytest.approx(90 * 60e-6)  # ten columns of 100 were not judged
+    findings = rows.of_study["findings"]
+    assert [(one["hole"], one["score"]) for one in findings] == [("1", 9.0), ("", 5.0)]
+    assert (findings[1]["x_mm"], findings[1]["y_mm"]) == pytest.approx((0.5, -19.5))
+    (operating,) = rows.of_study["operating"]
+    at = dict(zip(operating["threshold"], zip(operating["findings"], operating["hits"], strict=True), strict=True))
+    assert at[4.0] == (2, 1)
+    assert at[8.0] == (1, 1)
+    assert at[16.0] == (0, 0)
+    of_pixels = {row["hole"]: row for row in rows.of_study["pixels"]}
+    assert of_pixels["1"]["pixels"] == len(sight.outlines[1])
+    assert of_pixels["1"]["above"][of_pixels["1"]["threshold"].index(4.0)] == 1
+    assert of_pixels[""]["above"][of_pixels[""]["threshold"].index(4.0)] == 1
+    assert rows.of_study["sites"] == []
+
+
+def test_a_hole_free_board_gives_the_same_places_as_sites():
+    sight, judgement = sight_and_judgement()
+    rows = study_rows(sight, judgement, 0.01, hole_free=True)
+    assert rows.holes == []
+    assert [(row["hole"], row["detected"], row["signal"]) for row in rows.of_study["sites"]] == [
+        ("1", True, 9.0),
+        ("2", False, 0.0),
+    ]
+    assert {one["hole"] for one in rows.of_study["findings"]} == {""}
+    assert rows.of_study["operating"][0]["hits"] == [0] * len(grid(4.0, FINDING_OCTAVES))
+    assert rows.of_study["pixels"] == []
+
+
+def test_a_place_where_nothing_was_judged_has_no_signal():
+    sight, judgement = sight_and_judgement()
+    judgement.evidence.score[:] = np.nan
+    assert np.isnan(study_rows(sight, judgement, 0.01, hole_free=True).of_study["sites"][0]["signal"])
+
+
+def test_the_grid_of_thresholds_holds_the_one_in_use():
+    for octaves in (FINDING_OCTAVES, PIXEL_OCTAVES):
+        found = grid(3.7, octaves)
+        assert 3.7 in found
+        assert found[1:] / found[:-1] == pytest.approx(2**0.25)
+    assert grid(0.0, FINDING_OCTAVES).tolist() == [0.0]
+
+
+def test_pixels_cover_the_face_however_it_is_tilted():
+    """A camera's grid on a plane tilted by 40 degrees: the pixels' areas sum to the face's."""
+    sight, _ = sight_and_judgement()
+    slopes = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 281), np.linspace(-0.05, 0.05, 201)), axis=-1)
+    tilt = np.deg2rad(40)
+    depth = 1.0 / (1 - slopes[..., 0] * np.tan(tilt))  # z = 1 + x tan
+    place = np.stack([slopes[..., 0] * depth / np.cos(tilt), slopes[..., 1] * depth], axis=-1)
+    inside = (np.abs(place[..., 0]) < 0.05) & (np.abs(place[..., 1]) < 0.03)
+    place[~inside] = np.nan
+    cloud = SimpleNamespace(organised=True)
+    tilted = replace(sight, cloud=cast("Cloud", cloud), places_m=place)
+    assert tilted.area_m2(inside) == pytest.approx(100 * 60e-6, rel=0.01)
+
+
+def test_lines_of_sight_meet_a_sphere_where_they_should():
+    board = BoardConfig(width_mm=200, height_mm=200, thickness_mm=5, shape=SphereConfig(kind="sphere", radius_mm=400))
+    direction = np.array([[0.1, -0.05, -1.0], [-0.15, 0.1, -1.0]])
+    met = met_on_face(np.tile([0.0, 0.0, 0.7], (2, 1)), direction, face_of(board))
+    assert np.linalg.norm(met - [0, 0, -0.4], axis=-1) == pytest.approx([0.4, 0.4], abs=1e-7)
+    assert np.linalg.norm(np.cross(met - [0, 0, 0.7], direction), axis=-1) == pytest.approx([0, 0], abs=1e-9)
