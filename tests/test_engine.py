@@ -177,6 +177,41 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     assert all(journal.read(key) is not None for key in kept)
 
 
+def test_workers_end_with_a_driver_that_is_killed(finished):
+    """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is left."""
+    cut = finished.parent / "killed"
+    shutil.copytree(finished / ".cache", cut / ".cache")
+    command = [sys.executable, "-m", "harness.sweep", str(finished.parent / "tiny.yaml"), "--out", str(cut)]
+    marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
+    process = subprocess.Popen([*command, "--set", "repeats=400"], cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(cut.glob("tiny/*/journal/hole_free-*.json")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert len(processes_marked(str(cut))) > 1
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 10
+    while processes_marked(str(cut)):
+        assert time.monotonic() < deadline, "workers outlive their driver"
+        time.sleep(0.1)
+
+
+def processes_marked(mark: str) -> list[int]:
+    """Living processes whose environment holds the mark."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (folder / "environ").read_bytes()
+            state = (folder / "stat").read_text().rsplit(")")[-1].split()[0]
+        except OSError:
+            continue
+        if f"TOFPOD_TEST_OF={mark}".encode() in environment and state != "Z":
+            found.append(int(folder.name))
+    return found
+
+
 def test_dry_run_counts_and_runs_nothing(finished):
     done = sweep(finished, "--dry-run")
     assert done.returncode == 0

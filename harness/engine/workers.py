@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -14,14 +16,18 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 """One thread a worker: sums are then in one order on every machine, and workers do not fight for cores."""
 
 
+LOOKS_S = 1.0
+"""Between looks whether the driver is still there."""
+
+
 @contextmanager
 def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Workers that start afresh (no fork of a process with threads), leave Ctrl-C to the driver, and end at once when
-    the driver leaves early."""
+    the driver leaves early, within `LOOKS_S` even where it was killed."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_ignore_interrupts)
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_serve_the_driver)
     finished = False
     try:
         yield executor
@@ -36,8 +42,17 @@ def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
                 process.kill()
 
 
-def _ignore_interrupts() -> None:
+def _serve_the_driver() -> None:
+    """Of a worker: Ctrl-C is the driver's to hear, and without a driver there is nothing to do."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with(driver: int) -> None:
+    """End this process soon after its parent is another than ``driver``: a killed driver cannot tell its workers."""
+    while os.getppid() == driver:
+        time.sleep(LOOKS_S)
+    os._exit(1)
 
 
 def render(
