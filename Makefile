@@ -26,10 +26,11 @@ check: .venv/.ready
 
 benchmarks: .venv/.ready
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only -o python_files='bench_*.py' -o addopts=''
+	$(BIN)/python tests/benchmarks/trials.py --peers
 
 # Five minutes; needed after a change of pyproject.toml's dependencies only.
 lock: .venv/.ready
-	$(BIN)/pip-compile --quiet --extra dev --generate-hashes --strip-extras --allow-unsafe \
+	$(BIN)/pip-compile --quiet --extra dev --extra cluster --generate-hashes --strip-extras --allow-unsafe \
 	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links -o requirements.lock pyproject.toml
 
 .venv/.ready: requirements.lock pyproject.toml

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
+from detectors import crop_kernels as kernels
+from detectors.median import quantile_of
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -174,86 +176,36 @@ def _holes_filled(mask: np.ndarray) -> np.ndarray:
 
 def _largest_surface(cloud: Cloud, config: AutoCrop) -> np.ndarray:
     valid = cloud.valid
-    bend = _creases(cloud, config)
-    right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), bend)
-    down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), bend)
-    largest = _largest_component(valid & ~bend, right, down)
+    steps = kernels.links(cloud.points_m, MAX_SURFACE_TILT, STEP_SIGMAS * _step_noise(cloud))
+    largest = kernels.largest_component(valid & ~_creases(cloud.points_m, valid, config), *steps)
     # smoothing, slope and comparison flag half + 1 + half pixels on each side of a crease or rim: given back where no
     # step parts
     reach = 2 * (config.smooth_px // 2) + 1
-    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=reach)
-    rim = _largest_component(valid & (grown > 0), *_steps_only(cloud))
-    return _holes_filled(largest | (rim & (grown > 0))) & valid
-
-
-def _steps_only(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
-    flat = np.zeros(cloud.valid.shape, dtype=bool)
-    right = _joined(cloud, (slice(None), slice(None, -1)), (slice(None), slice(1, None)), flat)
-    down = _joined(cloud, (slice(None, -1), slice(None)), (slice(1, None), slice(None)), flat)
-    return right, down
-
-
-def _joined(cloud: Cloud, here: tuple[slice, slice], there: tuple[slice, slice], crease: np.ndarray) -> np.ndarray:
-    """Whether two neighbours lie on one surface: the step in z is within tilt and noise, and neither is a crease."""
-    step = cloud.points_m[there] - cloud.points_m[here]
-    allowed = MAX_SURFACE_TILT * np.hypot(step[..., 0], step[..., 1]) + STEP_SIGMAS * _step_noise(cloud)
-    with np.errstate(invalid="ignore"):
-        joined: np.ndarray = np.abs(step[..., 2]) <= allowed
-    return joined & ~crease[here] & ~crease[there]
+    grown = cv2.dilate(largest.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=reach) > 0
+    rim = kernels.largest_component(valid & grown, *steps)
+    return _holes_filled(largest | rim) & valid
 
 
 def _step_noise(cloud: Cloud) -> float:
     """Standard deviation of a difference between neighbours, from the quieter quarter of the second differences of z
     along rows (three quarters of the picture may be rubble); at least a rounding step's."""
-    z = cloud.points_m[..., 2]
-    bends = z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2]
+    z = np.ascontiguousarray(cloud.points_m[..., 2])
+    bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
     bends = bends[np.isfinite(bends)]
     # the second difference of white noise has sqrt(6) of its sigma, the first sqrt(2)
-    noise = float(np.quantile(np.abs(bends), 0.25)) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
+    noise = quantile_of(bends, 0.25) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
     return max(noise, cloud.z_step_m * np.sqrt(2.0 / 12.0))
 
 
-def _creases(cloud: Cloud, config: AutoCrop) -> np.ndarray:
-    """(h, w) bool: the smoothed surface's normal turns by more than ``crease_deg`` across ``smooth_px``."""
-    size = config.smooth_px
-    normals = _smooth_normals(cloud, size)
-    crease = np.zeros(cloud.valid.shape, dtype=bool)
-    limit = np.cos(np.deg2rad(config.crease_deg))
-    half = max(size // 2, 1)
-    for axis in (0, 1):
-        if normals.shape[axis] <= 2 * half:
-            continue
-        n = np.moveaxis(normals, axis, 0)
-        cosine = np.einsum("ijk,ijk->ij", n[2 * half :], n[: -2 * half])
-        np.moveaxis(crease, axis, 0)[half:-half] |= cosine < limit
-    return crease
-
-
-def _smooth_normals(cloud: Cloud, size: int) -> np.ndarray:
-    """(h, w, 3) unit normals of points averaged over ``size`` x ``size`` valid neighbours."""
-    valid = cloud.valid.astype(np.float64)
-    weight = cv2.blur(valid, (size, size), borderType=cv2.BORDER_REFLECT)
-    points = np.nan_to_num(cloud.points_m)
-    smooth = cv2.blur(points, (size, size), borderType=cv2.BORDER_REFLECT) / np.maximum(weight, 1e-12)[..., None]
-    du = np.gradient(smooth, axis=1) if smooth.shape[1] > 1 else np.zeros_like(smooth)
-    dv = np.gradient(smooth, axis=0) if smooth.shape[0] > 1 else np.zeros_like(smooth)
-    normals = np.cross(du, dv)
-    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-15)
-
-
-def _largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The largest set of nodes joined by links, by labelling a picture in which every link is a pixel of its own."""
-    h, w = nodes.shape
-    picture = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
-    picture[::2, ::2] = nodes
-    picture[::2, 1::2] = right & nodes[:, :-1] & nodes[:, 1:]
-    picture[1::2, ::2] = down & nodes[:-1] & nodes[1:]
-    _, labels = cv2.connectedComponents(picture, connectivity=4)
-    at_nodes = labels[::2, ::2]
-    sizes = np.bincount(at_nodes[nodes], minlength=2)
-    sizes[0] = 0
-    largest: np.ndarray = at_nodes == int(np.argmax(sizes))
-    return largest & nodes
+def _creases(points_m: np.ndarray, valid: np.ndarray, config: AutoCrop) -> np.ndarray:
+    """(h, w) bool: the normal of the surface of points averaged over ``smooth_px`` x ``smooth_px`` valid neighbours
+    turns by more than ``crease_deg`` across ``smooth_px``."""
+    size = (config.smooth_px, config.smooth_px)
+    weight = cv2.blur(valid.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
+    smooth = cv2.blur(np.where(valid[..., None], points_m, 0.0), size, borderType=cv2.BORDER_REFLECT)
+    smooth = smooth / np.maximum(weight, 1e-12)[..., None]
+    limit = float(np.cos(np.deg2rad(config.crease_deg)))
+    return np.asarray(kernels.turns(kernels.unit_normals(smooth), max(config.smooth_px // 2, 1), limit))
 
 
 # ---------------------------------------------------------------- the same without a pixel grid

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numba
 import numpy as np
@@ -16,8 +17,26 @@ STRIPS = 64
 pixels, 0.01 for none."""
 NODES, WEIGHTS = (np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5]), np.array([5.0, 8.0, 5.0]) / 18.0)
 """Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall."""
+FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "nsz"}}
 STEP = 1e-3
 """Of the differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall."""
+
+
+def crossed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3,) the cross product of two vectors."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _in_pixels(per_px: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """(2,) the pixels, along u and v, that come nearest to a vector (n,) by steps ``per_px`` (n, 2)."""
+    (uu, uv), (_, vv) = (per_px.T @ per_px).tolist()
+    u, v = (per_px.T @ vector).tolist()
+    determinant = uu * vv - uv * uv
+    if determinant <= 1e-12 * uu * vv:
+        # seen edge on, up to a millionth
+        return np.asarray(np.linalg.pinv(per_px) @ vector)
+    return np.array([vv * u - uv * v, uu * v - uv * u]) / determinant
 
 
 @dataclass(frozen=True)
@@ -43,21 +62,21 @@ class Sight:
     @classmethod
     def of(cls, centre_m: np.ndarray, per_px_m: np.ndarray, emitter_camera_m: np.ndarray) -> Sight:
         """At a surface's point (3,) in the camera's frame with its derivatives by u and v (2, 3)."""
-        normal = np.cross(per_px_m[0], per_px_m[1])
+        normal = crossed(per_px_m[0], per_px_m[1])
         normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
         ray, z = centre_m / centre_m[2], centre_m[2]
         slopes_per_px = ((per_px_m - np.outer(per_px_m[:, 2], ray)) / z)[:, :2].T
-        drift = np.linalg.pinv(slopes_per_px) @ (normal - normal[2] * ray)[:2] / z
+        drift = _in_pixels(slopes_per_px, (normal - normal[2] * ray)[:2]) / z
         distance, before = float(normal @ centre_m), float(normal @ emitter_camera_m)
-        beam = np.linalg.pinv(per_px_m.T) @ (emitter_camera_m - centre_m * before / distance)
+        beam = _in_pixels(per_px_m.T, emitter_camera_m - centre_m * before / distance)
         return cls(float(normal @ ray), drift, float(normal[2] / z), beam, distance - before)
 
     @classmethod
     def straight(cls, per_px_m: np.ndarray) -> Sight:
         """Along z from everywhere at once, and lit likewise: a parallel projection whose makers are not known."""
-        normal = np.cross(per_px_m[0], per_px_m[1])
+        normal = crossed(per_px_m[0], per_px_m[1])
         normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
-        drift = np.linalg.pinv(per_px_m[:, :2].T) @ normal[:2]
+        drift = _in_pixels(per_px_m[:, :2].T, normal[:2])
         return cls(float(normal[2]), drift, 0.0, np.zeros(2), 1.0)
 
     @cached_property
@@ -114,6 +133,7 @@ def _unit_strips() -> tuple[np.ndarray, np.ndarray]:
 
 
 EDGES, HALF_CHORDS = _unit_strips()
+MIDDLES = 0.5 * (EDGES[:-1] + EDGES[1:])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -146,60 +166,67 @@ def _fill_layers(depth: float, wall: float, sight: np.ndarray, weights: np.ndarr
         circles[k, 2] = (u - lit_below * beam_u, v - lit_below * beam_v, scale)
 
 
-@numba.njit(cache=True, nogil=True)
-def _chord(
-    y: float, mean_half_chord: float, radius: float, form: np.ndarray, circles: np.ndarray
-) -> tuple[float, float]:
-    """Ends along u, from the mouth's centre, of the part of a strip of the mouth that lies in all circles (n, 3).
+@numba.njit(**FAST)
+def _ends(radius: float, form: np.ndarray, circles: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    """Set ``low`` and ``high`` (layers, strips): ends along u, from the mouth's centre, of the part of each strip
+    of the mouth that lies in all circles (n, 3) of each layer.
 
-    ``y`` in -1..1: the strip's middle. ``form``: the ellipse's height and half-width in px per metre of radius, and the
-    drift of its chords along u by v.
+    ``form``: the ellipse's height and half-width in px per metre of radius, and the drift of its chords along u by v.
     """
     height, width, slant = form
-    low = radius * (slant * height * y - mean_half_chord * width)
-    high = radius * (slant * height * y + mean_half_chord * width)
-    for j in range(len(circles)):
-        shift_u, shift_v, scale = circles[j]
-        if shift_u == 0.0 and shift_v == 0.0 and scale == 1.0:
-            continue
-        v = radius * height * y - shift_v
-        half = width * np.sqrt(max((radius * scale) ** 2 - (v / height) ** 2, 0.0))
-        low = max(low, shift_u + slant * v - half)
-        high = min(high, shift_u + slant * v + half)
-    return low, high
+    for k in range(len(circles)):
+        for s in range(STRIPS):
+            low[k, s] = radius * (slant * height * MIDDLES[s] - HALF_CHORDS[s] * width)
+            high[k, s] = radius * (slant * height * MIDDLES[s] + HALF_CHORDS[s] * width)
+        for j in range(circles.shape[1]):
+            shift_u, shift_v, scale = circles[k, j]
+            if shift_u == 0.0 and shift_v == 0.0 and scale == 1.0:
+                continue
+            for s in range(STRIPS):
+                v = radius * height * MIDDLES[s] - shift_v
+                half = width * np.sqrt(max((radius * scale) ** 2 - (v / height) ** 2, 0.0))
+                low[k, s] = max(low[k, s], shift_u + slant * v - half)
+                high[k, s] = min(high[k, s], shift_u + slant * v + half)
 
 
-@numba.njit(cache=True, nogil=True)
-def _render(
-    hole: np.ndarray,
-    form: np.ndarray,
+@numba.njit(**FAST)
+def _paint(
+    u: float,
+    v: float,
+    tall: float,
     weights: np.ndarray,
-    circles: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
     blur: tuple[float, float],
     image: np.ndarray,
 ) -> None:
-    """Add to an image (h, w) the layers, each a stack of strips, averaged over the rectangle around each pixel."""
-    u, v, radius = hole[0], hole[1], hole[2]
+    """Set an image (h, w) to the layers, each a stack of strips, averaged over the rectangle around each pixel.
+    ``tall``: half the mouth's height in px."""
     h, w = image.shape
     half_u, half_v = 0.5 * blur[0], 0.5 * blur[1]
     area = blur[0] * blur[1]
     across = np.empty(w)
+    image[:] = 0.0
     for s in range(STRIPS):
-        bottom, top = v + radius * form[0] * EDGES[s], v + radius * form[0] * EDGES[s + 1]
         first, last = w, -1
-        across[:] = 0.0
         for k in range(len(weights)):
-            low, high = _chord(0.5 * (EDGES[s] + EDGES[s + 1]), HALF_CHORDS[s], radius, form, circles[k])
-            if not high > low:
-                continue
-            left, right = max(0, int(np.ceil(u + low - half_u))), min(w - 1, int(np.floor(u + high + half_u)))
-            first, last = min(first, left), max(last, right)
-            for c in range(left, right + 1):
-                across[c] += weights[k] * max(min(u + high, c + half_u) - max(u + low, c - half_u), 0.0)
+            if high[k, s] > low[k, s]:
+                first = min(first, max(0, int(np.ceil(u + low[k, s] - half_u))))
+                last = max(last, min(w - 1, int(np.floor(u + high[k, s] + half_u))))
+        if last < first:
+            continue
+        across[first : last + 1] = 0.0
+        for k in range(len(weights)):
+            start, end, weight = u + low[k, s], u + high[k, s], weights[k]
+            if end > start:
+                for c in range(first, last + 1):
+                    across[c] += weight * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
+        bottom, top = v + tall * EDGES[s], v + tall * EDGES[s + 1]
         for r in range(max(0, int(np.ceil(bottom - half_v))), min(h - 1, int(np.floor(top + half_v))) + 1):
             along = max(min(top, r + half_v) - max(bottom, r - half_v), 0.0) / area
+            row = image[r]
             for c in range(first, last + 1):
-                image[r, c] += along * across[c]
+                row[c] += along * across[c]
 
 
 def blurred_disc(
@@ -209,9 +236,10 @@ def blurred_disc(
 
     The disc is an ellipse in pixels: the set where the metric's form of the offset from (u, v) is below radius^2.
     """
-    image = np.zeros(shape)
+    image = np.empty(shape)
     disc = np.array([u, v, radius_m])
-    _render(disc, _form(metric_m2), np.ones(1), np.empty((1, 0, 3)), (float(blur_px), float(blur_px)), image)
+    blur = (float(blur_px), float(blur_px))
+    _picture(disc, _form(metric_m2), np.ones(1), np.empty((1, 0, 3)), blur, image)
     return image
 
 
@@ -220,45 +248,78 @@ def blurred_hole(patch: Patch, hole: np.ndarray) -> np.ndarray:
 
     Depth along the optical axis, wall in 0..1. Where the depth is negative (something before the surface) a disc.
     """
-    image: np.ndarray = _image(hole, patch.shape, patch.form, patch.sight.numbers, patch.blur_px)
+    image = np.empty(patch.shape)
+    picture(hole, patch.form, patch.sight.numbers, patch.blur_px, image)
     return image
 
 
 def derivatives(patch: Patch, hole: np.ndarray, image: np.ndarray) -> np.ndarray:
     """(5, h, w): of `blurred_hole`, whose value is ``image``, by u, v, radius, depth and wall, by differences."""
-    steps = STEP * np.array([1.0, 1.0, hole[2], hole[3] or STEP, 1.0 if hole[4] < 0.5 else -1.0])
-    by: np.ndarray = _differences(hole, steps, image, patch.form, patch.sight.numbers, patch.blur_px)
+    by = np.empty((len(hole), *patch.shape))
+    differences(hole, image, patch.form, patch.sight.numbers, patch.blur_px, by)
     return by
 
 
-@numba.njit(cache=True, nogil=True)
-def _image(
-    hole: np.ndarray, shape: tuple[int, int], form: np.ndarray, sights: np.ndarray, blur: tuple[float, float]
-) -> np.ndarray:
-    image = np.zeros(shape)
-    if hole[3] > 0.0:
-        weights, circles = _layers(hole[3], hole[4], sights)
-    else:
-        weights, circles = np.full(1, hole[3]), np.empty((1, 0, 3))
-    _render(hole, form, weights, circles, blur, image)
-    return image
+@numba.njit(**FAST)
+def picture(
+    hole: np.ndarray, form: np.ndarray, sights: np.ndarray, blur: tuple[float, float], image: np.ndarray
+) -> None:
+    """Set ``image`` (h, w) to `blurred_hole`."""
+    weights, circles = _hole_layers(hole, sights)
+    _picture(hole, form, weights, circles, blur, image)
 
 
-@numba.njit(cache=True, nogil=True)
-def _differences(
+@numba.njit(**FAST)
+def differences(
     hole: np.ndarray,
-    steps: np.ndarray,
     image: np.ndarray,
     form: np.ndarray,
     sights: np.ndarray,
     blur: tuple[float, float],
-) -> np.ndarray:
-    by = np.empty((len(hole), *image.shape))
+    by: np.ndarray,
+) -> None:
+    """Set ``by`` (5, h, w) to `derivatives`. A hole that only moves keeps its strips."""
+    weights, circles = _hole_layers(hole, sights)
+    low, high = np.empty((len(weights), STRIPS)), np.empty((len(weights), STRIPS))
+    _ends(hole[2], form, circles, low, high)
     for k in range(len(hole)):
+        step = STEP
+        if k == 2 or (k == 3 and hole[3] != 0.0):
+            step *= hole[k]
+        elif k == 3:
+            step *= STEP
+        elif k == 4 and hole[4] >= 0.5:
+            step = -step
         moved = hole.copy()
-        moved[k] += steps[k]
-        by[k] = (_image(moved, image.shape, form, sights, blur) - image) / steps[k]
-    return by
+        moved[k] += step
+        if k < 2:
+            _paint(moved[0], moved[1], hole[2] * form[0], weights, low, high, blur, by[k])
+        else:
+            picture(moved, form, sights, blur, by[k])
+        for r in range(image.shape[0]):
+            for c in range(image.shape[1]):
+                by[k, r, c] = (by[k, r, c] - image[r, c]) / step
+
+
+@numba.njit(**FAST)
+def _hole_layers(hole: np.ndarray, sights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if hole[3] > 0.0:
+        return _layers(hole[3], hole[4], sights)
+    return np.full(1, hole[3]), np.empty((1, 0, 3))
+
+
+@numba.njit(**FAST)
+def _picture(
+    hole: np.ndarray,
+    form: np.ndarray,
+    weights: np.ndarray,
+    circles: np.ndarray,
+    blur: tuple[float, float],
+    image: np.ndarray,
+) -> None:
+    low, high = np.empty((len(weights), STRIPS)), np.empty((len(weights), STRIPS))
+    _ends(hole[2], form, circles, low, high)
+    _paint(hole[0], hole[1], hole[2] * form[0], weights, low, high, blur, image)
 
 
 def _form(metric_m2: np.ndarray) -> np.ndarray:

@@ -22,13 +22,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from detectors.hole_image import Patch, blurred_hole, derivatives
+from detectors.hole_kernels import PARAMETERS, correlated_products, descend, hole_of
 
-PARAMETERS = 6
-"""u, v, radius, depth, offset, wall."""
+IMAGES, TOLERANCE = 60, 1e-4
+"""Of a descent: the most images drawn (most fits take eight), and the relative change of the sum of squares or of the
+parameters below which it ends: some hundredth of a standard error."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
 
@@ -49,84 +50,33 @@ class HoleFit:
 
 
 def fit_hole(patch: Patch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
-    """Least squares from a start, by Levenberg and Marquardt (MINPACK), with `sandwich_covariance`.
+    """Least squares from a start, by Levenberg's and Marquardt's way (MINPACK's), with `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2). The fourth is the hole's
     volume, which the blur keeps, so that a hole smaller than the blur still has one well-determined direction for each
     parameter but its radius; x may run free where the wall must stay in 0..1. The wall has `WALL_PRIOR` for one more
     observation: a small hole, or one seen straight on, does not determine it.
     """
-    from scipy.optimize import least_squares
-
-    model = _Model(patch)
-    start = np.array([u, v, np.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
-    scales = np.array([1.0, 1.0, 0.3, 0.3 * abs(start[3]) + 1e-12, 0.1 * abs(depth_m) + 1e-6, 0.3])
-    found = least_squares(
-        lambda q: model.misfit(q * scales),
-        start / scales,
-        lambda q: model.jacobian(q * scales) * scales,
-        method="lm",
-        max_nfev=60,
-        xtol=1e-4,
-        ftol=1e-4,
-        gtol=1e-9,
+    start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
+    h, w = patch.shape
+    # keeps a wild trial step finite: no disc is larger than ten patches
+    low = np.array([-10.0 * w, -10.0 * h, -20.0])
+    high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
+    prior = np.array([WALL_PRIOR[0], _prior_weight(patch)])
+    seen = (np.ascontiguousarray(patch.residual_m), np.ascontiguousarray(patch.used))
+    q, converged = descend(
+        *seen, start, low, high, prior, patch.form, patch.sight.numbers, patch.blur_px, IMAGES, TOLERANCE
     )
-    q = found.x * scales
-    hole, offset = model.hole(q), float(q[4])
+    hole, offset = hole_of(q, low, high), float(q[4])
     covariance = sandwich_covariance(patch, hole, offset)
     u, v, radius, depth, wall = (float(value) for value in hole)
-    return HoleFit(u, v, radius, depth, offset, wall, covariance, bool(found.success))
+    return HoleFit(u, v, radius, depth, offset, wall, covariance, converged)
 
 
 def _prior_weight(patch: Patch) -> float:
     """What a deviation of the wall of 1 is worth, in metres of misfit: noise that is equal over blur x blur pixels
     counts as often in the sum of squares."""
     return patch.noise_m * math.sqrt(patch.blur_area_px) / WALL_PRIOR[1]
-
-
-def _wall(x: float) -> float:
-    return math.sin(0.5 * math.pi * x) ** 2
-
-
-class _Model:
-    """Misfit and Jacobian of one patch with the prior as last row; MINPACK asks for both at the same place."""
-
-    def __init__(self, patch: Patch) -> None:
-        self._patch = patch
-        self._data = patch.residual_m[patch.used]
-        self._weight = _prior_weight(patch)
-        h, w = patch.used.shape
-        # keeps a wild trial step finite: no disc is larger than ten patches
-        self._low = np.array([-10.0 * w, -10.0 * h, -20.0])
-        self._high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
-        self._at = np.full(PARAMETERS, np.nan)
-        self._image = np.empty((h, w))
-
-    def misfit(self, q: np.ndarray) -> np.ndarray:
-        self._image, self._at = blurred_hole(self._patch, self.hole(q)), q.copy()
-        hole = self._image[self._patch.used]
-        return np.append(hole + q[4] - self._data, self._weight * (_wall(q[5]) - WALL_PRIOR[0]))
-
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
-        hole = self.hole(q)
-        image = self._image if np.array_equal(q, self._at) else blurred_hole(self._patch, hole)
-        by = derivatives(self._patch, hole, image)[:, self._patch.used]
-        radius, depth = hole[2], hole[3]
-        rows = np.zeros((by.shape[1] + 1, PARAMETERS))
-        rows[:-1, :2] = by[:2].T
-        rows[:-1, 2] = radius * by[2] - 2.0 * depth * by[3]
-        rows[:-1, 3] = by[3] / radius**2
-        rows[:-1, 4] = 1.0
-        rows[:-1, 5] = by[4]
-        rows[-1, 5] = self._weight
-        rows[:, 5] *= 0.5 * math.pi * math.sin(math.pi * q[5])
-        return rows
-
-    def hole(self, q: np.ndarray) -> np.ndarray:
-        """(u, v, radius, depth, wall) of the fitted parameters."""
-        u, v, log_radius = np.minimum(np.maximum(q[:3], self._low), self._high)
-        radius = math.exp(log_radius)
-        return np.array([u, v, radius, q[3] / radius**2, _wall(q[5])])
 
 
 def sandwich_covariance(patch: Patch, hole: np.ndarray, offset_m: float) -> np.ndarray:
@@ -139,26 +89,18 @@ def sandwich_covariance(patch: Patch, hole: np.ndarray, offset_m: float) -> np.n
     E[misfit' misfit] = s^2 (n - trace(A^-1 J' C J)); so what the model does not describe counts as noise. NaN where the
     fit determines no variance.
     """
-    h, w = patch.used.shape
     image = blurred_hole(patch, hole)
     by = derivatives(patch, hole, image)
-    columns = np.stack([*by[:4], np.ones((h, w)), by[4]], axis=-1) * patch.used[..., None]
-    flat = columns.reshape(-1, PARAMETERS)
+    columns = np.stack([*by[:4], np.ones(patch.shape), by[4]]) * patch.used
+    flat = columns.reshape(PARAMETERS, -1)
     across, down = patch.window
-    padded = np.pad(columns, ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
-    summed = np.dstack(
-        [
-            cv2.boxFilter(part, -1, patch.window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-            for part in (padded[..., :3], padded[..., 3:])
-        ]
-    ).reshape(-1, PARAMETERS)
     prior = np.zeros((PARAMETERS, PARAMETERS))
     prior[5, 5] = _prior_weight(patch) ** 2
     try:
-        bread = np.linalg.inv(flat.T @ flat + prior)
+        bread = np.linalg.inv(flat @ flat.T + prior)
     except np.linalg.LinAlgError:
         return np.full((PARAMETERS, PARAMETERS), np.nan)
-    meat = summed.T @ summed / (across * down)
+    meat = correlated_products(columns, across, down) / (across * down)
     freedom = int(patch.used.sum()) - float(np.trace(bread @ meat))
     misfit = (image + offset_m - patch.residual_m)[patch.used]
     if freedom <= 0:

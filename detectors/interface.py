@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -77,6 +78,15 @@ class ToldTheTruth(Protocol):
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """The detector for one cloud with this truth; empty on a hole-free board."""
+        ...
+
+
+@runtime_checkable
+class FindsAtOnce(Protocol):
+    """A detector that tells the findings of many thresholds in one pass: no detector need be one."""
+
+    def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
+        """For each threshold the centres (m, 3) of what `Detector.find` finds at it, strongest first."""
         ...
 
 

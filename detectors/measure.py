@@ -13,9 +13,11 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.hole_image import Patch, Sight, blurred_disc
+from detectors.hole_image import Patch, Sight, blurred_disc, crossed
+from detectors.hole_kernels import plane_sums
 from detectors.hole_model import HoleFit, fit_hole
 from detectors.interface import Detection, Evidence, Measurement
+from detectors.median import median_of, median_size_of, quantile_of
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import Region, rotate_vectors
@@ -110,7 +112,7 @@ def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, co
     blank = measure_extents(cloud, detection, "no pixel grid: extents only")
     if not cloud.organised:
         return blank
-    rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+    rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
     placed = on_pixels(cloud, detection, blank)
     around = _Surroundings.of(cloud, evidence, rows, columns, config)
     if around is None:
@@ -123,7 +125,7 @@ def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, co
 
 def on_pixels(cloud: Cloud, detection: Detection, measured: Measurement) -> Measurement:
     """A measurement with the mean of the detection's pixels as its place on the sensor."""
-    rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+    rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
     u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
     return replace(measured, u_px=u, v_px=v)
 
@@ -154,7 +156,7 @@ class _Surroundings:
         cls, cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
     ) -> _Surroundings | None:
         """Twice the blur of margin on each side; None where the surface around cannot be placed."""
-        h, w = cloud.valid.shape
+        h, w = cloud.points_m.shape[:2]
         sides = blur_in_cells(cloud, config)
         blur = max(sides)
         tight = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
@@ -174,17 +176,17 @@ class _Surroundings:
         used = finite & ~_other_damage(residual - offset, own, noise, blur)
         deviations = residual[own] - offset
         sign = 1.0 if deviations.sum() >= 0 else -1.0
-        peak = max(float(np.quantile(sign * deviations, 0.9)), 1e-9)
+        peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
         metric = plane[1] @ plane[1].T
         patch = Patch(residual, used, metric, sides, noise, _sight(cloud, *plane, np.array(config.emitter_mm) * MM))
-        invalid = ~cloud.valid[cut]
+        invalid = ~np.isfinite(cloud.points_m[cut][..., 2])
         v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
         return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])
 
     @property
     def surface_area_m2(self) -> float:
         """Of one pixel, on the surface."""
-        return float(np.linalg.norm(np.cross(self.per_px_m[0], self.per_px_m[1])))
+        return float(np.linalg.norm(crossed(self.per_px_m[0], self.per_px_m[1])))
 
     @property
     def facing_area_m2(self) -> float:
@@ -206,8 +208,8 @@ def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 def _level(values: np.ndarray) -> tuple[float, float]:
     """Median and robust standard deviation."""
-    middle = float(np.median(values))
-    return middle, float(np.median(np.abs(values - middle))) / 0.6745
+    middle = median_of(values)
+    return middle, median_size_of(values - middle) / 0.6745
 
 
 def _local_plane(
@@ -218,14 +220,9 @@ def _local_plane(
     Directions x/z and y/z and the surface's z are each linear in the pixel over a patch; then the product rule. In a
     parallel projection x and y themselves are.
     """
-    v, u = np.nonzero(finite)
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
-    design = np.column_stack([np.ones(len(u)), u - u0, v - v0])
-    p = points[finite]
-    across = p[:, :2] if projection == "parallel" else p[:, :2] / p[:, 2:]
-    targets = np.column_stack([across, surface_z[finite]])
     try:
-        beta = np.linalg.solve(design.T @ design, design.T @ targets)
+        beta = np.linalg.solve(*plane_sums(points, surface_z, finite, u0, v0, projection == "parallel"))
     except np.linalg.LinAlgError:
         return None
     if projection == "parallel":
@@ -234,7 +231,7 @@ def _local_plane(
         slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
         centre = slopes * z
         per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
-    if not np.linalg.norm(np.cross(per_px[0], per_px[1])) > 1e-12:
+    if not np.linalg.norm(crossed(per_px[0], per_px[1])) > 1e-12:
         return None
     return centre, per_px
 

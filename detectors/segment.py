@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from detectors import segment_kernels as kernels
 from harness.vocabulary.errors import UserError
 
 MAX_CELLS = 1 << 20
@@ -26,17 +26,46 @@ def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int 
     if len(finite) == 0:
         return labels
     points = np.ascontiguousarray(points_m[finite], dtype=np.float64)
-    cells = _cells(points, distance_m)
-    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-    order = np.argsort(keys, kind="stable")
-    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    roots = _join_cells(
-        points[order], cells[order[starts]], keys[order[starts]], np.append(starts, len(order)), distance_m
-    )
-    cell_of = np.empty(len(order), dtype=np.int64)
-    cell_of[order] = np.repeat(roots, np.diff(np.append(starts, len(order))))
-    labels[finite] = _in_order_of_appearance(cell_of, min_points)
+    cell_of, keys = kernels.occupied_cells(_cells(points, distance_m))
+    order, starts = kernels.grouped(cell_of, len(keys))
+    roots = kernels.joined_cells(points[order], starts, keys, distance_m)
+    labels[finite] = kernels.names_of(roots, cell_of, min_points)
     return labels
+
+
+def cluster_centres(
+    points_m: np.ndarray, scores: np.ndarray, thresholds: np.ndarray, distance_m: float, min_points: int = 1
+) -> tuple[np.ndarray, ...]:
+    """Centres (m, 3) of the clusters at each threshold: of each, the mean of its extreme points in x and in y.
+
+    At a threshold those of the points (n, 3) take part whose score (n,) is above it, as in `euclidean_clusters`; of
+    equal extremes the first point counts. Clusters come in falling order of their highest score, then in that of their
+    first point. One pass for all thresholds: a lower one only adds points, and only joins clusters.
+
+    Raises UserError as `euclidean_clusters`.
+    """
+    rising = np.unique(thresholds)
+    with np.errstate(invalid="ignore"):
+        loud = scores > np.min(rising, initial=np.inf)
+    some = np.flatnonzero(loud & np.isfinite(points_m).all(axis=1))
+    if not len(some):
+        return tuple(np.zeros((0, 3)) for _ in thresholds)
+    points, strength = np.ascontiguousarray(points_m[some], dtype=np.float64), scores[some]
+    # the number of thresholds that a point is above: 1 or more
+    level = np.searchsorted(rising, strength, side="left")
+    cell_of, keys = kernels.occupied_cells(_cells(points, distance_m))
+    loudest_first = np.argsort(-level, kind="stable")
+    order, starts = kernels.grouped(cell_of[loudest_first], len(keys))
+    order = loudest_first[order]
+    at, highest, named = kernels.clusters_by_level(
+        points, strength, level, order, starts, keys, len(rising), distance_m, min_points
+    )
+    west, east, north, south = (points[named[:, way]] for way in range(4))
+    centres = (west + east + north + south) / 4.0
+    sorted_by_level = np.lexsort((named[:, 4], -highest, at))
+    bounds = np.searchsorted(at[sorted_by_level], np.arange(len(rising) + 1))
+    each = [centres[sorted_by_level[bounds[n] : bounds[n + 1]]] for n in range(len(rising))]
+    return tuple(each[n] for n in np.searchsorted(rising, thresholds))
 
 
 def _cells(points: np.ndarray, distance_m: float) -> np.ndarray:
@@ -51,62 +80,3 @@ def _cells(points: np.ndarray, distance_m: float) -> np.ndarray:
             fix="crop the cloud, check its unit, or choose a larger cluster distance",
         )
     return cells.astype(np.int64) + 2
-
-
-def _in_order_of_appearance(groups: np.ndarray, min_points: int) -> np.ndarray:
-    """Rename group numbers to 0, 1, ... by first appearance; -1 for groups smaller than ``min_points``."""
-    _, first, inverse, sizes = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
-    kept = np.flatnonzero(sizes >= min_points)
-    names = np.full(len(sizes), -1, dtype=np.int64)
-    names[kept[np.argsort(first[kept])]] = np.arange(len(kept))
-    return names[inverse]
-
-
-@numba.njit(cache=True, nogil=True)
-def _root(parents: np.ndarray, i: int) -> int:
-    while parents[i] != i:
-        parents[i] = parents[parents[i]]
-        i = parents[i]
-    return i
-
-
-@numba.njit(cache=True, nogil=True)
-def _any_pair_within(points: np.ndarray, a0: int, a1: int, b0: int, b1: int, limit: float) -> bool:
-    for i in range(a0, a1):
-        for j in range(b0, b1):
-            dx = points[i, 0] - points[j, 0]
-            dy = points[i, 1] - points[j, 1]
-            dz = points[i, 2] - points[j, 2]
-            if dx * dx + dy * dy + dz * dz <= limit:
-                return True
-    return False
-
-
-@numba.njit(cache=True, nogil=True)
-def _join_cells(
-    points: np.ndarray, cells: np.ndarray, keys: np.ndarray, starts: np.ndarray, distance: float
-) -> np.ndarray:
-    """Root cell of each occupied cell; ``points`` sorted by cell, ``starts`` (c + 1,) where each cell begins."""
-    n = len(keys)
-    parents = np.arange(n)
-    limit = distance * distance
-    for c in range(n):
-        # points within the distance lie at most two cells away; half of the neighbours, because links are mutual
-        for dx in range(0, 3):
-            for dy in range(-2, 3):
-                for dz in range(-2, 3):
-                    if dx == 0 and (dy < 0 or (dy == 0 and dz <= 0)):
-                        continue
-                    key = ((cells[c, 0] + dx) << 42) | ((cells[c, 1] + dy) << 21) | (cells[c, 2] + dz)
-                    o = np.searchsorted(keys, key)
-                    if o == n or keys[o] != key:
-                        continue
-                    ours = _root(parents, c)
-                    theirs = _root(parents, o)
-                    if ours != theirs and _any_pair_within(
-                        points, starts[c], starts[c + 1], starts[o], starts[o + 1], limit
-                    ):
-                        parents[max(ours, theirs)] = min(ours, theirs)
-    for c in range(n):
-        parents[c] = _root(parents, c)
-    return parents

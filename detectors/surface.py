@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from detectors import surface_kernels as kernels
+from detectors.lar_kernels import lar_stage, lower_factor, solved
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 
@@ -33,7 +34,6 @@ SEED = 20201102
 """Of the elemental starts: fixed, so that the same cloud gives the same surface."""
 LAR_SAMPLE, LAR_THINNING = 2048, 12
 """Points below which LAR starts from least squares, and the thinning that gives the start above it."""
-LAR_STEPS = 60
 BISQUARE_CONVERGED = 1e-2
 """Stop when no point of the surface moves by more than this part of a standard error of the fit."""
 GAP_CONVERGED = 1e-6
@@ -181,20 +181,12 @@ class _Problem:
 
 def _cholesky(gram: np.ndarray) -> np.ndarray | None:
     """Lower factor, None where the matrix is singular to working precision."""
-    try:
-        factor = np.linalg.cholesky(gram)
-    except np.linalg.LinAlgError:
-        return None
-    diagonal = np.diag(factor)
-    return factor if diagonal.min() > 1e-7 * diagonal.max() else None
-
-
-def _solve(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(factor.T, np.linalg.solve(factor, right))
+    factor, regular = lower_factor(gram)
+    return factor if regular else None
 
 
 def _least_squares(problem: _Problem) -> _Solution:
-    return _Solution(_solve(problem.factor, problem.right), 1, True, "least squares")
+    return _Solution(solved(problem.factor, problem.right), 1, True, "least squares")
 
 
 # ---------------------------------------------------------------- least absolute residuals
@@ -221,7 +213,8 @@ def _lar(problem: _Problem) -> _Solution:
     scale = max(_median_size(r), TINY_M)
     iterations, gap = 0, np.inf
     for knee in scale * np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])[0 if sample is None else 2 :]:
-        c, r, spent = _lar_stage(problem, c, r, max(margin * scale, 10.0 * knee), knee)
+        enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
+        c, r, spent = lar_stage(problem.basis, problem.z, c, r, max(margin * scale, 10.0 * knee), knee, enough)
         iterations += spent
         margin = min(margin, 5.0 * knee / scale)
         _, lost, _ = kernels.huber_state(r, knee)
@@ -232,77 +225,8 @@ def _lar(problem: _Problem) -> _Solution:
     return _Solution(c, iterations, gap <= GAP_CONVERGED, note)
 
 
-def _lar_stage(
-    problem: _Problem, start: np.ndarray, r_start: np.ndarray, margin: float, knee: float
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """The optimum at one knee: (coefficients, residuals, steps). The margin widens until no far point changes sides."""
-    steps = 0
-    enough = 0.001 * GAP_CONVERGED * float(np.abs(r_start).sum())
-    while True:
-        near, basis, far_pull = kernels.split(problem.basis, r_start, margin)
-        part = _Problem(basis, problem.z[near], problem.gram, problem.right, problem.factor)
-        c, spent = _smoothed_descent(part, far_pull, start, knee, enough)
-        r = problem.residuals(c)
-        steps += spent
-        if not kernels.sides_changed(r_start, r, margin, knee):
-            return c, r, steps
-        margin *= 3.0
-
-
 def _median_size(r: np.ndarray) -> float:
     return float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)])))
-
-
-def _smoothed_descent(
-    part: _Problem, fixed_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
-) -> tuple[np.ndarray, int]:
-    """Minimise sum huber(r, knee) - c' fixed_pull over the near points: Newton, or a majorising step where it fails.
-
-    Stops where a step promises or brings less than ``enough``.
-    """
-    c = start
-    r = part.residuals(c)
-    value = kernels.huber_state(r, knee)[0] - float(c @ fixed_pull)
-    steps = 0
-    while steps < LAR_STEPS:
-        steps += 1
-        pull = kernels.signed_sum(part.basis, r, knee) + fixed_pull
-        step = _newton_step(part, r, knee, pull)
-        if step is not None and float(step @ pull) < enough:
-            break
-        moved = _line_search(part, fixed_pull, c, step, knee, value) if step is not None else None
-        if moved is None:
-            moved = _line_search(part, fixed_pull, c, _majorising_step(part, r, knee, pull), knee, value)
-        if moved is None or value - moved[2] < enough:
-            break
-        c, r, value = moved
-    return c, steps
-
-
-def _newton_step(part: _Problem, r: np.ndarray, knee: float, pull: np.ndarray) -> np.ndarray | None:
-    inside = (np.abs(r) <= knee).astype(np.float64)
-    curvature, _ = kernels.weighted_gram(part.basis, r, inside)
-    factor = _cholesky(curvature / knee)
-    return None if factor is None else _solve(factor, pull)
-
-
-def _majorising_step(part: _Problem, r: np.ndarray, knee: float, pull: np.ndarray) -> np.ndarray:
-    """The reweighted least-squares step: each |r| beyond the knee under its tangent parabola. Always descends."""
-    curvature, _ = kernels.weighted_gram(part.basis, r, 1.0 / np.maximum(np.abs(r), knee))
-    return np.linalg.lstsq(curvature, pull, rcond=1e-12)[0]
-
-
-def _line_search(
-    part: _Problem, fixed_pull: np.ndarray, c: np.ndarray, step: np.ndarray, knee: float, value: float
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """The first of the full, half, quarter ... step that lowers the value: (c, residuals, value), or None."""
-    for halvings in range(12):
-        trial = c + step * 0.5**halvings
-        r = part.residuals(trial)
-        new = kernels.huber_state(r, knee)[0] - float(trial @ fixed_pull)
-        if new < value:
-            return trial, r, new
-    return None
 
 
 # ---------------------------------------------------------------- bisquare
@@ -338,7 +262,7 @@ def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> 
         factor = _cholesky(gram)
         if factor is None:
             return _Solution(c, step, False, note + "; stopped: too few points kept weight")
-        new = _solve(factor, right)
+        new = solved(factor, right)
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
@@ -395,5 +319,5 @@ def _concentrate(problem: _Problem, c: np.ndarray, kept: int) -> tuple[np.ndarra
         factor = _cholesky(gram)
         if factor is None:
             break
-        c = _solve(factor, right)
+        c = solved(factor, right)
     return c, best

@@ -14,6 +14,20 @@ BLOCK = 256
 FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
 
 
+@numba.njit(cache=True, nogil=True)
+def columns_at(points: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and z, each (n,), of points (h, w, 3) where the mask (h, w) is true, in its order."""
+    n = mask.sum()
+    x, y, z = np.empty(n), np.empty(n), np.empty(n)
+    i = 0
+    for r in range(mask.shape[0]):
+        for c in range(mask.shape[1]):
+            if mask[r, c]:
+                x[i], y[i], z[i] = points[r, c, 0], points[r, c, 1], points[r, c, 2]
+                i += 1
+    return x, y, z
+
+
 @numba.njit(**FAST)
 def chebyshev_basis(u: np.ndarray, v: np.ndarray, powers: np.ndarray) -> np.ndarray:
     """(p, n) products T_a(u) T_b(v) of Chebyshev polynomials for each row (a, b) of ``powers`` (p, 2)."""

@@ -14,9 +14,11 @@ from pydantic import Field, model_validator
 
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
+from detectors.median import median_of, median_size_of
 from detectors.rounding import rounding_left_m2
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surface import SurfaceConfig, fit_surface
+from detectors.surface_kernels import columns_at
 from harness.vocabulary.capture import Cloud
 
 SCRIPT_VARIANT: dict[str, Any] = {
@@ -58,7 +60,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 3
+    version = 4
 
     @property
     def default_threshold(self) -> float | None:
@@ -71,20 +73,21 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         Raises UserError on an empty crop and where the points do not determine the surface.
         """
         mask = crop(cloud, self.settings.crop)
-        x, y, z = cloud.points_m[mask].T
+        x, y, z = columns_at(cloud.points_m, mask)
         surface = fit_surface(x, y, z, self.settings.surface)
         fitted = surface.evaluate(x, y)
         residual = z - fitted
         floor = rounding_floor(cloud, mask)
         deviation = self._stated_deviation(cloud, mask)
-        spread = _spread(residual / deviation, z, self.settings.scale)
-        scale = np.maximum(spread * deviation, floor)
+        spread = _spread(residual if deviation is None else residual / deviation, z, self.settings.scale)
+        typical = 1.0 if deviation is None else median_of(deviation)
+        scale = max(spread, floor) if deviation is None else np.maximum(spread * deviation, floor)
         notes = {
             "surface": surface.note,
             "surface_iterations": surface.iterations,
             "surface_converged": surface.converged,
             "points": len(z),
-            "spread_m": spread * float(np.median(deviation)),
+            "spread_m": spread * typical,
             "floor_m": floor,
         }
         return Evidence(
@@ -95,12 +98,12 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             notes=notes,
         )
 
-    def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray:
-        """(n,) standard deviation that the cloud states of each point, metres; ones where it states none or none is
+    def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:
+        """(n,) standard deviation that the cloud states of each point, metres; None where it states none or none is
         wanted."""
         wanted = self.settings.use_variance and self.settings.scale != "raw_z_std"
         if cloud.mean_variance_m2 is None or not wanted:
-            return np.ones(int(mask.sum()))
+            return None
         deviation: np.ndarray = np.sqrt(cloud.mean_variance_m2[mask])
         return deviation
 
@@ -122,7 +125,7 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
         return float(np.sqrt(whole))
     variances = cloud.variance_m2[mask]
     variances = variances[np.isfinite(variances)]
-    dither = max(float(np.median(variances)) - whole, 0.0) if len(variances) else 0.0
+    dither = max(median_of(variances) - whole, 0.0) if len(variances) else 0.0
     fixed = rounding_left_m2(step, dither)
     return float(np.sqrt(fixed + (whole - fixed) / max(cloud.n_frames, 1)))
 
@@ -135,7 +138,7 @@ def _on_half_steps(z: np.ndarray, step: float) -> bool:
 
 def _spread(residual: np.ndarray, z: np.ndarray, scale: str) -> float:
     if scale == "mad":
-        return float(np.median(np.abs(residual))) / 0.6745
+        return median_size_of(residual) / 0.6745
     values = z if scale == "raw_z_std" else residual
     # MATLAB's std divides by n - 1
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0

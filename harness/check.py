@@ -22,6 +22,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from harness.engine.options import add_engine_options, engine_options
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
@@ -61,15 +62,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
     add("--update", action="store_true", help="write the baseline anew, and print what changes")
-    add("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
+    add_engine_options(parser)
     return parser
-
-
-def _positive(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 4096:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
-    return int(text)
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
@@ -80,9 +75,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if experiment.config.study is None:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     _refuse_too_few_boards(experiment)
+    asked = engine_options(options)
+    if not asked.shard.is_whole:
+        raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
     baseline = _baseline(path, update=options.update)
-    code = run_study(experiment, options.out, options.jobs, command)
+    code = run_study(experiment, options.out, asked, command)
     if code not in (0, 1):
         return code
     found = _found(experiment, options.out)

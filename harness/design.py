@@ -320,8 +320,10 @@ def _json(design: StudyDesign, command: str) -> str:
     import json
 
     from harness.report.design_rows import design_data
+    from harness.vocabulary.versions import RESULTS_VERSION
 
-    return json.dumps({**design_data(design), "command": command}, indent=2, allow_nan=False)
+    told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
+    return json.dumps(told, indent=2, allow_nan=False)
 
 
 def _write(design: StudyDesign, out: Path, command: str) -> None:

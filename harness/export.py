@@ -167,11 +167,13 @@ def _write_beside(
 ) -> None:
     """The truth, the nominal poses that a registration may start from, the declaration, and where all this is from."""
     from harness.experiment.load import resolved_yaml
+    from harness.inspection.poses import POSES_KEY
     from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import record
 
+    nominal = {POSES_KEY: _nominal(source, targets, arguments.hole_free)}
     write_text(folder / "truth.json", _json(_truth(targets, views)))
-    write_text(folder / "nominal_poses.json", _json(_nominal(source, targets, arguments.hole_free)))
+    write_text(folder / "nominal_poses.json", _json(nominal))
     write_text(folder / "experiment.yaml", resolved_yaml(experiment))
     facts = {
         **record("python -m harness.export " + shlex.join(given)),
@@ -223,8 +225,10 @@ def _rows(matrix: np.ndarray) -> list[list[float]]:
     return rows
 
 
-def _json(data: Any) -> str:
-    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+def _json(data: dict[str, Any]) -> str:
+    from harness.vocabulary.versions import RESULTS_VERSION
+
+    return json.dumps({"results_version": RESULTS_VERSION, **data}, indent=2, allow_nan=False) + "\n"
 
 
 def _conclude(arguments: argparse.Namespace, experiment: Experiment, views: tuple[ExportedView, ...]) -> None:

@@ -1,25 +1,24 @@
-"""``python -m harness.ls``: what there is to choose from, where it comes from, and what can be set of it."""
+"""``python -m harness.ls``: what there is to choose from and what can be set of it; results and stored renders."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError, exit_code_of
-from harness.vocabulary.plug_ins import Offer, PlugIns
 
 if TYPE_CHECKING:
-    from harness.vocabulary.config import Config
-    from harness.vocabulary.declaration.shape import Declared
+    from harness.listing.offers import Offers
+    from harness.listing.results import ResultFolder
 
-Row = Mapping[str, Any]
+KINDS = ("detectors", "cameras")
+STORED = ("results", "cache")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where a plug-in is broken), 2 on a mistake of the user."""
+    """The program. Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
     options = _parser().parse_args(arguments)
     return exit_code_of(lambda: _run(options))
 
@@ -28,42 +27,59 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m harness.ls",
         description="List detectors and cameras: tofpod's own and those that installed packages offer through the "
-        "entry point groups tofpod.detectors and tofpod.cameras.",
+        "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, or the cache of renders.",
         epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
-        "python -m harness.ls --json",
+        "python -m harness.ls --json; python -m harness.ls results; python -m harness.ls results averaging; "
+        "python -m harness.ls cache",
     )
     add = parser.add_argument
-    add("what", nargs="?", help=f"list one kind only ({' or '.join(LISTINGS)}); or a name of either")
-    add("name", nargs="?", help="show everything that can be set of this one")
+    add("what", nargs="?", help=f"list one kind only ({', '.join(KINDS)}, results or cache); or a detector or camera")
+    add("name", nargs="?", help="show everything that can be set of this one; of results, those of this experiment")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
+    add("--fast", action="store_true", help="of the cache: do not read every render to find damaged ones")
     add("--json", action="store_true", help="as JSON, for programs")
     return parser
 
 
 def _run(options: argparse.Namespace) -> int:
-    if options.what is not None and options.what not in LISTINGS:
+    if options.what == "results":
+        return _list_results(options)
+    if options.what == "cache":
+        return _list_cache(options)
+    return _list_offers(options)
+
+
+# ---------------------------------------------------------------- detectors and cameras
+
+
+def _list_offers(options: argparse.Namespace) -> int:
+    from harness.listing.offers import OFFERS
+    from harness.listing.text import table_lines
+
+    if options.what is not None and options.what not in OFFERS:
         return _show_whichever(options)
     if options.name is not None:
-        return _show(LISTINGS[options.what], options.name, as_json=options.json)
-    chosen = {title: LISTINGS[title] for title in ([options.what] if options.what else LISTINGS)}
-    rows = {title: listing.rows() for title, listing in chosen.items()}
+        return _show(OFFERS[options.what], options.name, as_json=options.json)
+    chosen = {title: OFFERS[title] for title in ([options.what] if options.what else OFFERS)}
+    rows = {title: offers.rows() for title, offers in chosen.items()}
     if options.json:
-        _print_json(rows)
-        return 0
-    for number, (title, listing) in enumerate(chosen.items()):
-        print(f"{chr(10) if number else ''}{title} (entry points: {listing.plug_ins().group})")
-        print("\n".join(_table([listing.cells(row) for row in rows[title]])))
+        return _print_json(rows)
+    for number, (title, offers) in enumerate(chosen.items()):
+        print(f"{chr(10) if number else ''}{title} (entry points: {offers.plug_ins().group})")
+        print("\n".join(table_lines([offers.cells(row) for row in rows[title]])))
     return 0
 
 
 def _show_whichever(options: argparse.Namespace) -> int:
     """What is called so: a detector, a camera, or one of each. Raises UserError where it is neither."""
+    from harness.listing.offers import OFFERS
     from harness.vocabulary.declaration.diagnose import nearest
 
     word = options.what
-    named = [title for title, listing in LISTINGS.items() if word in listing.plug_ins().names()]
+    named = [title for title, offers in OFFERS.items() if word in offers.plug_ins().names()]
     if options.name is not None or not named:
-        names = [name for listing in LISTINGS.values() for name in listing.plug_ins().names()]
-        legal = [*LISTINGS, *([] if options.name is not None else names)]
+        names = [name for offers in OFFERS.values() for name in offers.plug_ins().names()]
+        legal = [*OFFERS, *STORED, *([] if options.name is not None else names)]
         near = nearest(word, legal)
         raise UserError(
             f"there is nothing called {word!r} to list" + (f"; did you mean {near!r}?" if near else ""),
@@ -71,202 +87,87 @@ def _show_whichever(options: argparse.Namespace) -> int:
             fix="python -m harness.ls lists all",
         )
     if options.json:
-        _print_json({title: _shown(LISTINGS[title], word) for title in named})
-        return 0
+        return _print_json({title: OFFERS[title].shown(word) for title in named})
     for title in named:
-        _show(LISTINGS[title], word, as_json=False)
+        _show(OFFERS[title], word, as_json=False)
     return 0
 
 
-def _show(listing: Listing, name: str, *, as_json: bool) -> int:
+def _show(offers: Offers, name: str, *, as_json: bool) -> int:
     """One of them with all that can be set of it. Raises UserError where it is unknown, taken twice or broken."""
+    from harness.listing.text import table_lines
     from harness.vocabulary.seeds import canonical_json
 
-    row = _shown(listing, name)
+    row = offers.shown(name)
     if as_json:
-        _print_json(row)
-        return 0
-    print("\n".join(_table([listing.cells(row)], indent="")))
-    settable = row[listing.settable_title]
-    print("\n".join(_table([(one["path"], canonical_json(one["value"]), one["about"]) for one in settable])))
+        return _print_json(row)
+    print("\n".join(table_lines([offers.cells(row)], indent="")))
+    settable = row[offers.settable_title]
+    print("\n".join(table_lines([(one["path"], canonical_json(one["value"]), one["about"]) for one in settable])))
     return 0
 
 
-def _shown(listing: Listing, name: str) -> Row:
-    row = {**_origin(listing.plug_ins().offer(name)), **listing.facts(name)}
-    return {**row, listing.settable_title: listing.settable(name)}
+# ---------------------------------------------------------------- results and renders
 
 
-def _print_json(value: Any) -> None:
+def _list_results(options: argparse.Namespace) -> int:
+    """Every folder of results with its state. Raises UserError where an experiment was named that has none."""
+    from harness.listing.results import result_folders
+
+    folders = list(result_folders(options.out, options.name))
+    if options.name is not None and not folders:
+        raise UserError(
+            f"{options.out}: has no results of {options.name!r}", fix="python -m harness.ls results lists all"
+        )
+    if options.json:
+        return _print_json([one.to_data() for one in folders])
+    print(f"results in {options.out}" + ("" if folders else ": none"))
+    for name in sorted({one.experiment for one in folders}):
+        print(f"  {name}")
+        _print_folders([one for one in folders if one.experiment == name])
+    return 0
+
+
+def _print_folders(folders: list[ResultFolder]) -> None:
+    from harness.listing.text import size_text, table_lines
+
+    print(
+        "\n".join(
+            table_lines(
+                [
+                    (
+                        one.digest,
+                        (one.date or "")[:10],
+                        (one.commit or "")[:7] + ("+" if one.dirty else ""),
+                        size_text(one.size_bytes),
+                        "report" if one.has_report else "no report",
+                        one.note,
+                    )
+                    for one in folders
+                ],
+                indent="    ",
+            )
+        )
+    )
+
+
+def _list_cache(options: argparse.Namespace) -> int:
+    if options.name is not None:
+        raise UserError(f"the cache has no part called {options.name!r}", fix="python -m harness.ls cache")
+    from harness.listing.renders import cache_facts, cache_lines
+
+    facts = cache_facts(options.out, check=not options.fast)
+    if options.json:
+        return _print_json(facts)
+    print("\n".join(cache_lines(facts)))
+    return 0
+
+
+def _print_json(value: Any) -> int:
     import json
 
     print(json.dumps(value, indent=2, ensure_ascii=False))
-
-
-def _table(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
-    """Lines with columns below each other; the last cell of a row is as long as it likes."""
-    widths: dict[int, int] = {}
-    for row in rows:
-        for column, cell in enumerate(row[:-1]):
-            widths[column] = max(widths.get(column, 0), len(cell))
-    for row in rows:
-        cells = [cell.ljust(widths[column]) for column, cell in enumerate(row[:-1])]
-        yield (indent + "  ".join([*cells, row[-1]])).rstrip()
-
-
-# ---------------------------------------------------------------- what is listed
-
-
-@dataclass(frozen=True)
-class Listing:
-    """One kind of thing. ``facts`` of a name that can be loaded; ``text`` of these facts for a table; ``settable`` of a
-    name: path, value, and what is legal or where the value comes from."""
-
-    plug_ins: Callable[[], PlugIns]
-    facts: Callable[[str], Row]
-    text: Callable[[Row], tuple[str, ...]]
-    settable: Callable[[str], list[dict[str, Any]]]
-    settable_title: str
-
-    def rows(self) -> list[Row]:
-        """One row per offer; what cannot be used has ``broken``, which says why, and ``fix``."""
-        return [self._row(offer) for offer in self.plug_ins().offers()]
-
-    def _row(self, offer: Offer) -> Row:
-        try:
-            return {**_origin(offer), **self.facts(offer.name)}
-        except UserError as mistake:
-            return _broken(offer, mistake)
-        except (Exception, SystemExit) as error:
-            if offer.built_in:
-                raise
-            return _broken(offer, self.plug_ins().broken(offer, f"{type(error).__name__}: {error}"))
-
-    def cells(self, row: Row) -> tuple[str, ...]:
-        """The row as text."""
-        head = (row["name"], f"{row['package']} {row['package_version']}".strip())
-        return (*head, f"broken: {row['broken']}") if "broken" in row else (*head, *self.text(row))
-
-
-def _broken(offer: Offer, mistake: UserError) -> Row:
-    return {**_origin(offer), "broken": mistake.message, "fix": mistake.fix}
-
-
-def _origin(offer: Offer) -> Row:
-    return {"name": offer.name, "package": offer.package, "package_version": offer.package_version}
-
-
-def _detectors() -> PlugIns:
-    from detectors import DETECTORS
-
-    return DETECTORS
-
-
-def _detector_facts(name: str) -> Row:
-    """Version (None where it is not known without settings), what it is in one line, whether it tests the harness."""
-    import inspect
-
-    from detectors import detector_type, load_detector
-
-    kind = detector_type(name)
-    try:
-        version = load_detector(name, {}).version
-    except UserError:
-        version = None
-    about = (inspect.getdoc(kind) or "").strip().partition("\n")[0]
-    return {"version": version, "about": about, "tests_the_harness": bool(getattr(kind, "tests_the_harness", False))}
-
-
-def _detector_text(row: Row) -> tuple[str, ...]:
-    mark = "(tests the harness, finds no damage) " if row["tests_the_harness"] else ""
-    version = "" if row["version"] is None else f"version {row['version']}"
-    return (version, f"{mark}{row['about']}")
-
-
-def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Every setting with its default. Of a setting that is one of several kinds, those of the default's kind."""
-    from pydantic import ValidationError
-
-    from detectors import detector_type
-    from harness.vocabulary.declaration.shape import Declared
-
-    settings_type: type[Config] = detector_type(name).settings_type
-    try:
-        defaults = settings_type().to_data()
-    except ValidationError as error:
-        lacking = ", ".join(".".join(map(str, one["loc"])) for one in error.errors())
-        raise UserError(f"detector {name!r} has settings without a default: {lacking}") from error
-    declared = Declared(settings_type, defaults, {})
-    return [
-        {"path": ".".join(path), "value": value, "about": _legal(declared, path)} for path, value in _leaves(defaults)
-    ]
-
-
-def _legal(declared: Declared, path: tuple[str, ...]) -> str:
-    """What a setting may be; of one that chooses a kind, all kinds."""
-    from harness.vocabulary.declaration.shape import bare, branches, legal_at, tags_of
-
-    around = declared.at(path[:-1]) if len(path) > 1 else None
-    if around is not None and bare(around)[1] == path[-1]:
-        return "one of " + ", ".join(tag for branch in branches(around) for tag in tags_of(branch, path[-1]))
-    return legal_at(declared.at(path)) or ""
-
-
-def _leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for key, value in data.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, (*path, key))
-        else:
-            yield (*path, key), value
-
-
-def _cameras() -> PlugIns:
-    from scenes.sensor.camera import CAMERAS
-
-    return CAMERAS
-
-
-def _camera_facts(name: str) -> Row:
-    """Title, grid, limits of range and wavelength."""
-    from math import isfinite
-
-    from scenes.sensor.camera import load_camera
-
-    camera = load_camera(name)
-    optics = camera.optics
-    return {
-        "title": camera.title,
-        "columns": optics.lens.width,
-        "rows": optics.lens.height,
-        "nearest_m": optics.nearest_m,
-        "farthest_m": optics.farthest_m if isfinite(optics.farthest_m) else None,
-        "wavelength_nm": optics.wavelength_nm,
-    }
-
-
-def _camera_text(row: Row) -> tuple[str, ...]:
-    near, far = row["nearest_m"], row["farthest_m"]
-    reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
-    return (f"{row['columns']} x {row['rows']} px", reach, f"{row['wavelength_nm']:.4g} nm", row["title"])
-
-
-def _camera_numbers(name: str) -> list[dict[str, Any]]:
-    """Every number of the camera's file with its tag and source."""
-    from harness.vocabulary.declaration.shape import get
-    from scenes.sensor.camera import load_camera, number_paths
-
-    data = load_camera(name).to_data()
-    numbers = {path: get(data, tuple(path.split("."))) for path in number_paths(data)}
-    return [
-        {"path": path, "value": one["value"], "about": f"{one['tag']}: {one['source']}"}
-        for path, one in numbers.items()
-    ]
-
-
-LISTINGS = {
-    "detectors": Listing(_detectors, _detector_facts, _detector_text, _detector_settings, "settings"),
-    "cameras": Listing(_cameras, _camera_facts, _camera_text, _camera_numbers, "numbers"),
-}
+    return 0
 
 
 if __name__ == "__main__":

@@ -140,9 +140,11 @@ def _write(statement: PodStatement, out: Path, command: str) -> None:
     from harness.report.pod_figure import save_pod_png
     from harness.report.pod_page import pod_html
     from harness.vocabulary.files import write_text
+    from harness.vocabulary.versions import RESULTS_VERSION
 
     data, picture, page = (out / name for name in FILES)
-    write_text(data, json.dumps({**statement.to_data(), "command": command}, indent=2, allow_nan=False) + "\n")
+    told = {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
+    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
     save_pod_png(picture, statement)
     write_text(page, pod_html(statement, command))
     print(f"wrote {data}, {picture.name}, {page.name}")

@@ -7,6 +7,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from harness.engine.options import add_engine_options, engine_options
 from harness.vocabulary.errors import exit_code_of
 
 
@@ -38,18 +39,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated",
     )
-    parser.add_argument("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
     parser.add_argument(
         "--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)"
     )
     parser.add_argument("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
+    add_engine_options(parser)
     return parser
-
-
-def _positive(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 4096:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
-    return int(text)
 
 
 def _run(options: argparse.Namespace, given: list[str]) -> int:
@@ -62,11 +57,13 @@ def _run(options: argparse.Namespace, given: list[str]) -> int:
         from harness.engine.captures import judge_captures
 
         return judge_captures(experiment, options.out, command, dry_run=options.dry_run)
-    from harness.engine.study import dry_run, run_study
-
     if options.dry_run:
-        return dry_run(experiment, options.out, options.jobs)
-    return run_study(experiment, options.out, options.jobs, command)
+        from harness.engine.estimate import dry_run
+
+        return dry_run(experiment, options.out, engine_options(options))
+    from harness.engine.study import run_study
+
+    return run_study(experiment, options.out, engine_options(options), command)
 
 
 if __name__ == "__main__":

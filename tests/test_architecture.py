@@ -23,7 +23,21 @@ ALLOWED = {
     "harness": ("",),
 }
 """Imports inside functions count as well, but for a version number that a leaf may ask for."""
-PROGRAMS = ["sweep", "detect", "export", "target", "validate", "prepare", "pod", "design", "compare", "check", "ls"]
+PROGRAMS = [
+    "sweep",
+    "detect",
+    "export",
+    "target",
+    "validate",
+    "prepare",
+    "pod",
+    "design",
+    "compare",
+    "check",
+    "ls",
+    "merge",
+    "clean",
+]
 
 
 def sources() -> list[Path]:

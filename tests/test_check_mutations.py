@@ -15,10 +15,8 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from serial_pool import serial_pool
 
 from harness import check
-from harness.engine import workers
 from tests.mutated_detectors import write_mutants
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +53,7 @@ class Gate:
 
     def check(self, *changed: str, update: bool = False) -> Checked:
         arguments = [str(ROOT / "experiments" / "regression.yaml"), "--baseline", str(self.home / "baseline.json")]
-        arguments += ["--out", str(self.home / "results"), *(["--update"] if update else [])]
+        arguments += ["--out", str(self.home / "results"), "--serial", *(["--update"] if update else [])]
         for one in (*SMALLER, *changed):
             arguments += ["--set", one]
         with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as errors:
@@ -71,7 +69,6 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gate]:
     home = tmp_path_factory.mktemp("gate")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(write_mutants(home / "plug_ins")))
-        patch.setattr(workers, "pool", serial_pool)
         gate = Gate(home)
         first = gate.check(update=True)
         assert first.code == 0, first.said

@@ -64,7 +64,7 @@ def test_it_finds_the_hole_and_writes_everything(
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
-    assert header == "id,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score\n"
+    assert header == "id,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     number = {key: float(value) for key, value in row.items()}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)

@@ -26,6 +26,7 @@ from harness.inspection.scene import view_of_points
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, invert, transform_points
+from harness.vocabulary.versions import RESULTS_VERSION
 
 POSES = tuple(board.T_camera_board(*turn) for turn in ((3.0, 2.0), (20.0, -3.0), (-18.0, 5.0)))
 T_FIRST_VIEW = tuple(POSES[0] @ invert(pose) for pose in POSES)
@@ -85,6 +86,7 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert sorted(path.name for path in out.iterdir()) == FILES
     told = json.loads((out / "registrations.json").read_text(), parse_constant=pytest.fail)
     assert [row["view"] for row in told["views"]] == ["view_0", "view_1", "view_2"] and told["reference"] == "view_0"
+    assert told["results_version"] == RESULTS_VERSION
     for number, row in enumerate(told["views"][1:], start=1):
         wrong_mm = 1e3 * np.sqrt((error_m(row["T_reference_view"], number) ** 2).sum(axis=1).mean())
         # corners lie farther out than the target's mean point: four times the prediction is beyond any chance
@@ -290,13 +292,15 @@ def test_a_full_disk_leaves_nothing(
 def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
     from harness.exchange.views import quaternion_of
 
-    (tmp_path / "p.json").write_text(json.dumps([invert(pose).tolist() for pose in POSES]))
+    matrices = [invert(pose).tolist() for pose in POSES]
+    (tmp_path / "p.json").write_text(json.dumps(matrices))
+    (tmp_path / "keyed.json").write_text(json.dumps({"T_reference_view": matrices}))
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for i, pose in enumerate(POSES):
         numbers = (*invert(pose)[:3, 3], *quaternion_of(invert(pose)))
         lines.append(f"{i} " + " ".join(f"{number:.9f}" for number in numbers))
     (tmp_path / "groundtruth.txt").write_text("\n".join(lines))
-    for name, within in (("p.json", 1e-12), ("groundtruth.txt", 1e-8)):
+    for name, within in (("p.json", 1e-12), ("keyed.json", 1e-12), ("groundtruth.txt", 1e-8)):
         read = read_poses(tmp_path / name, 3)
         np.testing.assert_array_equal(read[0], np.eye(4))
         np.testing.assert_allclose(read, T_FIRST_VIEW, atol=within)
@@ -319,14 +323,22 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
             "pose 1 is no rigid 4x4 transform: its last row",
         ),
         (
-            json.dumps([[[float("nan")] * 4] * 4] * 2),
+            json.dumps([[[float("inf")] * 4] * 4] * 2).replace("Infinity", "1e999"),
             "pose 0 is no rigid 4x4 transform: not all of its numbers are finite",
         ),
+        (json.dumps([[[float("nan")] * 4] * 4] * 2), "holds no list of matrices (NaN is no number of JSON)"),
+        ("[[[" + "9" * 400 + "]]]", "holds no list of matrices (int too large"),
+        ('{"a": 1, "a": 2}', "holds no list of matrices (the key a stands twice)"),
+        (json.dumps({f"k{i}": i for i in range(1000)}), "an object with the keys k0, .. k9, ...)"),
+        (json.dumps({"T_reference_view": 3}), "holds no list of matrices"),
+        (json.dumps({"T_reference_view": [np.eye(4).tolist()]}), "1 poses for 2 views"),
         (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views .. one line a view"),
         (json.dumps({"views": 1, "poses": []}), "holds no list of matrices (an object with the keys views, poses)"),
         ("[" * 100_000, "holds no list of matrices"),
         ("[", "holds no list of matrices"),
         ("0 0 0 0 0 0 0 1\n1 0 0 340 0 0 0 1", "pose 1 is 340 m from pose 0 .. metres, not millimetres"),
+        ("0 0 0 0 0 0 0 1\n1 1.7e308 -1.7e308 1 0 0 0 1", "pose 1 is inf m from pose 0"),
+        ("\n".join(["0 1.7e308 1.7e308 0 0 0 0.382683432 0.923879533"] * 2), "pose 1 is nan m from pose 0"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1", ":2: is no pose"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 2", ":2: is no pose"),
         ("0 0 0 0 0 0 0 one", ":1: is no pose"),

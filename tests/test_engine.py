@@ -16,17 +16,19 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pandas as pd
 import pytest
-from serial_pool import serial_pool
+from serial_run import records_of, run_serially
 
-from harness.engine import run, workers
-from harness.engine.journal import Journal, without_nan
+from harness.engine import run
+from harness.engine.journal import Entry, Journal, record_text
+from harness.engine.opening import EngineOptions
 from harness.engine.plan import plan_of
-from harness.engine.run import pending_counts
 from harness.engine.setup import SetUp
 from harness.engine.sight import sight_of_view
 from harness.engine.tables import tables_of
 from harness.engine.trial import run_trial
+from harness.engine.work import Ended
 from harness.experiment.load import load_experiment
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.target.declaration import TargetConfig
 from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import truth_of
@@ -84,6 +86,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sweep_leaves_all_its_files(finished):
     names = {path.name for path in results(finished).iterdir()}
     assert names == {
+        ".lock",
         "experiment.yaml",
         "journal",
         "noise.parquet",
@@ -124,11 +127,10 @@ def test_report_is_one_file_without_outside_links(finished):
 
 
 def test_one_process_gives_the_same_numbers(finished, monkeypatch):
-    monkeypatch.setattr(workers, "pool", serial_pool)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
-    outcome = run.run_plan(plan, Journal(finished.parent / "alone"), 1, lambda _: None)
-    alone = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
+    outcome = run_serially(plan, finished.parent / "alone")
+    alone = tables_of(records_of(finished.parent / "alone", outcome), experiment)
     pd.testing.assert_frame_equal(trials(finished), alone.holes, check_exact=True)
 
 
@@ -136,7 +138,7 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
     half = finished.parent / "half"
     shutil.copytree(finished, half)
     folder = results(half)
-    journal = sorted((folder / "journal").glob("*.json"))
+    journal = sorted((folder / "journal").glob("*/*.jsonl"))
     assert len(journal) == 4
     journal[0].unlink()
     journal[1].write_text(journal[1].read_text()[:100])  # half written
@@ -145,8 +147,8 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
     done = sweep(half)
     assert done.returncode == 0, done.stderr
     said = json.loads((folder / "provenance.json").read_text())
-    assert said["trials"] == {"done": 3, "resumed": 1}
-    assert said["renders"] == {"done": 0, "cached": 2}
+    assert said["trials"] == {"done": 3, "resumed": 1, "failed": 0}
+    assert said["renders"] == {"done": 0, "cached": 2, "failed": 0}
     pd.testing.assert_frame_equal(trials(finished), trials(half), check_exact=True)
 
 
@@ -160,7 +162,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
         command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     deadline = time.monotonic() + 120
-    while not list(cut.glob("tiny/*/journal/damaged-*.json")):
+    while not list(cut.glob("tiny/*/journal/*/damaged-*.jsonl")):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -172,7 +174,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     assert "interrupted; finished trials are kept" in errors
     assert "--set repeats=400" in errors
     journal = Journal(next(cut.glob("tiny/*/journal")))
-    kept = list(journal.keys())
+    kept = [key for key, _ in journal.entries()]
     assert kept
     assert all(journal.read(key) is not None for key in kept)
 
@@ -185,7 +187,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished):
     marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
     process = subprocess.Popen([*command, "--set", "repeats=400"], cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not list(cut.glob("tiny/*/journal/hole_free-*.json")):
+    while not list(cut.glob("tiny/*/journal/*/hole_free-*.jsonl")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -216,7 +218,7 @@ def test_dry_run_counts_and_runs_nothing(finished):
     done = sweep(finished, "--dry-run")
     assert done.returncode == 0
     assert "2 points, 1 set of frames" in done.stdout
-    assert "renders: 2, 2 already there" in done.stdout
+    assert "renders: 2, 2 of them cached, 0 to do" in done.stdout
     fresh = finished.parent / "fresh"
     assert sweep(fresh, "--dry-run").returncode == 0
     assert not fresh.exists()
@@ -270,16 +272,13 @@ def test_seeds_change_the_frames_but_not_the_render(finished):
     a, b = plan_of(first, cache), plan_of(second, cache)
     assert [job.path for job in a.renders] == [job.path for job in b.renders]
     assert first.digest != second.digest
-    assert dict((what, there) for what, _, there in pending_counts(b, Journal(finished / "none"))) == {
-        "renders": 2,
-        "hole-free trials that set thresholds": 0,
-    }
 
 
 def test_journal_holds_nan_as_none(tmp_path):
     journal = Journal(tmp_path)
-    journal.write("key", without_nan({"rows": [{"a": float("nan"), "b": 1.5}]}))
-    assert journal.read("key") == {"rows": [{"a": None, "b": 1.5}]}
+    journal.write("key", Entry.of(Ended("done", record_text({"rows": [{"a": float("nan"), "b": 1.5}]}))))
+    entry = journal.read("key")
+    assert entry is not None and entry.record == {"rows": [{"a": None, "b": 1.5}]}
     assert journal.read("other") is None
 
 
@@ -305,7 +304,7 @@ def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
     assert "left out: " in done.stdout
     assert "00003.png" in done.stdout
     table = pd.read_csv(next((tmp_path / "out").glob("capture/*/summary.csv")))
-    assert list(table.frames_used) == [1, 11]
+    assert list(table.frames_used) == [1, 11] and list(table.results_version) == [RESULTS_VERSION] * 2
     assert len(list((tmp_path / "out").glob("capture/*/point-*/findings.csv"))) == 2
 
 
@@ -326,16 +325,15 @@ def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
             raise ValueError("a bug of the detector")
         return run_trial(task)
 
-    monkeypatch.setattr(workers, "pool", serial_pool)
     monkeypatch.setattr(run, "run_trial", faulty)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
-    outcome = run.run_plan(plan, Journal(finished.parent / "faulty"), 1, lambda _: None)
+    outcome = run_serially(plan, finished.parent / "faulty")
     (failure,) = outcome.failures
     assert failure.what.startswith("damaged-00001-")
     assert "Traceback" in failure.why
     assert failure.why.rstrip().endswith("ValueError: a bug of the detector")
-    assert outcome.trials_done == 3
+    assert outcome.trials.done == 3
 
 
 def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, capsys):
@@ -344,12 +342,11 @@ def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, ca
     def faulty(task):
         raise ValueError("a bug of the detector")
 
-    monkeypatch.setattr(workers, "pool", serial_pool)
     monkeypatch.setattr(run, "run_trial", faulty)
     out = finished.parent / "hopeless"
     shutil.copytree(finished / ".cache", out / ".cache")
     experiment = load_experiment(finished.parent / "tiny.yaml")
-    assert study.run_study(experiment, out, 1, "python -m harness.sweep tiny.yaml") == 1
+    assert study.run_study(experiment, out, EngineOptions(serial=True), "python -m harness.sweep tiny.yaml") == 1
     told = capsys.readouterr().err
     assert told.count("Traceback (most recent call last)") == 1
     assert "ValueError: a bug of the detector" in told

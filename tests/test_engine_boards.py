@@ -8,12 +8,16 @@ from typing import cast
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from detectors.interface import Detection
+from detectors.interface import Detection, Evidence
+from detectors.thesis import ThesisConfig, ThesisDetector
 from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
 from harness.engine.judge import Judgement
-from harness.engine.setup import met_on_face
+from harness.engine.setup import INTACT_MARGIN_PX, _eroded, met_on_face
 from harness.engine.sight import Sight
+from harness.engine.sight_kernels import highest_within, pixel_areas
+from harness.evaluation.match import match
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
 from scenes.target.custom import BoardConfig, SphereConfig
@@ -138,3 +142,64 @@ def test_lines_of_sight_meet_a_sphere_where_they_should():
     met = met_on_face(np.tile([0.0, 0.0, 0.7], (2, 1)), direction, face_of(board))
     assert np.linalg.norm(met - [0, 0, -0.4], axis=-1) == pytest.approx([0.4, 0.4], abs=1e-7)
     assert np.linalg.norm(np.cross(met - [0, 0, 0.7], direction), axis=-1) == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_signals_are_the_highest_scores_within_the_radius():
+    random = np.random.default_rng(0)
+    places, score = random.uniform(-0.05, 0.05, (17, 23, 2)), random.exponential(1.0, (17, 23))
+    places[random.random((17, 23)) < 0.1] = np.nan
+    score[random.random((17, 23)) < 0.1] = np.nan
+    score[0, 0] = np.inf
+    centres = np.vstack([random.uniform(-0.05, 0.05, (6, 2)), [[9.0, 9.0]]])
+    found = highest_within(places, score, centres, 0.015)
+    with np.errstate(invalid="ignore"):
+        near = [np.linalg.norm(places - centre, axis=-1) <= 0.015 for centre in centres]
+    expected = [max(score[there & np.isfinite(score)], default=np.nan) for there in near]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_areas_are_those_of_numpys_gradients():
+    places = np.random.default_rng(1).uniform(-0.05, 0.05, (9, 12, 2))
+    places[4, 5] = np.nan
+    down, across = np.gradient(places, axis=(0, 1))
+    expected = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    np.testing.assert_allclose(pixel_areas(places), expected, rtol=1e-12)
+    assert np.isnan(pixel_areas(places)).sum() == 4  # a central difference does not look at its own pixel
+
+
+class FewerFound(ThesisDetector):
+    """Finds in a way of its own: the strongest only."""
+
+    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+        return super().find(cloud, evidence, threshold)[:1]
+
+
+@pytest.mark.parametrize("kind", [ThesisDetector, FewerFound])
+@pytest.mark.parametrize("min_points", [1, 3])
+def test_findings_at_other_thresholds_are_those_of_find(kind: type[ThesisDetector], min_points: int):
+    sight, judgement = sight_and_judgement()
+    detector = kind(ThesisConfig.from_data({"min_points": min_points}))
+    score = np.random.default_rng(2).exponential(2.0, sight.cloud.valid.shape)
+    evidence = Evidence(score, score, score, 1.0)
+    judgement = replace(judgement, detector=detector, evidence=evidence)
+    (operating,) = study_rows(sight, judgement, 0.01, hole_free=False).of_study["operating"]
+    found = [detector.find(sight.cloud, evidence, one) for one in operating["threshold"]]
+    centres = [sight.on_board(np.array([one.centre_m for one in each]).reshape(-1, 3)) for each in found]
+    truth = np.array([damage.centre_board_m[:2] for damage in sight.truth])
+    assert operating["findings"] == [len(each) for each in found]
+    assert operating["hits"] == [len(match(truth, each, 0.01)) for each in centres]
+    assert max(operating["findings"]) == 1 if kind is FewerFound else max(operating["findings"]) > 1
+
+
+def test_the_margin_is_taken_off_as_by_plain_erosion():
+    mask = np.ones((60, 70), bool)
+    mask[30, 40] = mask[5, 60] = False
+    square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, bool)
+    np.testing.assert_array_equal(_eroded(mask), ndimage.binary_erosion(mask, square, border_value=0))
+
+
+def test_lines_of_sight_meet_a_flat_face_where_they_should():
+    board = BoardConfig(width_mm=200, height_mm=200, thickness_mm=5)
+    points, direction = np.array([[0.0, 0.0, 0.7], [0.1, 0.0, 0.6]]), np.array([[0.1, -0.05, -1.0], [-0.15, 0.1, -0.9]])
+    met = met_on_face(points, direction, face_of(board))
+    np.testing.assert_allclose(met, points - (points[:, 2] / direction[:, 2])[:, None] * direction, atol=1e-15)

@@ -208,4 +208,4 @@ def test_one_process_or_two_give_the_same_numbers(finished, tmp_path):
             for folder in (finished, again)
         ]
         pd.testing.assert_frame_equal(*tables)
-    assert json.loads((again / "provenance.json").read_text())["renders"] == {"done": 0, "cached": 6}
+    assert json.loads((again / "provenance.json").read_text())["renders"] == {"done": 0, "cached": 6, "failed": 0}

@@ -14,12 +14,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
-from serial_pool import serial_pool
+from serial_run import records_of, run_serially
 
-from harness.engine import run, workers
-from harness.engine.journal import Journal
+from harness.engine import run
+from harness.engine.calibration import threshold_of
 from harness.engine.plan import plan_of
-from harness.engine.run import run_plan, threshold_of
 from harness.engine.study_record import record_of
 from harness.engine.tables import Tables, tables_of
 from harness.engine.trial import TrialTask, board_labels, run_trial
@@ -149,14 +148,13 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
             task = replace(task, points=tuple(point for point in task.points if point.frames == 2))
         return run_trial(task)
 
-    monkeypatch.setattr(workers, "pool", serial_pool)
     monkeypatch.setattr(run, "run_trial", faulty)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
-    outcome = run_plan(plan, Journal(tmp_path), 1, lambda _: None)
+    outcome = run_serially(plan, tmp_path)
     (failure,) = outcome.failures
     assert failure.what == "threshold of capture.frames=1"
-    tables = tables_of(outcome.records.values(), experiment)
+    tables = tables_of(records_of(tmp_path, outcome), experiment)
     assert set(tables.holes["frames"]) == {2}
     assert len(tables.holes) == 4 * 5
 
@@ -209,12 +207,11 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
 
 def judged(home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str) -> tuple[StudyRecord, Tables]:
     """A study run serially in this process, on the renders that are there, its journal in ``folder``."""
-    monkeypatch.setattr(workers, "pool", serial_pool)
     experiment = load_experiment(home / "tiny.yaml", changes)
     plan = plan_of(experiment, home / "out" / ".cache" / "renders")
-    outcome = run_plan(plan, Journal(folder), 1, lambda _: None)
+    outcome = run_serially(plan, folder)
     assert outcome.failures == []
-    tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
+    tables = tables_of(records_of(folder, outcome), experiment)
     provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
     return record_of(experiment, plan, tables, {}, provenance), tables
 
@@ -229,7 +226,7 @@ def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, m
     assert set_ups_of(serial) == parallel
     journal = tmp_path / "half"
     shutil.copytree(results(finished) / "journal", journal)
-    kept = sorted(journal.glob("*.json"))
+    kept = sorted(journal.glob("*/*.jsonl"))
     assert len(kept) == 12
     for path in kept[::3]:
         path.unlink()

@@ -178,7 +178,7 @@ def test_bad_files(tmp_path: Path, content: bytes, expected: str) -> None:
 def test_a_file_that_is_too_large_is_not_parsed(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_bytes(b"a: 1\n" * (MAX_BYTES // 5 + 1))
-    assert "the file is too large for a declaration\n  legal: at most 1000000 bytes" in refused_file(path)
+    assert "the file is too large for a declaration\n  legal: at most 500000 bytes" in refused_file(path)
 
 
 def test_an_experiment_error_survives_pickling() -> None:

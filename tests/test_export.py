@@ -20,10 +20,12 @@ from detectors.recordings import open_capture
 from harness import detect, export
 from harness.exchange import tum
 from harness.exchange.views import START_NS, in_turn, quaternion_of
+from harness.inspection.poses import read_poses
 from harness.vocabulary.capture import Cloud, FrameSource
 from harness.vocabulary.files import atomic_folder
 from harness.vocabulary.geometry import Region, invert, rotation_xyz_deg, transform_points
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view
 from scenes.perspectives import ArcViews, guessed_T_reference_view, poses_of
 from scenes.sensor.camera import CameraConfig, camera_of
@@ -188,9 +190,12 @@ def test_the_truth_and_the_nominal_poses_stand_beside(exports: dict[str, Path], 
     poses = poses_of(views, target.pose)
     for number, told in enumerate(truth["views"]):
         np.testing.assert_array_equal(told["T_board_camera"], invert(T_camera_board_of(poses[number])))
-    nominal = json.loads((out / "nominal_poses.json").read_text())
+    nominal = json.loads((out / "nominal_poses.json").read_text())["T_reference_view"]
     np.testing.assert_allclose(nominal[0], np.eye(4), atol=1e-15)
     np.testing.assert_array_equal(nominal[1], guessed_T_reference_view(views, poses, 1, "damaged", 0))
+    np.testing.assert_allclose(read_poses(out / "nominal_poses.json", 2), nominal, atol=1e-12)
+    for name in ("truth.json", "nominal_poses.json", "provenance.json"):
+        assert json.loads((out / name).read_text())["results_version"] == RESULTS_VERSION
     facts = json.loads((out / "provenance.json").read_text())
     assert facts["seed"] == 3 and facts["rounding_step_mm"] == 1.0 and "--format ros2" in facts["command"]
     # the declaration beside it exports the same again

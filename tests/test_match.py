@@ -45,3 +45,24 @@ def test_matching_is_one_to_one_within_the_radius_and_maximal(a, b, radius):
     for t in set(range(len(truth))) - set(pairs):
         for f in set(range(len(found))) - set(pairs.values()):
             assert not np.linalg.norm(truth[t] - found[f]) <= radius
+
+
+def by_falling_through_all_pairs(truth: np.ndarray, found: np.ndarray, radius: float) -> dict[int, int]:
+    """The same, written plainly: every pair in the order of its distance."""
+    distance = np.linalg.norm(truth[:, None] - found[None], axis=-1)
+    pairs: dict[int, int] = {}
+    for flat in np.argsort(distance, axis=None, kind="stable"):
+        t, f = divmod(int(flat), len(found))
+        if distance[t, f] <= radius and t not in pairs and f not in pairs.values():
+            pairs[t] = f
+    return pairs
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 20))
+def test_pairs_are_those_of_all_pairs_in_order_ties_included(seed: int, n: int, m: int):
+    random = np.random.default_rng(seed)
+    truth, found = random.integers(0, 8, (n, 2)).astype(float), random.integers(0, 8, (m, 2)).astype(float)
+    pairs = match(truth, found, 3.0)
+    assert pairs == by_falling_through_all_pairs(truth, found, 3.0)
+    assert list(pairs) == list(by_falling_through_all_pairs(truth, found, 3.0))

@@ -16,6 +16,7 @@ from harness.evaluation.pod.state_hits import state_hits
 from harness.evaluation.pod.state_signals import state_signals
 from harness.evaluation.pod.statement import drawn_sizes
 from harness.pod import FILES, main
+from harness.vocabulary.versions import RESULTS_VERSION
 
 SIZES = np.linspace(0.5, 12.0, 60)
 
@@ -44,6 +45,7 @@ def test_the_handbooks_hits_and_misses(shared_data: Path, tmp_path: Path, capsys
     asked = ["--hit", "hit.miss", "--size", "length.inch", "--unit", "inch", "--link", "logit", "--no-log"]
     assert main([file, *asked, "--out", str(tmp_path)]) == 0
     said, printed = stated(tmp_path), capsys.readouterr().out
+    assert said["results_version"] == RESULTS_VERSION
     assert (said["a50"], said["a90"]) == pytest.approx((0.1156, 0.1709), abs=5e-5)
     assert said["a90_95"]["size"] == pytest.approx(0.1974, abs=5e-5)
     assert said["a90_95"]["method"] == "likelihood ratio"

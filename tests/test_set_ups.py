@@ -148,7 +148,7 @@ def test_comparison_experiments_are_valid(name, points, groups, capsys, tmp_path
 
     path = ROOT / "experiments" / f"{name}.yaml"
     assert main([str(path), "--dry-run", "--out", str(tmp_path / "out")]) == 0
-    assert f"{name}: valid; {points} points, {groups} sets of frames" in capsys.readouterr().out
+    assert f"{name}: valid\n  {points} points, {groups} sets of frames" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
     experiment = load_experiment(path)
     assert all(point.config.repeats >= 10 for point in experiment.points)  # fewer could not make "found" of all

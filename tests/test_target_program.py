@@ -14,6 +14,7 @@ import trimesh
 
 from harness.target import main
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.target.declaration import ThesisTargetConfig, target_from_data
 from scenes.target.export import _srgb_bytes, write_mesh, write_truth
 from scenes.target.mesh import Target, build_target
@@ -32,6 +33,7 @@ def test_thesis_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "tape_4" in printed
     assert f"wrote {mesh}" in printed
     data = json.loads(truth.read_text())
+    assert data["results_version"] == RESULTS_VERSION
     assert [row["id"] for row in data["damages"]] == list(range(1, 12))
     assert target_from_data(data["target"]) == ThesisTargetConfig().declare()
     assert sorted(path.name for path in mesh.parent.iterdir()) == ["board.glb", "truth.json"]

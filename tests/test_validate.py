@@ -25,10 +25,12 @@ from harness.scorecard.run import Request, measured, requests_of
 from harness.scorecard.tables import number, plain_table
 from harness.validate import main
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION
 from scenes.sensor.camera import camera_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
+BASELINE = '{"scorecard_version": 1, "figures": {%s}}'
 GOOD = """
 figures:
   - name: wall
@@ -181,12 +183,29 @@ def test_a_baseline_comes_back_and_an_update_for_one_camera_keeps_the_rest(tmp_p
     assert read_baseline(path) == {"wall": True}
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"figures": []}', '{"figures": {"a": {"passes": 1}}}', '{"figures": 3}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "3",
+        "[" * 100_000,
+        '{"figures": {}}',
+        '{"scorecard_version": 1}',
+        '{"scorecard_version": 1, "figures": []}',
+        '{"scorecard_version": 1, "figures": {"a": {"passes": 1}}}',
+        '{"scorecard_version": 1, "figures": 3}',
+        '{"scorecard_version": 1, "figures": {"a": {"passes": true}, "a": {"passes": false}}}',
+    ],
+)
 def test_what_is_no_baseline_is_refused(tmp_path, text):
     path = tmp_path / "baseline.json"
     path.write_text(text)
     with pytest.raises(UserError, match="is no baseline"):
         read_baseline(path)
+    with pytest.raises(UserError, match="is no baseline"):
+        write_baseline(path, (), ())
+    assert path.read_text() == text
 
 
 def test_the_committed_baseline_knows_exactly_the_figures_on_file():
@@ -277,16 +296,20 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     told = capsys.readouterr()
     assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "A quick look" in told.out and not told.err
     page = (out / "scorecard.html").read_text()
+    assert f'<meta name="generator" content="{GENERATOR}">' in page
     assert page.count("<svg") == 6 and "http" not in page.replace("http://www.w3.org", "")
     scores = list(csv.DictReader((out / "scorecard.csv").open()))
     assert [row["name"] for row in scores] == ["wall", "neighbours"]
     assert float(scores[0]["low"]) < float(scores[0]["simulated"]) < float(scores[0]["high"])
     curves = list(csv.DictReader((out / "curves.csv").open()))
     assert len(curves) == len(list(curve_points(QUICK_GRIDS)))
-    assert json.loads((out / "provenance.json").read_text())["command"].startswith("python -m harness.validate --quick")
+    assert {row["results_version"] for row in scores + curves} == {str(RESULTS_VERSION)}
+    provenance = json.loads((out / "provenance.json").read_text())
+    assert provenance["command"].startswith("python -m harness.validate --quick")
+    assert provenance["results_version"] == RESULTS_VERSION
 
     first = (out / "curves.csv").read_bytes()
-    baseline.write_text('{"figures": {"wall": {"passes": true}, "neighbours": {"passes": true}}}')
+    baseline.write_text(BASELINE % '"wall": {"passes": true}, "neighbours": {"passes": true}')
     options += ["--baseline", str(baseline)]
     figures.write_text(GOOD.replace("{value: 0.89, tolerance: 0.06}", "{value: 2.0, tolerance: 0.06}"))
     assert main(options) == 1
@@ -294,7 +317,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     assert "passed in the baseline and fails now: wall" in told.err and "neighbours (" not in told.err
     assert (out / "curves.csv").read_bytes() == first
 
-    baseline.write_text('{"figures": {"gone": {"passes": true}, "missed": {"passes": false}}}')
+    baseline.write_text(BASELINE % '"gone": {"passes": true}, "missed": {"passes": false}')
     assert main(options) == 1
     told = capsys.readouterr()
     assert "passed in the baseline and is no longer among the figures: gone" in told.err and "missed" not in told.err

@@ -13,6 +13,7 @@ import pytest
 from harness.scorecard.bench import NOISE
 from harness.validate import main
 from harness.vocabulary.geometry import Region
+from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
@@ -53,9 +54,12 @@ def step(tmp_path_factory) -> list[dict[str, str]]:
     options = ["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--out", str(folder / "out")]
     assert main(options) == 0
     page = (folder / "out" / "capture.html").read_text()
-    assert "<svg" in page and "edge of plane" in page
-    assert json.loads((folder / "out" / "provenance.json").read_text())["camera"] == "azure_kinect_nfov"
-    return rows_of(folder / "out")
+    assert "<svg" in page and "edge of plane" in page and f'<meta name="generator" content="{GENERATOR}">' in page
+    provenance = json.loads((folder / "out" / "provenance.json").read_text())
+    assert (provenance["camera"], provenance["results_version"]) == ("azure_kinect_nfov", RESULTS_VERSION)
+    rows = rows_of(folder / "out")
+    assert {row["results_version"] for row in rows} == {str(RESULTS_VERSION)}
+    return rows
 
 
 def test_noise_of_a_simulated_recording_is_found_again(step):
@@ -118,7 +122,7 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     told = refused(["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"], capsys)
     assert "the capture has 200 x 160 pixels, but azure_kinect_nfov has 640 x 576" in told
     told = refused(["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--mask", str(lens)], capsys)
-    assert "no image that can be read" in told
+    assert "no image that can be read" in told and "neither as PNG nor as JPEG" in told
 
 
 def test_nothing_flat_is_refused(tmp_path, capsys):

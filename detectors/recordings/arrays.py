@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +18,12 @@ from detectors.recordings.distances import (
 )
 from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
 from detectors.recordings.recording import Recording
+from harness.vocabulary.archives import read_npy, read_npz
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.limits import refuse_pixels
 
 DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
@@ -101,21 +102,12 @@ def open_stack(
 
 def load_npy(path: Path, lens: Lens | None) -> Stack:
     """An ``.npy`` file, mapped. Raises UserError where it is broken, or holds objects (they would need pickle)."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise _broken(path, error) from error
-    return stack_of(str(path), array, None, None, lens)
+    return stack_of(str(path), read_npy(path), None, None, lens)
 
 
 def load_npz(path: Path, lens: Lens | None) -> Stack:
     """An ``.npz`` file: its only array, or the one named depth, z, xyz or points; colour and amplitude."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise _broken(path, error) from error
-    return named_stack(str(path), arrays, lens)
+    return named_stack(str(path), read_npz(path), lens)
 
 
 def named_stack(name: str, arrays: dict[str, np.ndarray], lens: Lens | None) -> Stack:
@@ -144,12 +136,13 @@ def stack_of(
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     points, shape, organised = _axes(name, array.shape, lens)
+    refuse_pixels(name, shape[2], shape[1])
     full = (*shape, 3) if points else shape
     return Stack(
         distances=array.reshape(full),
         rgb=_colours(rgb, (*shape, 3)),
         amplitude=amplitude.reshape(shape).astype(np.float32)
-        if amplitude is not None and amplitude.size == np.prod(shape)
+        if amplitude is not None and amplitude.dtype.kind in "biuf" and amplitude.size == np.prod(shape)
         else None,
         organised=organised,
     )
@@ -157,13 +150,13 @@ def stack_of(
 
 def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, tuple[int, int, int], bool]:
     """(holds points, (n, h, w), has a pixel grid) of an array's shape."""
-    if shape[-1] == 3 and len(shape) == 2:
+    if len(shape) == 2 and shape[-1] == 3:
         return True, *_grid_of(1, shape[0], lens)
-    if shape[-1] == 3 and len(shape) == 3:
+    if len(shape) == 3 and shape[-1] == 3:
         if shape[1] >= FRAMES_OF_POINTS * shape[0]:
             return True, *_grid_of(shape[0], shape[1], lens)
         return True, (1, shape[0], shape[1]), True
-    if shape[-1] == 3 and len(shape) == 4:
+    if len(shape) == 4 and shape[-1] == 3:
         return True, (shape[0], shape[1], shape[2]), True
     if len(shape) == 2 and min(shape) > 1:
         return False, (1, shape[0], shape[1]), True
@@ -181,17 +174,9 @@ def _grid_of(frames: int, points: int, lens: Lens | None) -> tuple[tuple[int, in
 
 def _colours(rgb: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
     """Colours as uint8 on the stack's axes; None where their count does not fit it."""
-    if rgb is None or rgb.size != np.prod(shape):
+    if rgb is None or rgb.dtype.kind not in "biuf" or rgb.size != np.prod(shape):
         return None
     if rgb.dtype.kind == "f":
         rgb = rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb
         rgb = np.nan_to_num(np.clip(np.rint(rgb), 0, 255))
     return rgb.astype(np.uint8).reshape(shape)
-
-
-def _broken(path: Path, error: Exception) -> UserError:
-    return UserError(
-        f"{path}: cannot be read as arrays ({error})",
-        legal="numeric arrays as numpy.save or numpy.savez write them, no objects",
-        fix="save it again, or copy it again if it was cut off",
-    )

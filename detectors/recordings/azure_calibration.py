@@ -7,14 +7,15 @@ scales them to its binned sensor, subtracts its crop's offset, and 0.5 px leads 
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.limits import TEXT_BYTES, refuse_bytes
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ class ColourCamera:
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
     """The calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
+    refuse_bytes(name, len(content), TEXT_BYTES)
     try:
-        data = json.loads(content.rstrip(b"\0").decode())
+        data = strict_json(content.rstrip(b"\0"))
         cameras = data["CalibrationInformation"]["Cameras"]
         return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -96,15 +98,21 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
-    T_colour_depth[:3, :3] = np.reshape(camera["Rt"]["Rotation"], (3, 3))
-    T_colour_depth[:3, 3] = camera["Rt"]["Translation"]
+    try:
+        T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
+        T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{name}: the colour camera's place cannot be read ({error!r})") from error
     return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
 
 
 def _camera(name: str, cameras: dict[str, Any], purpose: str) -> dict[str, Any]:
     if purpose not in cameras:
         raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
-    return cameras[purpose]
+    camera: dict[str, Any] = cameras[purpose]
+    if not all(isinstance(camera.get(key), int) for key in ("SensorWidth", "SensorHeight")):
+        raise UserError(f"{name}: the calibration states no size of the sensor for {purpose}")
+    return camera
 
 
 def _parameters(name: str, camera: dict[str, Any]) -> list[float]:

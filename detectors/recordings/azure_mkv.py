@@ -24,6 +24,7 @@ from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import transform_points
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.limits import FRAME_PIXELS, refuse_pixels
 
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
@@ -125,8 +126,11 @@ class _Header:
 def _opened(path: Path) -> Any:
     import av
 
+    # Without these the decoder guesses the form by content: a playlist or a script called .mkv would open other files,
+    # and addresses.
+    only = {"protocol_whitelist": "file", "format_whitelist": "matroska,webm"}
     try:
-        return av.open(str(path))
+        return av.open(f"file:{path}", format="matroska", options=only)
     except (OSError, ValueError) as error:  # PyAV's errors derive from these
         raise UserError(
             f"{path}: cannot be opened as a recording ({error})", legal=LEGAL_MKV, fix="copy or record it again"
@@ -142,6 +146,8 @@ def _header(path: Path) -> _Header:
             raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
         depth, colour = tracks["DEPTH"], tracks.get("COLOR")
         attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
+        for track in filter(None, (depth, colour)):
+            refuse_pixels(f"{path}: its track", track.codec_context.width, track.codec_context.height)
         return _Header(
             depth_size=(depth.codec_context.width, depth.codec_context.height),
             depth_mode=depth.metadata.get("K4A_DEPTH_MODE", "(not stated)"),
@@ -182,8 +188,11 @@ def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float
         tracks = {title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"}
         title_of = {s.index: title for title, s in tracks.items()}
         period_s = 1.0 / float(tracks["DEPTH"].average_rate or 30)
-        delay_s = int(container.metadata.get("K4A_DEPTH_DELAY_NS", 0)) * 1e-9
+        for track in tracks.values():
+            # A picture may state another size than its track.
+            track.codec_context.options = {"max_pixels": str(FRAME_PIXELS)}
         try:
+            delay_s = int(container.metadata.get("K4A_DEPTH_DELAY_NS", 0)) * 1e-9
             for packet in container.demux(*tracks.values()):
                 title = title_of[packet.stream.index]
                 for picture in packet.decode():

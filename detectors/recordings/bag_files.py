@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 
 if TYPE_CHECKING:
@@ -24,6 +27,8 @@ MAX_MESSAGE_BYTES = 2**28
 MAX_CHUNK_BYTES = 2**30
 """Of an MCAP chunk, unpacked: recorders close a chunk at some MiB, or after the message that passes it."""
 PIECE_BYTES = 2**20
+COMPUTED = re.compile(r"\bvirtual\b|\bgenerated\b|\bas\s*\(|\bas\s+(select|with)\b", re.IGNORECASE)
+"""Of an SQLite table's declaration: words that only a virtual table or a computed column has."""
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MCAP_CHUNK = 6
 
@@ -43,7 +48,7 @@ def is_bag_folder(folder: Path) -> bool:
     if any(_holds_messages(path) for path in folder.iterdir()):
         return True
     metadata = folder / METADATA
-    return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()
+    return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.open("rb").read(MAX_BYTES)
 
 
 def find_bag(path: Path) -> Bag:
@@ -120,12 +125,11 @@ def _holds_messages(path: Path) -> bool:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """What metadata.yaml says of the bag. Raises UserError where it is no such file."""
-    from ruamel.yaml import YAML, YAMLError
-
     try:
-        told = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-        _ = list(told["relative_file_paths"])
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, OSError) as error:
+        told = read_yaml(path).data["rosbag2_bagfile_information"]
+        if not all(isinstance(name, str) for name in told["relative_file_paths"]):
+            raise TypeError("relative_file_paths")
+    except (DeclarationError, KeyError, TypeError) as error:
         raise UserError(
             f"{path}: is no description of a ROS 2 bag, or is cut off ({type(error).__name__})",
             legal=LEGAL_BAG,
@@ -142,6 +146,8 @@ def _opened(file: Path) -> Iterator[Reader]:
     if file.suffix.lower() == ".mcap":
         stat = file.stat()
         _refuse_bad_chunks(file, stat.st_size, stat.st_mtime_ns)
+    else:
+        _refuse_programs(file)
     with _readable(file):
         reader = Reader(file)
         reader.open()
@@ -216,6 +222,23 @@ def _pieces(name: str, form: str, content: bytes) -> Iterator[bytes]:
             content = b""
             yield piece
         content = unpacker.unused_data or b""
+
+
+def _refuse_programs(file: Path) -> None:
+    """A database may hold programs: a view or a computed column called ``messages`` that never ends or fills the
+    memory when it is read. Recorders write tables of plain columns."""
+    import apsw
+
+    with _readable(file):
+        database = apsw.Connection(str(file), flags=apsw.SQLITE_OPEN_READONLY)
+        try:
+            found = database.execute("select type, name, coalesce(sql, '') from sqlite_master limit 1000").fetchall()
+        finally:
+            database.close()
+    for kind, name, sql in found:
+        plain = kind == "index" or (kind == "table" and not COMPUTED.search(str(sql)))
+        if not plain:
+            raise UserError(f"{file}: holds a program ({kind} {str(name)[:40]!r}), not only tables", legal=LEGAL_BAG)
 
 
 @lru_cache(maxsize=1000)

@@ -19,17 +19,18 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, frame_from_depth, rounding_step_m
 from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
+from detectors.recordings.pictures import PNG_SIGNATURE, decoded, read_picture
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.limits import PICTURE_BYTES, bounded_bytes, refuse_pixels
 
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg")
 TUM_MATCH_S = 0.02
 """Largest difference of time stamps of depth and colour that still belong together (the benchmark's own default)."""
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
 
 
@@ -127,7 +128,7 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """(width, height, bits, colour type) from the header of a PNG. Raises UserError where it is none."""
+    """(width, height, bits, colour type) from the header of a PNG. Raises UserError where it is none, or too large."""
     try:
         with path.open("rb") as file:
             head = file.read(26)
@@ -135,18 +136,17 @@ def png_kind(path: Path) -> tuple[int, int, int, int]:
         raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_PNG) from error
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
         raise UserError(f"{path}: is no PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")
-    return struct.unpack(">IIBB", head[16:26])
+    width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
+    refuse_pixels(str(path), width, height)
+    return width, height, bits, kind
 
 
 def read_depth_png(path: Path) -> np.ndarray:
     """The stored numbers (h, w) uint16. Raises UserError where the file is broken or not 16-bit grey."""
     _refuse_wrong_bits(path)
-    content = path.read_bytes()
+    content = bounded_bytes(path, PICTURE_BYTES)
     _refuse_broken(path, content)
-    stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None:
-        raise UserError(f"{path}: cannot be decoded", legal=LEGAL_PNG, fix="copy or export it again")
-    return stored
+    return decoded(str(path), content, cv2.IMREAD_UNCHANGED)
 
 
 def _refuse_wrong_bits(path: Path) -> None:
@@ -227,10 +227,7 @@ def _aligned(
 
 
 def _colour(path: Path) -> np.ndarray:
-    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise UserError(f"{path}: cannot be decoded", legal="PNG or JPEG", fix="mend or remove this colour picture")
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(read_picture(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def _is_number(stem: str) -> bool:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from detectors.recordings.azure_calibration import depth_lens, depth_mode_of_size, parse_calibration
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import MAX_BYTES, parse_yaml
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.lens import Lens
+from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes, refuse_bytes
 
 LEGAL_LENS = (
     "JSON or YAML with fx, fy, cx, cy in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
@@ -28,6 +31,9 @@ FOUND_BESIDE = (
 """Stems of the files that are taken for the lens of the frames beside or below them."""
 
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+SHOWN_KEYS = 20
+LARGEST = 1e12
+"""Of any number of a lens, in any unit."""
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
 
 
@@ -56,7 +62,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         mode = depth_mode_of_size(width, height)
         if mode is None:
             raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
-        return depth_lens(str(path), parse_calibration(str(path), path.read_bytes()), mode)
+        return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
     data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
     stated = _stated_size(data)
     if stated not in (None, (width, height)):
@@ -72,7 +78,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 def _parsed(path: Path) -> dict[str, Any]:
     """The file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS) from error
     except (OSError, UnicodeDecodeError) as error:
@@ -84,46 +90,31 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 
 def _parse_json(path: Path, text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        for key, _ in pairs:
-            if sum(key == other for other, _ in pairs) > 1:
-                raise UserError(f"{path}: the key {key} stands twice", fix="keep one of them")
-        return dict(pairs)
-
     try:
-        return json.loads(text, object_pairs_hook=unique)
+        return strict_json(text, nan=True)  # `_number` says which
     except json.JSONDecodeError as error:
         raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
+    except ValueError as error:
+        raise UserError(f"{path}: {error}", legal=LEGAL_LENS) from error
 
 
 def _parse_yaml(path: Path, text: str) -> Any:
-    from ruamel.yaml import YAML, YAMLError
-    from ruamel.yaml.constructor import SafeConstructor
-    from ruamel.yaml.nodes import MappingNode
-
-    class Constructor(SafeConstructor):
-        """Knows OpenCV's matrices as plain mappings."""
-
-    def opencv_matrix(constructor: SafeConstructor, node: MappingNode) -> dict[str, Any]:
-        return {str(k.value): constructor.construct_object(v, deep=True) for k, v in node.value}
-
-    Constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", opencv_matrix)
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Constructor = Constructor
-    # OpenCV's first line, "%YAML:1.0", is no directive of YAML.
+    refuse_bytes(str(path), len(text), MAX_BYTES)
+    # OpenCV's first line, "%YAML:1.0", is no directive of YAML, and its matrices are plain mappings under a tag.
     body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     try:
-        return yaml.load(body)
-    except YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or str(error)
-        raise UserError(f"{path}{where}: {problem}", legal=LEGAL_LENS) from error
+        return parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
+    except DeclarationError as error:
+        first = error.problems[0]
+        where = first.place.head if first.place else str(path)
+        raise UserError(f"{where}: {first.message}", legal=LEGAL_LENS) from error
 
 
 def _stated_size(data: dict[str, Any]) -> tuple[int, int] | None:
     for across, down in (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px")):
         if across in data and down in data:
+            if not all(isinstance(data[key], int) for key in (across, down)):
+                raise UserError("the lens' width and height are no whole numbers", legal=LEGAL_LENS)
             return data[across], data[down]
     return None
 
@@ -139,7 +130,8 @@ def _centre_and_focal(path: Path, data: dict[str, Any]) -> tuple[float, float, f
         if key in data:
             m = _numbers(path, key, data[key], 9)
             return m[0], m[4], m[2], m[5]
-    raise UserError(f"{path}: holds no lens (its keys: {', '.join(map(str, data)) or 'none'})", legal=LEGAL_LENS)
+    keys = ", ".join(str(key)[:40] for key in list(data)[:SHOWN_KEYS]) + (", .." if len(data) > SHOWN_KEYS else "")
+    raise UserError(f"{path}: holds no lens (its keys: {keys or 'none'})", legal=LEGAL_LENS)
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
@@ -175,8 +167,10 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: {key} is {value!r}", legal="a finite number")
+    # Python's integers have no largest one, and lists may be endless to print.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
+        shown = repr(value)[:40] if isinstance(value, str | bool | float | None) else type(value).__name__
+        raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")
     return float(value)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from detectors.recordings.arrays import Stack, named_stack
+from detectors.recordings.matlab_elements import LEGAL_MAT, Variable, broken, variables_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 
@@ -15,7 +16,6 @@ EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location',
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-LEGAL_MAT = "MATLAB 5 to 7 files (-v6, -v7) of numeric arrays: Location (h, w, 3), (n, 3) or (k, n, 3), and Color"
 
 
 def load_mat(path: Path, lens: Lens | None) -> Stack:
@@ -24,10 +24,12 @@ def load_mat(path: Path, lens: Lens | None) -> Stack:
     Raises UserError for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file.
     """
     _refuse_hdf5(path)
-    variables = _loaded(path)
-    _refuse_objects(path, variables)
-    arrays = {name: _frames_first(value) for name, value in variables.items() if _is_numeric(value)}
+    stat = path.stat()
+    variables = variables_of(path, stat.st_size, stat.st_mtime_ns)
+    loaded = _loaded(path, [one.name for one in variables if one.is_numeric])
+    arrays = {name: _frames_first(value) for name, value in loaded.items() if _is_numeric(value)}
     if not arrays:
+        _refuse_objects(path, variables)
         raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=f"in MATLAB: {EXPORT}")
     return named_stack(str(path), arrays, lens)
 
@@ -43,32 +45,26 @@ def _refuse_hdf5(path: Path) -> None:
         )
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _loaded(path: Path, names: list[str]) -> dict[str, Any]:
+    """The named variables; others (cells and structs, which nest) are left unread."""
     import scipy.io
 
+    if not names:
+        return {}
     try:
-        return scipy.io.loadmat(str(path), squeeze_me=False)
-    except MemoryError:
-        raise
+        return scipy.io.loadmat(str(path), squeeze_me=False, variable_names=names)
+    except MemoryError as error:
+        raise broken(path, "there is not memory enough for what it states") from error
     except Exception as error:  # a cut or foreign file fails anywhere in scipy's parser, with any type
-        raise UserError(
-            f"{path}: cannot be read as a MATLAB file ({type(error).__name__}: {error})",
-            legal=LEGAL_MAT,
-            fix="save it again with '-v7', or copy it again if it was cut off",
-        ) from error
+        raise broken(path, f"{type(error).__name__}: {error}") from error
 
 
-def _refuse_objects(path: Path, variables: dict[str, Any]) -> None:
-    from scipy.io.matlab import MatlabOpaque
-
-    named = {name: value for name, value in variables.items() if not name.startswith("__")}
-    if any(_is_numeric(value) for value in named.values()):
-        return
-    opaque = next((value for value in named.values() if isinstance(value, MatlabOpaque)), None)
+def _refuse_objects(path: Path, variables: tuple[Variable, ...]) -> None:
+    opaque = next((one for one in variables if one.object_of), None)
     if opaque is not None:
-        name, _, kind = (bytes(opaque[0][field]).decode() for field in ("s0", "s1", "s2"))
         raise UserError(
-            f"{path}: the variable {name} is a MATLAB object ({kind}), which cannot be read outside MATLAB",
+            f"{path}: the variable {opaque.name} is a MATLAB object ({opaque.object_of}), which cannot be read outside"
+            " MATLAB",
             legal=LEGAL_MAT,
             fix=f"in MATLAB, with the cloud named pc: {EXPORT}",
         )

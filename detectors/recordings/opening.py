@@ -50,6 +50,9 @@ def open_capture(
     missing = next((path for path in paths if not path.exists()), None)
     if missing is not None:
         raise UserError(f"{missing}: no such file or folder", legal=LEGAL_FORMATS)
+    odd = next((path for path in paths if not path.is_file() and not path.is_dir()), None)
+    if odd is not None:
+        raise UserError(f"{odd}: is neither a file nor a folder, but a device or a pipe", legal=LEGAL_FORMATS)
     scale_m = metres_per_unit(unit) if unit else None
     if len(paths) == 1 and _is_bag(paths[0]):
         recording = open_bag(paths[0], scale_m, intrinsics, lens, topic)

@@ -8,6 +8,7 @@ header's promise is compared with the file first.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +21,21 @@ from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
+from harness.vocabulary.limits import refuse_pixels
 
 LEGAL_CLOUD = "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
 PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8} | {
     "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8,
 }  # fmt: skip
 HEADER_BYTES = 65536
+COUNT = re.compile(r"\d{1,15}", re.ASCII)
+"""What a header may state as a count: more digits are no file's, and Python refuses to read thousands of them."""
+PCD_SIZES = (1, 2, 4, 8)
+"""Bytes that a number of a PCD may have."""
+PCD_NUMBERS = 10_000
+"""Numbers in one point: descriptors of some hundred stand in published clouds."""
+LZF_STRONGEST = 100
+"""Times that LZF can shorten anything: three bytes stand for at most 264."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,7 @@ def cloud_header(path: Path) -> CloudHeader:
     header = _ply_header(path, content) if path.suffix.lower() == ".ply" else _pcd_header(path, content)
     if header.points < 1:
         raise UserError(f"{path}: holds no points", legal=LEGAL_CLOUD)
+    refuse_pixels(f"{path}: its cloud", header.width, header.height)
     found = path.stat().st_size - header.header_bytes
     if found < header.data_bytes:
         raise UserError(
@@ -125,14 +136,19 @@ def _ply_header(path: Path, content: bytes) -> CloudHeader:
         raise UserError(f"{path}: is no PLY, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
     points, bytes_each, fields = 0, 0, 0
-    element = ""
+    element, names = "", set[str]()
     for words in (line.split() for line in lines if line.strip()):
         if words[0] == "element" and len(words) == 3:
+            if words[1] == "vertex" and points:
+                raise UserError(f"{path}: its header states its points twice", legal=LEGAL_CLOUD)
             element = words[1]
-            points = int(words[2]) if element == "vertex" and words[2].isdigit() else points
-        elif words[0] == "property" and element == "vertex":
+            points = int(words[2]) if element == "vertex" and COUNT.fullmatch(words[2]) else points
+        elif words[0] == "property" and element == "vertex" and len(words) > 1:
+            names.add(words[-1])
             fields += 1
             bytes_each += PLY_BYTES.get(words[1], 0)
+    if points and not {"x", "y", "z"} <= names:
+        raise UserError(f"{path}: its points lack x, y or z", legal=LEGAL_CLOUD)
     ascii_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     # Each number of an ASCII line takes at least a digit and a separator.
     least = points * (2 * fields if ascii_text else bytes_each)
@@ -143,7 +159,9 @@ def _ply_header(path: Path, content: bytes) -> CloudHeader:
 
 
 def _stated(lines: list[str], names: str) -> int:
-    found = (re.match(rf"(?:obj_info|comment)\s+(?:{names})\s*[:=]?\s*(\d+)\s*$", line.strip()) for line in lines)
+    found = (
+        re.match(rf"(?:obj_info|comment)\s+(?:{names})\s*[:=]?\s*(\d{{1,15}})\s*$", line.strip()) for line in lines
+    )
     return next((int(match.group(1)) for match in found if match), 0)
 
 
@@ -154,18 +172,53 @@ def _pcd_header(path: Path, content: bytes) -> CloudHeader:
     lines = content[: end.start()].decode("latin1").split("\n")
     fields = {words[0]: words[1:] for line in lines if (words := line.split()) and not line.startswith("#")}
     try:
-        width, height = int(fields["WIDTH"][0]), int(fields["HEIGHT"][0])
-        points = int(fields.get("POINTS", [str(width * height)])[0])
-        counts = fields.get("COUNT", ["1"] * len(fields["SIZE"]))
-        bytes_each = sum(int(size) * int(count) for size, count in zip(fields["SIZE"], counts, strict=True))
+        width, height = _count(fields["WIDTH"][0]), _count(fields["HEIGHT"][0])
+        points = _count(fields["POINTS"][0]) if "POINTS" in fields else width * height
+        bytes_each = _point_bytes(fields)
     except (KeyError, IndexError, ValueError) as error:
         raise UserError(f"{path}: its PCD header cannot be read ({error!r})", legal=LEGAL_CLOUD) from error
     if width * height != points:
         raise UserError(
             f"{path}: its header states {width} x {height} but {points} points", legal="WIDTH * HEIGHT = POINTS"
         )
-    least = {b"binary": points * bytes_each, b"ascii": points * 2 * len(fields["SIZE"]) - 1}.get(end.group(1), 8)
+    least = {b"binary": points * bytes_each, b"ascii": points * 2 * len(fields["SIZE"]) - 1}.get(end.group(1))
+    if least is None:
+        least = _compressed_bytes(path, end.end(), points * bytes_each)
     return CloudHeader(points, width, height, end.end(), least)
+
+
+def _count(text: str) -> int:
+    if not COUNT.fullmatch(text):
+        raise ValueError(f"{text[:20]!r} is no count")
+    return int(text)
+
+
+def _point_bytes(fields: dict[str, list[str]]) -> int:
+    """Bytes of one point, by its fields' sizes and counts. Raises ValueError or KeyError where they are no PCD's."""
+    sizes = [_count(text) for text in fields["SIZE"]]
+    counts = [_count(text) for text in fields["COUNT"]] if "COUNT" in fields else [1] * len(sizes)
+    if not len(fields["FIELDS"]) == len(fields["TYPE"]) == len(sizes) == len(counts):
+        raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
+    if not set(sizes) <= set(PCD_SIZES) or sum(counts) > PCD_NUMBERS:
+        raise ValueError(f"sizes {sorted(set(sizes))}, {sum(counts)} numbers in a point")
+    return sum(size * count for size, count in zip(sizes, counts, strict=True))
+
+
+def _compressed_bytes(path: Path, start: int, unpacked: int) -> int:
+    """Bytes of compressed points, with the two sizes before them. Raises UserError where these sizes cannot be."""
+    with path.open("rb") as file:
+        file.seek(start)
+        sizes = file.read(8)
+    if len(sizes) < 8:
+        return 8
+    packed, states = struct.unpack("<II", sizes)
+    if states != unpacked or states > LZF_STRONGEST * packed:
+        raise UserError(
+            f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}",
+            legal=LEGAL_CLOUD,
+            fix="copy or export it again",
+        )
+    return 8 + packed
 
 
 def _bytes(colours: np.ndarray) -> np.ndarray:

@@ -3,17 +3,19 @@ and flagged at other thresholds than the one in use."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from harness.engine.judge import Judgement, centres_m, places_of
+from detectors.interface import FindsAtOnce
+from harness.engine.judge import Judgement, centres_m
 from harness.engine.sight import Sight
+from harness.engine.sight_kernels import highest_within
 from harness.evaluation.match import match
+from harness.vocabulary.capture import Cloud
 from harness.vocabulary.units import MM
-from scenes.target.truth import Damage
 
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
 STEPS_PER_OCTAVE = 4
@@ -40,7 +42,7 @@ def study_rows(sight: Sight, judgement: Judgement, radius_m: float, *, hole_free
     threshold = run["threshold"]
     if np.isnan(threshold):
         return Judged(run, [])
-    signals = [_signal(sight, score, damage, radius_m) for damage in sight.truth]
+    signals = highest_within(sight.places_m, score, centres_m(sight), radius_m).tolist()
     sites = list(_sites(sight, judgement, signals)) if hole_free else []
     judged = [] if hole_free else zip(judgement.holes, signals, strict=True)
     holes = [{**row, "signal": signal} for row, signal in judged]
@@ -59,14 +61,6 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
         return np.array([threshold])
     steps = np.arange(octaves[0] * STEPS_PER_OCTAVE, octaves[1] * STEPS_PER_OCTAVE + 1)
     return np.asarray(threshold * 2.0 ** (steps / STEPS_PER_OCTAVE))
-
-
-def _signal(sight: Sight, score: np.ndarray, damage: Damage, radius_m: float) -> float:
-    """The highest score within the hit radius of a damage's centre; NaN where no pixel there was judged."""
-    with np.errstate(invalid="ignore"):
-        near = np.linalg.norm(sight.places_m - damage.centre_board_m[:2], axis=-1) <= radius_m
-    there = score[near & np.isfinite(score)]
-    return float(there.max()) if there.size else float("nan")
 
 
 def _sites(sight: Sight, judgement: Judgement, signals: list[float]) -> Iterator[dict[str, Any]]:
@@ -99,13 +93,23 @@ def _operating(
     sight: Sight, judgement: Judgement, threshold: float, radius_m: float, *, hole_free: bool
 ) -> dict[str, list[Any]]:
     """Lists over the grid of thresholds: numbers of findings and of hits."""
-    thresholds = grid(threshold, FINDING_OCTAVES)
-    findings, hits = [], []
-    for one in thresholds:
-        found = judgement.detector.find(sight.cloud, judgement.evidence, float(one))
-        findings.append(len(found))
-        hits.append(0 if hole_free else len(match(centres_m(sight), places_of(sight, found), radius_m)))
-    return {"threshold": thresholds.tolist(), "findings": findings, "hits": hits}
+    thresholds = grid(threshold, FINDING_OCTAVES).tolist()
+    found = _centres_at(judgement, sight.cloud, thresholds)
+    findings = [len(centres) for centres in found]
+    if hole_free:
+        return {"threshold": thresholds, "findings": findings, "hits": [0] * len(found)}
+    places_m = np.split(sight.on_board(np.concatenate(found)), np.cumsum(findings)[:-1])
+    hits = [len(match(centres_m(sight), places, radius_m)) for places in places_m]
+    return {"threshold": thresholds, "findings": findings, "hits": hits}
+
+
+def _centres_at(judgement: Judgement, cloud: Cloud, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
+    """For each threshold the centres (m, 3) of what the detector finds."""
+    detector, evidence = judgement.detector, judgement.evidence
+    if isinstance(detector, FindsAtOnce):
+        return detector.centres_at(cloud, evidence, thresholds)
+    found = (detector.find(cloud, evidence, threshold) for threshold in thresholds)
+    return tuple(np.array([one.centre_m for one in each]).reshape(-1, 3) for each in found)
 
 
 def _pixels(sight: Sight, score: np.ndarray, threshold: float) -> Iterator[dict[str, Any]]:

@@ -17,6 +17,7 @@ from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
+from harness.vocabulary.versions import RESULTS_VERSION
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: bool) -> int:
@@ -50,7 +51,8 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
         print(f"{name} {point.label}: {len(judged.findings)} findings beyond {mm:.2f} mm")
         for left in judged.cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")
-    write_text(folder / "summary.csv", pd.DataFrame(rows).to_csv(index=False))
+    table = pd.DataFrame(rows).assign(results_version=RESULTS_VERSION)
+    write_text(folder / "summary.csv", table.to_csv(index=False))
     print(f"findings: {folder}")
     return 0
 

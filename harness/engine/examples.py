@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from detectors.average import prefix_averages
+from harness.engine.averages import averages_of
 from harness.engine.judge import detector_for
 from harness.engine.plan import Group
 from harness.engine.setup import SetUp, load_set_up
@@ -29,7 +29,10 @@ def examples_of(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCl
     counts = sorted({point.config.capture.frames for point in chosen})
     capture = set_up.unit.capture(counts[-1], group.seed, "damaged", 0)
     averages = {canonical_json(point.config.capture.average.to_data()): point for point in chosen}
-    clouds = {text: prefix_averages(capture, counts, point.config.capture.average) for text, point in averages.items()}
+    clouds = {
+        text: averages_of(capture, counts, point.config.capture.average, exact=point.config.capture.exact)
+        for text, point in averages.items()
+    }
     return [
         _example(
             set_up,

@@ -11,6 +11,7 @@ import numpy as np
 
 from detectors import DETECTORS, load_detector
 from detectors.interface import Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
+from detectors.median import median_of, median_size_of
 from harness.engine.sight import Sight
 from harness.evaluation.match import match
 from harness.vocabulary.units import MM
@@ -105,9 +106,11 @@ def _hole_row(
     """How one damage fared. Distances in mm; positions as the thesis takes them, from the largest cluster's centre."""
     inside = sight.outlines[damage.id]
     # a cloud without a grid has no pixels that could lack a range
-    missing = float((~sight.cloud.valid.ravel()[inside]).mean()) if sight.cloud.organised else np.nan
-    residual = evidence.residual_m.ravel()[inside]
-    median_m = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
+    seen_z = sight.cloud.points_m.reshape(-1, 3)[inside, 2]
+    missing = float((~np.isfinite(seen_z)).mean()) if sight.cloud.organised else np.nan
+    residual = evidence.residual_m.reshape(-1)[inside]
+    residual = residual[np.isfinite(residual)]
+    median_m = median_of(residual) if residual.size else np.nan
     last = max(sight.truth, key=lambda d: d.diameter_m)
     row: dict[str, Any] = {
         "hole": str(damage.id),
@@ -158,4 +161,4 @@ def _measured_columns(
 
 def _robust_std(values: np.ndarray) -> float:
     finite = values[np.isfinite(values)]
-    return float(np.median(np.abs(finite - np.median(finite))) / 0.6745) if finite.size else float("nan")
+    return median_size_of(finite - median_of(finite)) / 0.6745 if finite.size else float("nan")

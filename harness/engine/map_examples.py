@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from detectors.average import prefix_averages
 from detectors.interface import Measurement
 from detectors.mapping.settings import MappingConfig
 from detectors.views import PreparedView
+from harness.engine.averages import averages_of
 from harness.engine.judge import centres_m, detector_for, places_of
 from harness.engine.maps import MapMaker
 from harness.engine.plan import Group
@@ -45,7 +45,7 @@ def map_examples_of(group: Group, thresholds: Mapping[str, float]) -> list[Mappe
     frames = chosen[0].config.capture.frames
     average = chosen[0].config.capture.average
     captures = [capture_of(set_up, number, task, frames) for number, set_up in enumerate(set_ups)]
-    clouds = [prefix_averages(capture, [frames], average) for capture in captures]
+    clouds = [averages_of(capture, [frames], average, exact=chosen[0].config.capture.exact) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0), hole_free=False)
     T_board_reference = invert(set_ups[0].T_camera_board)
     placed: dict[int, tuple[PlacedView, ...]] = {}

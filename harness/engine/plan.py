@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -113,17 +113,25 @@ class Group:
             return calibrate.repeats
         return point.config.repeats
 
-    def trials(self, batch: Batch, thresholds: Mapping[str, float]) -> Iterator[tuple[str, TrialTask]]:
-        """(journal key, task) of each trial of a batch. ``thresholds`` by point digest, empty while calibrating; a
-        point that got none is not judged."""
-        calibrating = batch in self.first
-        points = [one for one in self.points if calibrating or self._threshold(one, thresholds) is not None]
-        for repeat in range(max((self.repeats(batch, point) for point in points), default=0)):
-            wanted = tuple(
-                _point_task(point, self._threshold(point, thresholds))
-                for point in points
-                if repeat < self.repeats(batch, point)
-            )
+    def most_repeats(self, batch: Batch) -> int:
+        """How many trials of a batch there are."""
+        return max(self.repeats(batch, point) for point in self.points)
+
+    def trials(
+        self, batch: Batch, thresholds: Mapping[str, float] | None, repeats: Iterable[int] | None = None
+    ) -> Iterator[tuple[str, TrialTask]]:
+        """(journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest, empty
+        while calibrating; a point that got none is not judged. With None in place of thresholds the trials are named
+        as what could not be judged at all."""
+        unjudged = thresholds is None or batch in self.first
+        thresholds = thresholds or {}
+        points = [one for one in self.points if unjudged or self._threshold(one, thresholds) is not None]
+        asked = {point.digest: _point_task(point, self._threshold(point, thresholds)) for point in points}
+        count = max((self.repeats(batch, point) for point in points), default=0)
+        for repeat in range(count) if repeats is None else repeats:
+            wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
+            if not wanted:
+                continue
             task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
             yield self._key(batch, task), task
 
@@ -176,7 +184,7 @@ class Plan:
     @property
     def trial_count(self) -> int:
         """Trials of all roles."""
-        return sum(max(g.repeats(batch, p) for p in g.points) for g in self.groups for batch in g.batches)
+        return sum(group.most_repeats(batch) for group in self.groups for batch in group.batches)
 
 
 def plan_of(experiment: Experiment, cache: Path) -> Plan:

@@ -1,317 +1,350 @@
-"""Running a plan: renders feed trials, hole-free trials calibrate thresholds, the trials that are judged use them. What
-is finished is in the journal; what the journal holds is not run again."""
+"""Running a plan: renders feed trials, hole-free trials set thresholds, the trials that are judged use them. Whatever
+ends is in the journal; what the journal holds is not run again, nor is what only it needed rendered.
+"""
 
 from __future__ import annotations
 
 import time
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from harness.engine import workers
+from harness.engine.calibration import Calibration
 from harness.engine.examples import examples_of
-from harness.engine.journal import Journal, without_nan
+from harness.engine.journal import Entry, Journal, record_text
 from harness.engine.map_examples import map_examples_of
+from harness.engine.outcome import Failure, Outcome, Progress
+from harness.engine.parts import Part, parts_of
 from harness.engine.plan import Group, Plan, RenderJob
-from harness.engine.trial import Record, Role, TrialTask, run_trial
-from harness.evaluation.pod.false_calls import threshold_for_rate
-from harness.experiment.points import Point
-from harness.report.example import ExampleCloud
-from harness.report.views_example import MappedExample
-from harness.vocabulary.errors import UserError
+from harness.engine.rendering import render_into_cache
+from harness.engine.shard import WHOLE, Shard
+from harness.engine.trial import TrialTask, run_trial
+from harness.engine.work import Ended, Engine, Job
 
-FAILURE_CHARACTERS = 4000
-"""Of a traceback, its end."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A trial that raised: what it was, and why: a message, or of a bug the end of its traceback."""
-
-    what: str
-    why: str
-    is_bug: bool = False
-
-    @property
-    def in_short(self) -> str:
-        """One line: of a bug what the traceback ends with."""
-        return self.why.strip().splitlines()[-1] if self.is_bug else self.why
+AHEAD = 4096
+"""Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
+RENDER_TRIES = 2
+"""A render whose process died is begun once more: two of them may have been too much for the memory."""
 
 
-@dataclass
-class Outcome:
-    """What a run gave: records by journal key, failures, and what was done anew or found finished."""
-
-    records: dict[str, Record] = field(default_factory=dict)
-    failures: list[Failure] = field(default_factory=list)
-    thresholds: dict[str, float] = field(default_factory=dict)
-    examples: list[ExampleCloud | MappedExample] = field(default_factory=list)
-    renders_done: int = 0
-    renders_cached: int = 0
-    render_seconds: float = 0.0
-    trials_done: int = 0
-    trials_resumed: int = 0
-    seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a run is: finished and planned counts of renders and trials."""
-
-    renders: int
-    renders_total: int
-    trials: int
-    trials_total: int
+def run_plan(
+    plan: Plan,
+    journal: Journal,
+    engine: Engine,
+    report: Callable[[Progress], None],
+    *,
+    shard: Shard = WHOLE,
+    retry_failed: bool = False,
+) -> Outcome:
+    """Run what the journal does not hold, or of it with ``retry_failed`` what is not done. A job that does not end well
+    becomes a `Failure` and costs what needs it. Raises UserError where nothing can be written or the engine is gone;
+    KeyboardInterrupt passes through: what ended is in the journal."""
+    began = time.monotonic()
+    state = _Run(plan, journal, engine, report, shard, retry_failed)
+    state.start()
+    while state.feed():
+        for job, ended in engine.ended():
+            state.take(job, ended)
+    state.outcome.seconds = time.monotonic() - began
+    state.outcome.finished.sort()
+    state.outcome.failures.sort(key=lambda failure: failure.what)
+    return state.outcome
 
 
-@dataclass(frozen=True)
-class _Render:
-    job: RenderJob
+def render_missing(jobs: Iterable[RenderJob], engine: Engine) -> None:
+    """Have views rendered that the cache lacks, for pictures of trials that were run elsewhere."""
+    waiting = deque(_render_job(job) for job in {job.path: job for job in jobs if not job.path.exists()}.values())
+    under_way = 0
+    while waiting or under_way:
+        while waiting and engine.room("renders") > 0:
+            engine.submit(waiting.popleft())
+            under_way += 1
+        under_way -= len(engine.ended())
 
 
-@dataclass(frozen=True)
-class _Examples:
-    group: int
+def _render_job(job: RenderJob) -> Job:
+    arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
+    return Job(job.path.name, "renders", render_into_cache, arguments)
 
 
 @dataclass(frozen=True)
 class _Trial:
+    part: Part
     key: str
-    group: int
-    batch: int
-    role: Role
+    task: TrialTask
 
 
-MOST_RENDERERS = 2
-"""Processes that render, of 2 GB each."""
+@dataclass
+class _Views:
+    """Which renders are wanted, there, or lost."""
 
+    jobs: dict[Path, RenderJob] = field(default_factory=dict)
+    there: set[Path] = field(default_factory=set)
+    lost: dict[Path, str] = field(default_factory=dict)
+    wanted: deque[Path] = field(default_factory=deque)
+    later: deque[Path] = field(default_factory=deque)
+    """Will be wanted once thresholds are set; rendered when nothing is wanted now."""
+    asked: set[Path] = field(default_factory=set)
+    tries: dict[Path, int] = field(default_factory=dict)
 
-def run_plan(plan: Plan, journal: Journal, jobs: int, report: Callable[[Progress], None]) -> Outcome:
-    """Run what is not finished. Raises UserError where nothing can be rendered or written; a single trial's error
-    becomes a `Failure`. KeyboardInterrupt passes through: finished trials are in the journal."""
-    began = time.perf_counter()
-    with workers.pool(min(jobs, MOST_RENDERERS)) as renderer, workers.pool(jobs) as trial_pool:
-        state = _Run(plan, journal, renderer, trial_pool, report)
-        state.start()
-        while state.pending:
-            done, _ = wait(state.pending, return_when=FIRST_COMPLETED)
-            for future in done:
-                state.finish(future)
-    state.outcome.seconds = time.perf_counter() - began
-    return state.outcome
+    def want(self, renders: Iterable[RenderJob]) -> set[Path]:
+        """Ask for renders; returns those that are still missing."""
+        paths = [job.path for job in renders]
+        for path in paths:
+            if path not in self.asked:
+                self.asked.add(path)
+                self.wanted.append(path)
+        return {path for path in paths if path not in self.there}
+
+    def next(self) -> Path | None:
+        """The next to render."""
+        if self.wanted:
+            return self.wanted.popleft()
+        while self.later:
+            path = self.later.popleft()
+            if path not in self.asked:
+                self.asked.add(path)
+                return path
+        return None
 
 
 class _Run:
-    """The state of one run: what is pending, what each group still waits for."""
+    """The state of one run: what may be begun, what waits for what, and what came of it."""
 
     def __init__(
         self,
         plan: Plan,
         journal: Journal,
-        renderer: ProcessPoolExecutor,
-        trial_pool: ProcessPoolExecutor,
+        engine: Engine,
         report: Callable[[Progress], None],
+        shard: Shard,
+        retry_failed: bool,
     ) -> None:
-        self.plan = plan
-        self.journal = journal
-        self.renderer = renderer
-        self.trial_pool = trial_pool
-        self.report = report
         self.outcome = Outcome()
-        self.pending: dict[Future[Any], _Render | _Trial | _Examples] = {}
-        self._waiting: dict[Path, list[tuple[int, int]]] = {}
-        """Which batches, as (group, batch), wait for a render."""
-        self._renders_missing: dict[tuple[int, int], set[Path]] = {}
-        self._trials_missing: dict[tuple[int, int], set[str]] = {}
-        """Of batches that have begun."""
-        self._calibrated = [False for _ in plan.groups]
-        self._quiet: dict[str, list[tuple[float, float]]] = {}
-        """Of each point, the quiet threshold and the judged area of its hole-free runs."""
-        for number, group in enumerate(plan.groups):
-            for place, batch in enumerate(group.batches):
-                paths = {job.path for job in batch.renders}
-                self._renders_missing[number, place] = paths
-                for path in paths:
-                    self._waiting.setdefault(path, []).append((number, place))
+        self._groups = plan.groups
+        self._journal, self._engine, self._report = journal, engine, report
+        self._shard, self._retry_failed = shard, retry_failed
+        self._first, self._then = parts_of(plan, shard)
+        self._calibrations = [Calibration(group) for group in plan.groups]
+        self._views = _Views(
+            {job.path: job for parts in (*self._first, *self._then) for p in parts for job in p.renders}
+        )
+        self._to_open: deque[Part] = deque()
+        self._queue: deque[_Trial] = deque()
+        self._waiting: dict[Path, list[Part]] = {}
+        self._pictures: deque[int] = deque()
+        """Groups whose trials are over and whose pictures are not begun."""
+        self._under_way: dict[str, _Trial | RenderJob | int] = {}
+        """By name of the job; a number is that of a group whose pictures are made."""
+        self.outcome.renders.total = len(self._views.jobs)
+        self.outcome.trials.total = sum(part.count for parts in (*self._first, *self._then) for part in parts)
+
+    # ---------------------------------------------------------------- what begins
 
     def start(self) -> None:
-        """Submit every render; a group's trials follow when all its views are there."""
-        for job in self.plan.renders:
-            arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
-            self.pending[self.renderer.submit(workers.render, *arguments)] = _Render(job)
-        for number, group in enumerate(self.plan.groups):
-            if not group.first:
-                self._calibrate(number)
-        self._tell()
+        """All calibrations may begin; groups that need none are judged at once."""
+        for number, parts in enumerate(self._first):
+            if parts:
+                self._to_open += self._shard.rotated(parts)
+            elif self._then[number]:
+                self._calibrated(number)
 
-    def finish(self, future: Future[Any]) -> None:
-        """Take one result and submit what it makes possible."""
-        work = self.pending.pop(future)
-        try:
-            result = future.result()
-        except BrokenProcessPool as error:
-            raise UserError(
-                "a worker process died" + (" while rendering" if isinstance(work, _Render) else ""),
-                legal="workers need about 1 GB of memory each, the render 2 GB",
-                fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short",
-            ) from error
-        except UserError as error:
-            if isinstance(work, _Render):
-                raise
-            self._failed(work, error.message)
+    def feed(self) -> bool:
+        """Hand the engine what it has room for. False where nothing is left to wait for."""
+        while self._to_open and len(self._queue) + len(self._waiting) < AHEAD:
+            self._open(self._to_open.popleft())
+        while self._engine.room("renders") > 0 and (path := self._views.next()) is not None:
+            job = self._views.jobs[path]
+            self._submit(_render_job(job), job)
+        while self._engine.room("trials") > 0 and (self._queue or self._pictures_ready()):
+            self._submit_trial() if self._queue else self._submit_pictures()
+        self._report(Progress(self.outcome.renders, self.outcome.trials))
+        return bool(self._under_way)
+
+    def _submit(self, job: Job, work: _Trial | RenderJob | int) -> None:
+        self._under_way[job.name] = work
+        self._engine.submit(job)
+
+    def _submit_trial(self) -> None:
+        trial = self._queue.popleft()
+        # another shard with the same folder may have run a calibration meanwhile
+        if not self._shard.is_whole and trial.part.sets_threshold and self._found(trial.part, trial.key):
+            self._trial_over(trial)
             return
-        except Exception as error:
-            # A bug in one trial costs that trial; its traceback (the worker's, as text) goes into the failures.
-            if isinstance(work, _Render):
-                raise
-            self._failed(work, "".join(traceback.format_exception(error))[-FAILURE_CHARACTERS:], is_bug=True)
-            return
-        if isinstance(work, _Render):
-            self._rendered(work.job, *result)
-        elif isinstance(work, _Examples):
-            self.outcome.examples += result
-        else:
-            record = without_nan(result)
-            self.journal.write(work.key, record)
-            self.outcome.trials_done += 1
-            self._keep(work, record)
-            self._trial_over(work)
+        self._submit(Job(trial.key, "trials", trial_as_text, (trial.task,), trial.part.paths), trial)
 
-    def _failed(self, work: _Trial | _Examples, why: str, *, is_bug: bool = False) -> None:
-        what = work.key if isinstance(work, _Trial) else f"example clouds of set-up {work.group}"
-        self.outcome.failures.append(Failure(what, why, is_bug))
-        if isinstance(work, _Trial):
-            self._trial_over(work)
+    def _pictures_ready(self) -> bool:
+        """Whether the views of the first group that waits for its pictures are there; lost ones are given up."""
+        while self._pictures:
+            paths = [job.path for job in self._groups[self._pictures[0]].damaged.renders]
+            if not any(path in self._views.lost for path in paths):
+                return all(path in self._views.there for path in paths)
+            self._pictures.popleft()
+        return False
 
-    def _rendered(self, job: RenderJob, found: bool, seconds: float) -> None:
-        self.outcome.renders_cached += found
-        self.outcome.renders_done += not found
-        self.outcome.render_seconds += 0.0 if found else seconds
-        for number, place in self._waiting.pop(job.path, ()):
-            self._renders_missing[number, place].discard(job.path)
-            self._begin_if_ready(number, place)
-        self._tell()
+    def _submit_pictures(self) -> None:
+        number = self._pictures.popleft()
+        group = self._groups[number]
+        arguments = (group, self.outcome.thresholds)
+        needs = tuple(job.path for job in group.damaged.renders)
+        self._submit(Job(f"pictures of set-up {number}", "trials", pictures_of, arguments, needs), number)
 
-    def _begin_if_ready(self, number: int, place: int) -> None:
-        """A batch begins once, when its views are there and, where it is judged, its points have their thresholds."""
-        judged = place >= len(self.plan.groups[number].first)
-        if self._renders_missing[number, place] or (number, place) in self._trials_missing:
-            return
-        if not judged or self._calibrated[number]:
-            self._begin(number, place)
-
-    def _begin(self, number: int, place: int) -> None:
-        """Submit a batch's trials, or take them from the journal."""
-        group = self.plan.groups[number]
-        batch = group.batches[place]
-        missing = self._trials_missing[number, place] = set()
-        todo: list[tuple[_Trial, TrialTask]] = []
-        for key, task in group.trials(batch, self.outcome.thresholds):
-            work = _Trial(key, number, place, batch.role)
-            stored = self.journal.read(key)
-            if stored is None:
-                missing.add(key)
-                todo.append((work, task))
-            else:
-                self.outcome.trials_resumed += 1
-                self._keep(work, stored)
-        for work, task in todo:
-            self.pending[self.trial_pool.submit(run_trial, task)] = work
-        if not todo:
-            self._batch_over(number, place)
-
-    def _keep(self, work: _Trial, record: Record) -> None:
-        self.outcome.records[work.key] = record
-        if work.batch < len(self.plan.groups[work.group].first):
-            for run in record["runs"]:
-                if run["quiet_threshold"] is not None:
-                    known = (run["quiet_threshold"], run.get("inspected_m2", np.nan))
-                    self._quiet.setdefault(run["point"], []).append(known)
-
-    def _trial_over(self, work: _Trial) -> None:
-        missing = self._trials_missing[work.group, work.batch]
-        missing.discard(work.key)
-        self._tell()
+    def _open(self, part: Part) -> None:
+        """Take from the journal what it holds of a part, and queue the rest once its views are there."""
+        missing = [trial for trial in self._trials(part) if not self._found(part, trial.key)]
+        part.left = len(missing)
         if not missing:
-            self._batch_over(work.group, work.batch)
+            self._part_over(part)
+            return
+        if part.sets_threshold:
+            self._views.later += [job.path for later in self._then[part.group] for job in later.renders]
+        absent = self._views.want(part.renders)
+        lost = [self._views.lost[path] for path in absent if path in self._views.lost]
+        if lost:
+            self._skip(missing, lost[0])
+        elif absent:
+            part.absent, part.trials = absent, missing
+            for path in absent:
+                self._waiting.setdefault(path, []).append(part)
+        else:
+            self._queue += missing
 
-    def _batch_over(self, number: int, place: int) -> None:
-        """After the batches that set thresholds the judged ones begin; after those there are pictures to make."""
-        group = self.plan.groups[number]
-        if place < len(group.first):
-            if self._over(number, range(len(group.first))):
-                self._calibrate(number)
-        elif not group.is_study and self._over(number, range(len(group.first), len(group.batches))):
-            future = self.trial_pool.submit(_examples_of, group, self.outcome.thresholds)
-            self.pending[future] = _Examples(number)
+    def _trials(self, part: Part) -> Iterator[_Trial]:
+        group = self._groups[part.group]
+        found = [
+            _Trial(part, key, task) for key, task in group.trials(part.batch, self.outcome.thresholds, part.repeats)
+        ]
+        self.outcome.trials.total += len(found) - part.count
+        yield from self._shard.rotated(found) if part.sets_threshold else found
 
-    def _over(self, number: int, places: range) -> bool:
-        """Whether all trials of these batches have ended."""
-        return all(self._trials_missing.get((number, place)) == set() for place in places)
+    def _found(self, part: Part, key: str) -> bool:
+        """Whether the journal says how a trial ended, and nothing asks for another try."""
+        entry = self._journal.read(key)
+        if entry is None or entry.state == "skipped" or (self._retry_failed and entry.state != "done"):
+            return False
+        if entry.state == "done":
+            self.outcome.trials.found += 1
+            self._done(part, key, entry)
+        else:
+            self._failed(key, entry)
+        return True
 
-    def _calibrate(self, number: int) -> None:
-        """Each point's threshold; then what is judged by it begins."""
-        group = self.plan.groups[number]
-        for point in group.points:
-            found = self._threshold_of(point)
-            if found is not None:
-                self.outcome.thresholds[point.digest] = found
+    # ---------------------------------------------------------------- what ended
+
+    def take(self, job: Job, ended: Ended) -> None:
+        """A job has ended, one way or another."""
+        work = self._under_way.pop(job.name)
+        if isinstance(work, RenderJob):
+            self._render_over(work, ended)
+        elif isinstance(work, int):
+            if ended.state == "done":
+                self.outcome.examples += ended.value
+            else:
+                self.outcome.failures.append(Failure(job.name, ended.why, ended.is_bug, ended.state))
+        else:
+            entry = Entry.of(ended)
+            self._journal.write(work.key, entry)
+            self.outcome.peak_mb = max(self.outcome.peak_mb, entry.peak_mb)
+            self.outcome.trials.seconds += entry.seconds
+            if entry.state == "done":
+                self.outcome.trials.done += 1
+                self._done(work.part, work.key, entry)
+            else:
+                self._failed(work.key, entry)
+            self._trial_over(work)
+
+    def _done(self, part: Part, key: str, entry: Entry) -> None:
+        self.outcome.finished.append(key)
+        if part.sets_threshold and entry.record is not None:
+            self._calibrations[part.group].add(key, entry.record["runs"])
+
+    def _failed(self, key: str, entry: Entry) -> None:
+        self.outcome.trials.failed += 1
+        self.outcome.failures.append(Failure(key, entry.why, entry.is_bug, entry.state))
+
+    def _render_over(self, job: RenderJob, ended: Ended) -> None:
+        counts, path = self.outcome.renders, job.path
+        if ended.state == "done":
+            was_there, seconds = ended.value
+            counts.found += was_there
+            counts.done += not was_there
+            counts.seconds += 0.0 if was_there else seconds
+            self._views.there.add(path)
+            for part in self._waiting.pop(path, ()):
+                self._view_there(part, path)
+            return
+        self._views.tries[path] = self._views.tries.get(path, 0) + 1
+        if ended.state == "crashed" and self._views.tries[path] < RENDER_TRIES:
+            self._views.wanted.appendleft(path)
+            return
+        counts.failed += 1
+        self.outcome.failures.append(Failure(f"render {path.stem}", ended.why, ended.is_bug, ended.state))
+        self._views.lost[path] = self.outcome.failures[-1].in_short
+        for part in self._waiting.pop(path, ()):
+            trials, part.trials = part.trials, []
+            self._skip(trials, self._views.lost[path])
+
+    def _view_there(self, part: Part, path: Path) -> None:
+        part.absent.discard(path)
+        if not part.absent:
+            self._queue += part.trials
+            part.trials = []
+
+    def _skip(self, trials: list[Any], why: str) -> None:
+        """Trials that cannot be begun; they are tried again by the next run."""
+        for trial in trials:
+            entry = Entry("skipped", why=why)
+            self._journal.write(trial.key, entry)
+            self._failed(trial.key, entry)
+            self._trial_over(trial)
+
+    def _trial_over(self, trial: _Trial) -> None:
+        trial.part.left -= 1
+        if trial.part.left == 0:
+            self._part_over(trial.part)
+
+    def _part_over(self, part: Part) -> None:
+        """After the parts that set thresholds the judged ones may begin; after those there are pictures to make."""
+        for job in part.renders:
+            if job.path not in self._views.asked:
+                self._views.asked.add(job.path)
+                self.outcome.renders.total -= 1  # nobody needs it
+        part.is_over = True
+        group = self._groups[part.group]
+        if part.sets_threshold:
+            if all(one.is_over for one in self._first[part.group]):
+                self._calibrated(part.group)
+        elif self._shard.is_whole and not group.is_study and all(one.is_over for one in self._then[part.group]):
+            self._want_pictures(part.group)
+
+    def _calibrated(self, number: int) -> None:
+        """Each point's threshold; then what is judged by it may begin."""
+        thresholds, failures = self._calibrations[number].thresholds(may_lack=bool(self.outcome.failures))
+        self.outcome.thresholds |= thresholds
+        self.outcome.failures += failures
+        if thresholds:
+            self._to_open += self._then[number]
+            return
+        group = self._groups[number]
+        for part in self._then[number]:
+            unjudged = [_Trial(part, *one) for one in group.trials(part.batch, None, part.repeats)]
+            part.left = len(unjudged)
+            self._skip(unjudged, f"no threshold: {failures[0].in_short}")
+
+    def _want_pictures(self, number: int) -> None:
+        group = self._groups[number]
         if any(point.digest in self.outcome.thresholds for point in group.points):
-            self._calibrated[number] = True
-            for place in range(len(group.first), len(group.batches)):
-                self._begin_if_ready(number, place)
-
-    def _threshold_of(self, point: Point) -> float | None:
-        """A point's threshold; where failed trials left too few runs, or none, that is a failure of its own."""
-        try:
-            found = threshold_of(point, self._quiet.get(point.digest, []))
-        except UserError as error:
-            if not self.outcome.failures:
-                raise
-            self.outcome.failures.append(Failure(f"threshold of {point.label}", error.message))
-            return None
-        if found is None:
-            self.outcome.failures.append(Failure(f"threshold of {point.label}", "no hole-free run ended"))
-        return found
-
-    def _tell(self) -> None:
-        o = self.outcome
-        renders = o.renders_done + o.renders_cached
-        trials = o.trials_done + o.trials_resumed + len(o.failures)
-        self.report(Progress(renders, len(self.plan.renders), trials, self.plan.trial_count))
+            self._views.want(group.damaged.renders)
+            self._pictures.append(number)
 
 
-def threshold_of(point: Point, quiet: Sequence[tuple[float, float]]) -> float | None:
-    """A point's threshold: given, or by its hole-free runs, (quiet threshold, judged area in m2) each: the highest of
-    them, or in a study the one for the wanted rate of false calls. None where there is nothing to go by.
-
-    Raises UserError as `threshold_for_rate` does.
-    """
-    given, calibrate = point.config.threshold.k, point.config.threshold.calibrate
-    if given is not None or not quiet:
-        return given
-    thresholds, areas_m2 = np.array(quiet).T
-    if calibrate is None or calibrate.false_calls_per_m2 is None:
-        return float(thresholds.max())
-    if not areas_m2.mean() > 0:
-        message = f"the detector {point.config.detector.name!r} gave no score to any pixel of the hole-free boards"
-        raise UserError(message, fix="check its crop against the boards' poses")
-    return threshold_for_rate(thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2).value
+def trial_as_text(task: TrialTask) -> str:
+    """A trial's record as the journal keeps it; made where the trial runs, as it takes a millisecond."""
+    return record_text(run_trial(task))
 
 
-def _examples_of(group: Group, thresholds: dict[str, float]) -> Sequence[ExampleCloud | MappedExample]:
-    return examples_of(group, thresholds) if group.poses is None else map_examples_of(group, thresholds)
-
-
-def pending_counts(plan: Plan, journal: Journal) -> Iterator[tuple[str, int, int]]:
-    """For a dry run: (what, planned, already there) for renders and hole-free trials."""
-    renders = plan.renders
-    yield "renders", len(renders), sum(job.path.exists() for job in renders)
-    keys = [key for group in plan.groups for batch in group.first for key, _ in group.trials(batch, {})]
-    yield "hole-free trials that set thresholds", len(keys), sum(journal.read(key) is not None for key in keys)
+def pictures_of(group: Group, thresholds: dict[str, float]) -> list[Any]:
+    """The example clouds of a group, or of its maps."""
+    return list(examples_of(group, thresholds) if group.poses is None else map_examples_of(group, thresholds))

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
-from scipy import ndimage
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
@@ -94,13 +94,22 @@ class SetUp:
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
         """Flat indices of the pixels whose central ray enters each damage; at least the nearest pixel."""
-        flat = self.board_xy_m.reshape(-1, 2)
+        x, y = (np.ascontiguousarray(self.board_xy_m[..., axis]).ravel() for axis in (0, 1))
         inside = {}
         for damage in self.truth:
-            distance = np.linalg.norm(flat - damage.centre_board_m[:2], axis=-1)
+            centre_x, centre_y = damage.centre_board_m[:2]
+            distance = np.sqrt((x - centre_x) ** 2 + (y - centre_y) ** 2)
             within = np.flatnonzero(distance < damage.diameter_m / 2)
             inside[damage.id] = within if within.size else np.array([int(np.nanargmin(distance))])
         return inside
+
+    @cached_property
+    def seen_depth_m(self) -> dict[int, float]:
+        """By damage how far behind the face the central rays through it end, along the optical axis: the median of
+        those that come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the
+        backing."""
+        depth_m = (self.seen_z_m - self.face_z_m).ravel()
+        return {damage.id: _deepest(depth_m[self.outlines[damage.id]]) for damage in self.truth}
 
     @cached_property
     def intact(self) -> np.ndarray:
@@ -141,15 +150,24 @@ class SetUp:
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """A mask less a rim of `INTACT_MARGIN_PX`."""
-    square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, bool)
-    return np.asarray(ndimage.binary_erosion(mask, square, border_value=0))
+    square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, np.uint8)
+    left = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(left > 0)
+
+
+def _deepest(depth_m: np.ndarray) -> float:
+    known = depth_m[np.isfinite(depth_m)]
+    return float(np.median(known[known > known.max() - 1 * MM])) if known.size else float("nan")
 
 
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
     """(..., 3): where the lines through points along directions (both (..., 3), board frame) meet a face."""
-    place = points_m
+    place, before = points_m, None
     for _ in range(FACE_STEPS):
         height = np.nan_to_num(face.height_m(place[..., 0], place[..., 1]))
+        if before is not None and np.array_equal(height, before):
+            break  # on a flat face the second step is the last
+        before = height
         place = points_m + ((height - points_m[..., 2]) / directions[..., 2])[..., None] * directions
     return np.asarray(place)
 
@@ -168,8 +186,13 @@ def load_set_up(ref: SetUpRef) -> SetUp:
     )
 
 
+sent_views: Path | None = None
+"""Of a process that does not see the driver's cache: the folder where views that were sent lie under their names."""
+
+
 def _stored_view(path: str) -> NoiseFreeView:
-    view = read_view(Path(path))
+    place = Path(path)
+    view = read_view(sent_views / place.name if sent_views is not None and not place.exists() else place)
     if view is None:
         raise UserError(f"{path}: the stored render is missing or damaged", fix="run the same command again")
     return view

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.engine.setup import INTACT_MARGIN_PX, SetUp, met_on_face
+from harness.engine.sight_kernels import pixel_areas
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.units import MM
@@ -60,12 +61,14 @@ class Sight:
         if not self.cloud.organised:
             size = self.target.board
             return size.width_mm * size.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
-        down, across = np.gradient(self.places_m, axis=(0, 1))
-        each = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+        areas = pixel_areas(self.places_m)
+        each = areas[there]
         known = np.isfinite(each)
-        # at the outline a neighbour is off the board: such a pixel is taken for one like the others
-        each = np.where(known, each, np.median(each[known]) if known.any() else 0.0)
-        return float(each[there].sum())
+        if not known.all():
+            # at the outline a neighbour is off the board: such a pixel is taken for one like the others
+            every = areas[np.isfinite(areas)]
+            each = np.where(known, each, np.median(every) if every.size else 0.0)
+        return float(each.sum())
 
 
 def sight_of_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> Sight:
@@ -80,7 +83,7 @@ def sight_of_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> Sight:
         outlines=set_up.outlines,
         places_m=set_up.board_xy_m,
         undamaged=undamaged,
-        seen_depth_m={damage.id: _seen_depth_m(set_up, damage) for damage in set_up.truth},
+        seen_depth_m=set_up.seen_depth_m,
     )
 
 
@@ -113,7 +116,7 @@ def sight_of_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, h
         outlines=outlines,
         places_m=place,
         undamaged=bare if hole_free and not intact.any() else intact,
-        seen_depth_m={damage.id: _seen_depth_m(first, damage) for damage in first.truth},
+        seen_depth_m=first.seen_depth_m,
     )
 
 
@@ -154,12 +157,3 @@ def _ticks(places: np.ndarray) -> np.ndarray:
     filled = first + step * np.arange(places.shape[1])
     filled[known] = ticks
     return np.asarray(filled)
-
-
-def _seen_depth_m(set_up: SetUp, damage: Damage) -> float:
-    """How far behind the face the central rays through a hole end, along the optical axis: the median of those that
-    come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the backing."""
-    inside = set_up.outlines[damage.id]
-    depth = set_up.seen_z_m.ravel()[inside] - set_up.face_z_m.ravel()[inside]
-    depth = depth[np.isfinite(depth)]
-    return float(np.median(depth[depth > depth.max() - 1 * MM])) if depth.size else float("nan")

@@ -7,6 +7,7 @@ import io
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,17 +15,26 @@ import numpy as np
 
 from harness.engine.console import progress_display
 from harness.engine.journal import Journal
+from harness.engine.lock import locked
+from harness.engine.opening import EngineOptions, engine_of
+from harness.engine.outcome import Outcome
 from harness.engine.plan import Plan, plan_of
-from harness.engine.run import Outcome, pending_counts, run_plan
+from harness.engine.rates import learn
+from harness.engine.run import render_missing, run_plan
 from harness.engine.tables import STUDY_ORDERS, Tables, tables_of
+from harness.engine.work import STATES, Engine
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment
 from harness.experiment.schema import SimulatedSource
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, write_text
+from harness.vocabulary.json_text import strict_json
+from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import INCH, MM
+from harness.vocabulary.versions import RESULTS_VERSION, check_version
 from scenes.render.cache import read_view
+from scenes.render.store import in_use, trim_cache
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
@@ -32,56 +42,85 @@ from scenes.view import NoiseFreeView
 if TYPE_CHECKING:
     from rich.table import Table
 
-RESULTS_VERSION = 1
-"""Stands in every result folder; raised when the tables' meaning changes."""
+
+PROVENANCE = "provenance.json"
+MOST_FAILURES = 200
+"""That are told one by one; the journal has all."""
+MOST_VIEWS = 64
+"""Of which the render's own noise is told: evenly taken from all, 4 MB each."""
 
 
-def dry_run(experiment: Experiment, out: Path, jobs: int) -> int:
-    """Say what would be run."""
-    folder = experiment.folder(out)
-    plan = plan_of(experiment, _cache(out))
-    sets = f"{len(plan.groups)} set{'s' if len(plan.groups) != 1 else ''} of frames"
-    print(f"{experiment.config.name}: valid; {len(experiment.points)} points, {sets}")
-    for what, planned, there in pending_counts(plan, Journal(folder / "journal")):
-        print(f"  {what}: {planned}, {there} already there")
-    print(f"  trials of both kinds: {plan.trial_count}, on {jobs} processes")
-    print(f"  results would go to {folder}")
-    return 0
-
-
-def run_study(experiment: Experiment, out: Path, jobs: int, command: str) -> int:
-    """Run, write tables and report, print the summary. Returns 0, or 1 where trials failed."""
-    began = time.perf_counter()
+def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
+    """Run, write tables and report, print the summary; a shard's trials only go into the journal. Returns 0, 1 where
+    trials did not end well, 130 after Ctrl-C."""
+    began = time.monotonic()
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder = experiment.folder(out)
+    _refuse_newer(folder)
     plan = plan_of(experiment, _cache(out))
     # The first file written: an unwritable folder shows before any work is done.
     write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+    journal = Journal(folder / "journal")
     try:
-        with progress_display() as show:
-            outcome = run_plan(plan, Journal(folder / "journal"), jobs, show)
+        with in_use(_cache(out)), locked(folder, options.shard), engine_of(options) as engine:
+            with progress_display() as show:
+                outcome = run_plan(plan, journal, engine, show, shard=options.shard, retry_failed=options.retry_failed)
+            learn(plan, outcome, journal, out / ".cache", 1 if options.serial else options.jobs)
+            if not options.shard.is_whole:
+                return _conclude_shard(folder, outcome, options)
+            if not outcome.finished or not outcome.thresholds:
+                return _nothing_to_report(experiment, outcome)
+            tables = tables_of(_records(journal, outcome), experiment)
+            provenance = _provenance(experiment, plan, outcome, tables, command, started)
+            provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
+            _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
+            if experiment.config.study is None:
+                _write_report(folder, experiment, outcome, tables, provenance)
+                table, text = _final_table(tables)
+            else:
+                table, text = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
     except KeyboardInterrupt:
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
-    if not outcome.records or not outcome.thresholds:
-        return _nothing_to_report(experiment, outcome)
-    tables = tables_of((outcome.records[key] for key in sorted(outcome.records)), experiment)
-    provenance = _provenance(experiment, plan, outcome, command, started, time.perf_counter() - began)
-    _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
-    if experiment.config.study is None:
-        _write_report(folder, experiment, outcome, tables, provenance)
-        table, text = _final_table(tables)
-    else:
-        table, text = _write_study(folder, experiment, plan, outcome, tables, provenance)
+    if options.cache_limit_gb is not None:
+        trim_cache(_cache(out), round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     _conclude(folder, table, text, outcome)
     return 1 if outcome.failures else 0
 
 
+def _refuse_newer(folder: Path) -> None:
+    """Results of a newer tofpod are not written over. Raises UserError."""
+    try:
+        version = strict_json(bounded_bytes(folder / PROVENANCE, RECORD_BYTES))["results_version"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if type(version) is int and version > RESULTS_VERSION:
+        check_version(version, RESULTS_VERSION, folder / PROVENANCE, "a result folder")
+
+
+def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
+    """Of all finished trials, in order of their keys; read again, so that a large study need not fit into memory."""
+    for key in outcome.finished:
+        entry = journal.read(key)
+        if entry is None or entry.record is None:
+            raise UserError(
+                f"{journal.folder}: the record {key} is gone or damaged since it was written",
+                fix="run the same command again: what is missing is run again",
+            )
+        yield entry.record
+
+
 def _write_study(
-    folder: Path, experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
+    folder: Path,
+    experiment: Experiment,
+    plan: Plan,
+    outcome: Outcome,
+    tables: Tables,
+    provenance: dict[str, Any],
+    engine: Engine,
 ) -> tuple[Table, str]:
     """A study's record and report; its limits as a table and as text."""
-    from harness.engine.study_examples import study_examples
+    from harness.engine.study_examples import shown_in, study_examples
     from harness.engine.study_record import failed_by_point, record_of
     from harness.evaluation.study.record import record_text
     from harness.evaluation.study.result import evaluate_study
@@ -94,7 +133,10 @@ def _write_study(
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     write_text(folder / "study.json", record_text(study))
     result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
-    examples = study_examples(plan, result.limits, outcome.thresholds)
+    shown = shown_in(plan, result.limits)
+    # of trials that were run on other machines the views may not be here
+    render_missing((job for one in shown for job in one.batch.renders), engine)
+    examples = study_examples(shown, outcome.thresholds)
     title = experiment.config.title or experiment.config.name
     write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
     return study_table(result), study_text(result)
@@ -116,24 +158,40 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     name, detector = experiment.config.name, experiment.config.detector.name
     bug = next((failure for failure in outcome.failures if failure.is_bug), None)
     if bug is None:
-        raise UserError(f"no trial of {name} succeeded: {_reasons(outcome)}")
+        first = next((failure for failure in outcome.failures if failure.state != "skipped"), None)
+        alike = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
+        why = first.why if first is not None and len(alike) == 1 else _reasons(outcome)
+        raise UserError(f"no trial of {name} succeeded: {why}")
     print(bug.why, file=sys.stderr)
-    count = len(outcome.failures)
+    count = outcome.trials.failed
     print(f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})", file=sys.stderr)
     return 1
 
 
 def _reasons(outcome: Outcome) -> str:
-    return "; ".join(sorted({failure.in_short for failure in outcome.failures})[:3]) or "nothing was planned"
+    """What went wrong, without what was skipped because of it."""
+    own = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
+    return "; ".join(sorted(own)[:3]) or "nothing was planned"
+
+
+def _counted(outcome: Outcome) -> str:
+    """How many did not end well, by state; empty where all did."""
+    return ", ".join(f"{count} {state}" for state, count in _counts(outcome).items())
+
+
+def _counts(outcome: Outcome) -> dict[str, int]:
+    """Of failures by state, those that there are."""
+    found = {state: sum(failure.state == state for failure in outcome.failures) for state in STATES}
+    return {state: count for state, count in found.items() if count}
 
 
 def _provenance(
-    experiment: Experiment, plan: Plan, outcome: Outcome, command: str, started: str, seconds: float
+    experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, command: str, started: str
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
-    runs = [row for record in outcome.records.values() for row in record["runs"]]
     views = _views_of_set_ups(plan)
     noise = _indirect_noise_mm(views)
+    runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     return {
         "results_version": RESULTS_VERSION,
         **record(command),
@@ -143,23 +201,26 @@ def _provenance(
         "mitsuba_variant": views[0].variant if views else None,
         "started": started,
         "seconds": {
-            "this run in all": round(seconds, 1),
-            "renders (not cached)": round(outcome.render_seconds, 1),
-            "frames (all workers, resumed trials too)": round(sum(row["seconds_frames"] for row in runs), 1),
-            "detection and measurement (likewise)": round(sum(row["seconds_detect"] for row in runs), 1),
+            "renders (not cached)": round(renders.seconds, 1),
+            "frames (all workers, resumed trials too)": round(float(runs["seconds_frames"].sum()), 1),
+            "detection and measurement (likewise)": round(float(runs["seconds_detect"].sum()), 1),
         },
-        "renders": {"done": outcome.renders_done, "cached": outcome.renders_cached},
-        "trials": {"done": outcome.trials_done, "resumed": outcome.trials_resumed},
+        "renders": {"done": renders.done, "cached": renders.found, "failed": renders.failed},
+        "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
+        "peak_mb": outcome.peak_mb,
         "indirect_noise_mm": noise,
-        "failures": [{"what": failure.what, "why": failure.why} for failure in outcome.failures],
+        "failures": [
+            {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
+        ],
+        "failures_in_all": _counts(outcome),
     }
 
 
 def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
     """The damaged views of all set-ups, variations left out."""
     set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    jobs = (job for group in set_ups or plan.groups[:1] for job in group.damaged.renders)
-    views = (read_view(job.path) for job in jobs)
+    jobs = [job for group in set_ups or plan.groups[:1] for job in group.damaged.renders]
+    views = (read_view(job.path) for job in jobs[:: -(-len(jobs) // MOST_VIEWS)])
     return [view for view in views if view is not None]
 
 
@@ -197,9 +258,10 @@ def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any], *, i
             pq.write_table(stored, path)
     if not is_study:
         buffer = io.StringIO()
-        summarise_holes(tables.holes, list(tables.axes["path"])).to_csv(buffer, index=False, float_format="%.6g")
+        summary = summarise_holes(tables.holes, list(tables.axes["path"])).assign(results_version=RESULTS_VERSION)
+        summary.to_csv(buffer, index=False, float_format="%.6g")
         write_text(folder / "summary.csv", buffer.getvalue())
-    write_text(folder / "provenance.json", json.dumps(provenance, indent=2) + "\n")
+    write_text(folder / PROVENANCE, json.dumps(provenance, indent=2) + "\n")
 
 
 def _write_report(
@@ -212,16 +274,31 @@ def _write_report(
 
 
 def _conclude(folder: Path, table: Table, text: str, outcome: Outcome) -> None:
-    """The final table, the failures, and where to look."""
+    """The final table, what did not end well, and where to look."""
     from rich.console import Console
 
     if sys.stdout.isatty():
         Console().print(table)
     else:
         print(text)
-    if outcome.failures:
-        print(f"{len(outcome.failures)} trials failed: {_reasons(outcome)}", file=sys.stderr)
+    _tell_failures(outcome)
     print(f"report: {folder / 'report.html'}")
+
+
+def _tell_failures(outcome: Outcome) -> None:
+    if outcome.failures:
+        print(f"{_counted(outcome)}: {_reasons(outcome)}", file=sys.stderr)
+        print("the same command with --retry-failed runs these trials again", file=sys.stderr)
+
+
+def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> int:
+    """What a shard did, and what comes next."""
+    trials = outcome.trials
+    print(f"shard {options.shard}: {trials.done} trials done, {trials.found} found, {trials.failed} not ended well")
+    _tell_failures(outcome)
+    print(f"journal: {folder / 'journal'}")
+    print("when all shards have run: python -m harness.merge, then the same command without --shard")
+    return 1 if outcome.failures else 0
 
 
 def _final_table(tables: Tables) -> tuple[Table, str]:

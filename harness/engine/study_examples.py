@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from detectors.average import prefix_averages
+from harness.engine.averages import averages_of
 from harness.engine.examples import outline_px
 from harness.engine.judge import Judgement, judge
 from harness.engine.plan import Batch, Group, Plan
@@ -26,17 +27,30 @@ ROOM_MM = 12.0
 """Around the largest of a set-up's damages in their pictures, which are all of one size."""
 
 
-def study_examples(plan: Plan, limits: Sequence[SetUpLimit], thresholds: Mapping[str, float]) -> list[StudyExample]:
+@dataclass(frozen=True)
+class Shown:
+    """One damage to show: row ``row`` of the limit's inspections, on the board of ``batch``."""
+
+    group: Group
+    batch: Batch
+    point: Point
+    limit: SetUpLimit
+    where: Where
+    row: int
+    half_m: float
+
+
+def shown_in(plan: Plan, limits: Sequence[SetUpLimit]) -> list[Shown]:
     """Of each of the first few set-ups the damages whose sizes lie nearest to 0.75, 1 and 1.25 of its limit: of a90/95
     where that is demonstrated, else of the estimate of a90, a50 or the middle size; of smaller ones where that is too
     near the largest size. One view's clouds only: of maps there are none."""
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in _points(plan)}
-    examples = []
+    shown = []
     for limit in limits[:MOST_SET_UPS]:
         group, point = by_place[limit.record.variant, limit.record.frames]
         if group.poses is None:
-            examples += list(_examples(group, point, limit, thresholds))
-    return examples
+            shown += list(_shown(group, point, limit))
+    return shown
 
 
 def _points(plan: Plan) -> Iterator[tuple[Group, Point]]:
@@ -45,29 +59,38 @@ def _points(plan: Plan) -> Iterator[tuple[Group, Point]]:
             yield group, point
 
 
-def _examples(group: Group, point: Point, limit: SetUpLimit, thresholds: Mapping[str, float]) -> Iterator[StudyExample]:
+def _shown(group: Group, point: Point, limit: SetUpLimit) -> Iterator[Shown]:
     seen = limit.record.inspected
     batches = {batch.board: batch for batch in group.then if batch.role == "damaged"}
     chosen = _chosen(seen, _limit_mm(limit))
     half_m = (max(seen.diameter_mm[row] for row in chosen.values()) / 2 + ROOM_MM) * MM
     for where, row in chosen.items():
-        batch = batches[int(seen.board[row])]
-        set_up, sight, judgement = _again(group, batch, point, int(seen.repeat[row]), thresholds)
-        curve = None if limit.statement is None else limit.statement.curve
-        yield _cut_out(
-            set_up,
-            sight,
-            judgement,
-            half_m,
-            variant=point.variant,
-            frames=point.config.capture.frames,
-            board=int(seen.board[row]),
-            hole=str(seen.hole[row]),
-            where=where,
-            pod=float("nan") if curve is None else float(curve.pod(seen.diameter_mm[row])),
-            hit=bool(seen.hit[row]),
-            score=float(seen.signal[row]),
-        )
+        yield Shown(group, batches[int(seen.board[row])], point, limit, where, row, half_m)
+
+
+def study_examples(shown: Sequence[Shown], thresholds: Mapping[str, float]) -> list[StudyExample]:
+    """The pictures; every view is there."""
+    return [_example(one, thresholds) for one in shown]
+
+
+def _example(one: Shown, thresholds: Mapping[str, float]) -> StudyExample:
+    seen, row, point = one.limit.record.inspected, one.row, one.point
+    set_up, sight, judgement = _again(one.group, one.batch, point, int(seen.repeat[row]), thresholds)
+    curve = None if one.limit.statement is None else one.limit.statement.curve
+    return _cut_out(
+        set_up,
+        sight,
+        judgement,
+        one.half_m,
+        variant=point.variant,
+        frames=point.config.capture.frames,
+        board=int(seen.board[row]),
+        hole=str(seen.hole[row]),
+        where=one.where,
+        pod=float("nan") if curve is None else float(curve.pod(seen.diameter_mm[row])),
+        hit=bool(seen.hit[row]),
+        score=float(seen.signal[row]),
+    )
 
 
 def _limit_mm(limit: SetUpLimit) -> float:
@@ -101,7 +124,7 @@ def _again(
 
 def _sight(set_up: SetUp, task: TrialTask, asked: PointTask) -> Sight:
     capture = capture_of(set_up, 0, task, asked.frames)
-    cloud = prefix_averages(capture, [asked.frames], asked.average)[asked.frames]
+    cloud = averages_of(capture, [asked.frames], asked.average, exact=asked.exact)[asked.frames]
     return sight_of_view(set_up, cloud, hole_free=False)
 
 

@@ -30,6 +30,9 @@ ORDERS = {
     "registrations": ["variant", "role", "frames", "repeat", "view"],
 }
 
+ROWS_AT_ONCE = 20_000
+"""As mappings some 30 MB."""
+
 
 @dataclass(frozen=True)
 class Tables:
@@ -62,25 +65,50 @@ class Tables:
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> Tables:
-    """Collect records, in any order, into tables in a fixed order."""
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ("probes", *ORDERS, *STUDY_ORDERS)}
+    """Collect records into tables in a fixed order; equal for equal records in equal order."""
+    collected = {name: _Rows() for name in (*ORDERS, *STUDY_ORDERS)}
+    probes: list[dict[str, Any]] = []
     for record in records:
-        for name, collected in rows.items():
-            collected.extend(record.get(name, ()))
+        probes.extend(record.get("probes", ()))
+        for name, rows in collected.items():
+            rows.add(record.get(name, ()))
     axes, variants = _axes(experiment), _variants(experiment)
     placed = variants.set_index("variant")[list(axes["path"])]
 
     def with_axes(table: pd.DataFrame) -> pd.DataFrame:
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
-    ordered = {name: with_axes(_ordered(rows[name], order)) for name, order in ORDERS.items()}
-    of_study = {name: _ordered(_one_a_threshold(rows[name]), order) for name, order in STUDY_ORDERS.items()}
-    probes = with_axes(_probes(rows["probes"]))
+    ordered = {name: with_axes(_ordered(collected[name].table(), order)) for name, order in ORDERS.items()}
+    of_study = {name: _ordered(collected[name].table(), order) for name, order in STUDY_ORDERS.items()}
     walls = wall_rows(experiment) if experiment.config.study is None else pd.DataFrame()
-    return Tables(**ordered, **of_study, probes=probes, variants=variants, axes=axes, walls=walls)
+    return Tables(**ordered, **of_study, probes=with_axes(_probes(probes)), variants=variants, axes=axes, walls=walls)
 
 
-def _one_a_threshold(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+class _Rows:
+    """Rows on their way into a table: a row as a mapping takes ten times the memory that it takes in a frame."""
+
+    def __init__(self) -> None:
+        self._frames: list[pd.DataFrame] = []
+        self._rows: list[Mapping[str, Any]] = []
+
+    def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Some more rows."""
+        self._rows.extend(rows)
+        if len(self._rows) >= ROWS_AT_ONCE:
+            self._flush()
+
+    def table(self) -> pd.DataFrame:
+        """All rows."""
+        self._flush()
+        return pd.concat(self._frames, ignore_index=True) if len(self._frames) > 1 else self._frames[0]
+
+    def _flush(self) -> None:
+        if self._rows or not self._frames:
+            self._frames.append(pd.DataFrame(_one_a_threshold(self._rows)))
+        self._rows = []
+
+
+def _one_a_threshold(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Rows with lists over thresholds, as one row for each threshold."""
     if not rows or not isinstance(rows[0].get("threshold"), list):
         return rows
@@ -88,8 +116,7 @@ def _one_a_threshold(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
 
 
-def _ordered(rows: list[dict[str, Any]], order: list[str]) -> pd.DataFrame:
-    table = pd.DataFrame(rows)
+def _ordered(table: pd.DataFrame, order: list[str]) -> pd.DataFrame:
     order = [name for name in order if name in table]
     return _numbers(table if table.empty else table.sort_values(order, kind="stable", ignore_index=True))
 

@@ -10,8 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from detectors.average import AverageConfig, prefix_averages
+from detectors.average import AverageConfig
 from detectors.mapping.settings import MappingConfig
+from harness.engine.averages import averages_of
 from harness.engine.board_noise import board_noise_rows
 from harness.engine.boards import STUDY_TABLES, Judged, study_rows
 from harness.engine.judge import judge
@@ -43,6 +44,7 @@ class PointTask:
     radius_m: float
     threshold: float | None
     mapping: MappingConfig | None = None
+    exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,10 @@ def _clouds(
     """One view's averages, of as many frames as the points that use this view ask for."""
     views = [point.mapping.views if point.mapping is not None else None for point in points]
     counts = sorted({point.frames for point, n in zip(points, views, strict=True) if n is None or number < n})
-    return prefix_averages(capture_of(set_up, number, task, counts[-1]), counts, config) if counts else {}
+    if not counts:
+        return {}
+    exact = any(point.exact for point in points)
+    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, config, exact)
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:

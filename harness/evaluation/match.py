@@ -16,11 +16,9 @@ def match(truth_m: np.ndarray, found_m: np.ndarray, radius_m: float) -> dict[int
     distance = np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1)
     pairs: dict[int, int] = {}
     taken: set[int] = set()
-    order = np.argsort(np.where(np.isfinite(distance), distance, np.inf), axis=None, kind="stable")
-    for flat in order:
+    near = np.flatnonzero(distance <= radius_m)
+    for flat in near[np.argsort(distance.reshape(-1)[near], kind="stable")]:
         t, f = divmod(int(flat), len(found_m))
-        if not distance[t, f] <= radius_m:
-            break
         if t not in pairs and f not in taken:
             pairs[t] = f
             taken.add(f)

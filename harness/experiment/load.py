@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,18 @@ from harness.experiment.schema import ExperimentConfig, ValuesVariation
 from harness.experiment.unfold import unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import validated
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.versions import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig
+
+EXPERIMENT_VERSION = 1
+"""Of the resolved experiment in a result folder; raised when a key changes its meaning."""
+STAMP_KIND = "experiment"
+RESERVED = frozenset(
+    {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
+)
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
@@ -28,13 +36,16 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     ``calibration``: a recording whose lens takes the place of the nominal one (`harness.experiment.calibrated`).
     """
     recording_of.cache_clear()
-    source, problems = overridden(read_yaml(Path(path)), overrides, declared_of)
+    written = read_yaml(Path(path))
+    _refuse_other_version(written, Path(path))
+    source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, Path(path).resolve().parent)
     if calibration is not None:
         source = _with_calibration(source, calibration)
     config, invalid = validated(ExperimentConfig, source, splices_of(source.data))
     problems += invalid
     problems += checks.name_problems(source)
+    problems += _reserved_names(source)
     if config is not None and not problems:
         problems += checks.joint_problems(config, source)
     points, unfolding = unfolded(source, None if problems else config)
@@ -44,8 +55,24 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 
 
 def resolved_yaml(experiment: Experiment) -> str:
-    """The experiment with every default written out; loading it again gives the same points."""
-    return to_yaml(dict(experiment.data))
+    """The experiment with every default written out, under its version; loading it again gives the same points."""
+    return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
+
+
+def _refuse_other_version(source: Source, path: Path) -> None:
+    """A file that a result folder holds says its version; one that is written by hand says none and is read as is."""
+    found = stamp_of(source.text, STAMP_KIND)
+    if found is not None:
+        again = "take the experiment that it was made from, or remove the first line and mend what is refused then"
+        check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
+
+
+def _reserved_names(source: Source) -> Iterator[Problem]:
+    """Names that are devices on Windows: no folder of results can be called so there."""
+    name = source.data.get("name")
+    if isinstance(name, str) and name.lower() in RESERVED:
+        place = source.place_of(("name",))
+        yield Problem(f"`name` is {name}, which is a device's name on Windows", place, fix="choose another name")
 
 
 def _resolved_data(config: ExperimentConfig, source: Source) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 from harness.experiment import recorded
 from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
 from harness.vocabulary.declaration.yaml_source import Source
+from harness.vocabulary.files import inside
 from harness.vocabulary.seeds import digest
 from scenes.sensor.camera import camera_digest, camera_of
 from scenes.target.declaration import AnyTargetConfig
@@ -65,8 +66,8 @@ class Experiment:
         return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
 
     def folder(self, results: Path) -> Path:
-        """Where the results go: ``results/<name>/<digest>``; the name's legal letters keep it inside ``results``."""
-        return Path(results) / self.config.name / self.digest
+        """Where the results go: ``results/<name>/<digest>``. Raises UserError where a link leads out of it."""
+        return inside(Path(results), self.config.name, self.digest)
 
 
 def point_of(

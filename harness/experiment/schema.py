@@ -66,6 +66,11 @@ class CaptureConfig(Config):
 
     frames: Frames
     average: AverageConfig = AverageConfig()
+    exact: bool = Field(
+        False,
+        description="whether each simulated frame is drawn; false: a mean is drawn at once where that is equal in "
+        "distribution, in a fraction of the time",
+    )
 
 
 class DetectorConfig(Config):

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert
+from harness.vocabulary.json_text import strict_json
+from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
+from harness.vocabulary.versions import RESULTS_VERSION, check_version
 
+POSES_KEY = "T_reference_view"
+"""Under which `harness.export` writes the list, beside the file's version."""
 LEGAL_POSES = (
-    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame; or lines of"
+    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
+    f" under the key {POSES_KEY}; or lines of"
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
 RIGID_WITHIN = 1e-4
@@ -20,14 +26,18 @@ FARTHEST_M = 100.0
 """Between two views of one target: several times any such camera's range. Poses in millimetres lie beyond."""
 
 
+MOST_KEYS = 10
+"""Named of an object that is no list."""
+
+
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """``T_first_view`` (4, 4) of each view, the first the identity, whatever common frame the file's poses lead to.
 
-    Raises UserError where the file cannot be read, holds another number of poses, one that is not rigid, or one
-    farther than `FARTHEST_M` from the first.
+    Raises UserError where the file cannot be read, is larger than `limits.TEXT_BYTES` or of a newer version, holds
+    another number of poses, one that is not rigid, or one farther than `FARTHEST_M` from the first.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_POSES) from error
     except UnicodeDecodeError as error:
@@ -39,11 +49,12 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
             legal=LEGAL_POSES,
             fix="keep one pose for each PATH, in the same order (of a sequence's groundtruth.txt one line a view)",
         )
-    T_first_common = invert(poses[0])
-    from_first = [T_first_common @ pose for pose in poses[1:]]
-    for number, pose in enumerate(from_first, start=1):
-        distance_m = float(np.linalg.norm(pose[:3, 3]))
-        if distance_m > FARTHEST_M:
+    with np.errstate(over="ignore", invalid="ignore"):
+        T_first_common = invert(poses[0])
+        from_first = [T_first_common @ pose for pose in poses[1:]]
+        distances_m = [float(np.linalg.norm(pose[:3, 3])) for pose in from_first]
+    for number, distance_m in enumerate(distances_m, start=1):
+        if not distance_m <= FARTHEST_M:  # or NaN, where numbers are near the largest
             raise UserError(
                 f"{path}: pose {number} is {distance_m:.4g} m from pose 0",
                 legal=f"up to {FARTHEST_M:g} m between views of one target",
@@ -54,17 +65,26 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
     try:
-        data = json.loads(text)
-        if isinstance(data, dict):
-            raise TypeError(f"an object with the keys {', '.join(data)}")
-        poses = [np.array(each, float) for each in data]
-    except (json.JSONDecodeError, TypeError, ValueError, RecursionError) as error:
+        poses = [np.array(each, float) for each in _listed(path, strict_json(text))]
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path}: holds no list of matrices ({error})", legal=LEGAL_POSES) from error
     for number, pose in enumerate(poses):
         fault = _fault(pose)
         if fault:
             raise UserError(f"{path}: pose {number} is no rigid 4x4 transform: {fault}", legal=LEGAL_POSES)
     return poses
+
+
+def _listed(path: Path, data: Any) -> Any:
+    """The list itself: of a file that `harness.export` wrote, or somebody by hand, who states no version."""
+    if not isinstance(data, dict):
+        return data
+    if "results_version" in data:
+        check_version(data["results_version"], RESULTS_VERSION, path, "a file of poses")
+    if POSES_KEY not in data:
+        keys = ", ".join(key[:40] for key in list(data)[:MOST_KEYS])
+        raise TypeError(f"an object with the keys {keys}{', ...' if len(data) > MOST_KEYS else ''}")
+    return data[POSES_KEY]
 
 
 def _fault(pose: np.ndarray) -> str:

@@ -15,6 +15,7 @@ from harness.inspection.registrations import Checks, checks_of, print_registrati
 from harness.inspection.several_arguments import mapping_config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import MM
+from harness.vocabulary.versions import RESULTS_VERSION
 
 if TYPE_CHECKING:
     from detectors.interface import Detector
@@ -214,7 +215,7 @@ def _write(
 
     judged, merged = inspection.judged, inspection.mapped.merged
     title = f"{len(merged.views_used)} views: {len(judged.detections)} findings beyond {inspection.beyond}"
-    rows = registration_rows(inspection.mapped, inspection.checks)
+    rows = {"results_version": RESULTS_VERSION, **registration_rows(inspection.mapped, inspection.checks)}
     beside = {
         "registrations.json": lambda path: path.write_text(plain_json(rows), encoding="utf-8"),
         "view3d.html": lambda path: write_view3d(path, scene_of(inspection.mapped, judged), title),

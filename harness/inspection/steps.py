@@ -63,7 +63,7 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
         raise UserError(f"--set {assignment}: no value", legal="KEY=VALUE, for instance surface.degree=5")
     try:
         value = json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         value = text
     *folders, leaf = path.split(".")
     for folder in folders:

@@ -15,6 +15,8 @@ from harness.report.page_parts import aligned, mm
 if TYPE_CHECKING:
     from rich.table import Table
 
+COMPARISON_VERSION = 1
+"""Of compare.json; raised when a key changes its meaning."""
 HEADS = ("", "set-up", "verdict", "a90 mm", "change", "95 % mm", "a90/95 mm", "lost, won", "p", "false calls/m²", "p")
 LEFT = 3
 """Columns flush left."""
@@ -117,6 +119,7 @@ def compare_table(comparison: Comparison) -> Table:
 def compare_data(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON's types; what is not a number is None."""
     return {
+        "comparison_version": COMPARISON_VERSION,
         "first": _study(comparison.first),
         "second": _study(comparison.second),
         "rule": {"margin": MARGIN, "alpha": comparison.alpha},

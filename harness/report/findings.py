@@ -28,6 +28,9 @@ DAMAGE_RGB = (255, 0, 255)
 COLUMNS = (
     "id", "u_px", "v_px", "x_mm", "y_mm", "z_mm", "diameter_mm", "depth_mm", "volume_mm3", "points", "score",
 )  # fmt: skip
+FINDINGS_VERSION = 1
+"""Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
+VERSION_COLUMN = "findings_version"
 FILES = ("findings.csv", "findings.json", "annotated.png", "cloud.ply")
 
 
@@ -132,13 +135,13 @@ def write_findings(
 
 
 def csv_text(findings: Sequence[Finding]) -> str:
-    """The table with the columns `COLUMNS`; an empty cell where there is no number."""
+    """The table with the columns `COLUMNS` and the version; an empty cell where there is no number."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow((*COLUMNS, VERSION_COLUMN))
     for finding in findings:
         row = asdict(finding)
-        writer.writerow([_cell(row[column]) for column in COLUMNS])
+        writer.writerow([*(_cell(row[column]) for column in COLUMNS), FINDINGS_VERSION])
     return text.getvalue()
 
 
@@ -153,7 +156,7 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
     rows = []
     for finding, measured in zip(judged.findings, judged.measurements, strict=True):
         rows.append({**asdict(finding), "extent": _extent(measured), "model": _model(measured)})
-    return plain_json({"findings": rows, **about})
+    return plain_json({"findings_version": FINDINGS_VERSION, "findings": rows, **about})
 
 
 def plain_json(data: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.summary import STATES, ResultTables, bounded
+from harness.vocabulary.versions import GENERATOR
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,6 +35,7 @@ def template(name: str, folder: Path | None = None) -> Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.globals["generator"] = GENERATOR
     return environment.get_template(name)
 
 

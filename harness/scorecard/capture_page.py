@@ -17,6 +17,7 @@ from harness.scorecard.page import told
 from harness.scorecard.plots import COLOURS
 from harness.scorecard.tables import interval, number
 from harness.vocabulary.units import MM
+from harness.vocabulary.versions import RESULTS_VERSION
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +55,7 @@ def capture_csv(rows: Sequence[Beside]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     names = "where quantity at unit pixels measured measured_low measured_high simulated simulated_low simulated_high"
-    writer.writerow(names.split())
+    writer.writerow([*names.split(), "results_version"])
     for row in rows:
         values = [
             value
@@ -62,7 +63,7 @@ def capture_csv(rows: Sequence[Beside]) -> str:
             for value in (estimate.value, estimate.interval.low, estimate.interval.high)
         ]
         texts = ["" if np.isnan(value) else f"{value:.9g}" for value in values]
-        writer.writerow([row.where, row.quantity, row.at, row.unit, row.pixels, *texts])
+        writer.writerow([row.where, row.quantity, row.at, row.unit, row.pixels, *texts, RESULTS_VERSION])
     return buffer.getvalue()
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from detectors.recordings import open_capture
+from detectors.recordings.pictures import read_picture
 from detectors.recordings.recording import Recording
 from harness.scorecard.capture import Beside, Captured, Twin, captured_of, surface_rows, surfaces_of, twin_of
 from harness.scorecard.capture_edges import edge_rows, edges_of
@@ -18,6 +19,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.provenance import record
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.sensor.camera import camera_names, load_camera
 
 
@@ -52,7 +54,12 @@ def run_capture(options: CaptureOptions) -> int:
     for note in recording.notes:
         print(f"note: {note}")
     print(plain_rows(rows))
-    provenance = {**record(options.command), "camera": name, "files": [str(path) for path in recording.files]}
+    provenance = {
+        "results_version": RESULTS_VERSION,
+        **record(options.command),
+        "camera": name,
+        "files": [str(path) for path in recording.files],
+    }
     write_text(options.out / "capture.csv", capture_csv(rows))
     write_text(options.out / "capture.html", capture_html(captured, twin, rows, provenance))
     write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
@@ -118,9 +125,11 @@ def read_mask(path: Path) -> np.ndarray:
     """(h, w) bool: what is not black in an image. Raises UserError where it cannot be read."""
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    if image is None:
+    try:
+        image = read_picture(path, cv2.IMREAD_GRAYSCALE)
+    except UserError as error:
         raise UserError(
-            f"--mask {path}: no image that can be read", legal="a PNG of the frames' size, black = left out"
-        )
+            f"--mask {path}: no image that can be read ({error.message.removeprefix(f'{path}: ')})",
+            legal="a PNG of the frames' size, black = left out",
+        ) from error
     return np.asarray(image > 0)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,14 @@ from harness.scorecard.estimate import Estimate
 from harness.scorecard.published import Figure
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
+from harness.vocabulary.json_text import strict_json
+from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
+from harness.vocabulary.versions import check_version
 
 BASELINE_FILE = Path(__file__).with_name("baseline.json")
+SCORECARD_VERSION = 1
+"""Of a baseline; raised when the meaning of its keys changes."""
+AGAIN = "remove it, and write it anew with --update-baseline"
 
 
 @dataclass(frozen=True)
@@ -50,24 +57,32 @@ def judged(
 
 
 def read_baseline(path: Path) -> dict[str, bool]:
-    """Which figures passed, by name; empty where there is no file. Raises UserError where it is no baseline."""
+    """Which figures passed, by name; empty where there is no file. Raises UserError where it is no baseline, or one
+    of another version."""
+    return {name: one["passes"] for name, one in _figures(path).items()}
+
+
+def _figures(path: Path) -> dict[str, dict[str, Any]]:
+    """What a baseline says of each figure."""
     if not path.exists():
         return {}
     try:
-        figures = json.loads(path.read_text(encoding="utf-8"))["figures"]
-        found = {str(name): one["passes"] for name, one in figures.items()}
+        data = strict_json(bounded_bytes(path, TEXT_BYTES))
+        check_version(data["scorecard_version"], SCORECARD_VERSION, path, "a baseline of the scorecard", again=AGAIN)
+        figures: dict[str, dict[str, Any]] = data["figures"]
+        is_one = all(isinstance(one["passes"], bool) for one in figures.values())
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise _no_baseline(path) from error
-    if not all(isinstance(passes, bool) for passes in found.values()):
+    if not is_one:
         raise _no_baseline(path)
-    return found
+    return figures
 
 
 def _no_baseline(path: Path) -> UserError:
     return UserError(
         f"{path}: is no baseline of the scorecard",
-        legal='JSON: {"figures": {NAME: {"passes": true or false, "simulated": number}}}',
-        fix="write it anew with --update-baseline",
+        legal='JSON: {"scorecard_version": 1, "figures": {NAME: {"passes": true or false, "simulated": number}}}',
+        fix=AGAIN,
     )
 
 
@@ -76,12 +91,11 @@ def write_baseline(path: Path, scores: Iterable[Score], known: Iterable[str]) ->
 
     Entries of other figures stay as they are where their name is among the ``known`` ones.
     """
-    read_baseline(path)
-    before = json.loads(path.read_text(encoding="utf-8"))["figures"] if path.exists() else {}
-    figures = {name: one for name, one in before.items() if name in set(known)}
+    figures = {name: one for name, one in _figures(path).items() if name in set(known)}
     figures |= {score.figure.name: {"passes": score.passes, "simulated": _rounded(score)} for score in scores}
     lines = [f"    {json.dumps(name)}: {json.dumps(one)}" for name, one in sorted(figures.items())]
-    write_text(path, '{\n  "figures": {\n' + ",\n".join(lines) + "\n  }\n}\n")
+    head = f'{{\n  "scorecard_version": {SCORECARD_VERSION},\n  "figures": {{\n'
+    write_text(path, head + ",\n".join(lines) + "\n  }\n}\n")
 
 
 def _rounded(score: Score) -> float | None:

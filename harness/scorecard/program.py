@@ -21,6 +21,7 @@ from harness.scorecard.tables import curves_csv, print_scorecard, scores_csv
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import record
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.sensor.camera import camera_digest, camera_names, load_camera
 
 
@@ -89,6 +90,7 @@ def _write(
 ) -> None:
     cameras = {name: camera_digest(load_camera(name)) for name in titles}
     provenance = {
+        "results_version": RESULTS_VERSION,
         **record(options.command),
         "cameras": cameras,
         "figures": str(options.figures),

@@ -74,16 +74,21 @@ def _in_turn(groups: list[list[Request]], effort: Effort, renders: Path) -> Iter
 
 
 def _in_parallel(groups: list[list[Request]], effort: Effort, renders: Path, jobs: int) -> Iterator[Done]:
-    from concurrent.futures import as_completed
+    from harness.engine.processes import LocalEngine
+    from harness.engine.work import Job, Limits
 
-    from harness.engine.workers import pool
-
-    with pool(jobs) as executor:
-        running = {
-            executor.submit(measure_group, group[0].camera, _plain(group), effort, renders): group for group in groups
-        }
-        for future in as_completed(running):
-            yield running[future], future.result()
+    by_name = {f"scene {number}": group for number, group in enumerate(groups)}
+    waiting, running = list(reversed(by_name.items())), 0
+    with LocalEngine(jobs, Limits()) as engine:
+        while waiting or running:
+            while waiting and engine.room("trials") > 0:
+                name, group = waiting.pop()
+                arguments = (group[0].camera, _plain(group), effort, renders)
+                engine.submit(Job(name, "trials", measure_group, arguments))
+                running += 1
+            for job, ended in engine.ended():
+                running -= 1
+                yield by_name[job.name], ended.result()
 
 
 def _plain(group: list[Request]) -> list[tuple[str, dict[str, Any]]]:

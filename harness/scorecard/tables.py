@@ -15,6 +15,7 @@ from harness.scorecard.estimate import Estimate
 from harness.scorecard.judge import Score
 from harness.scorecard.quantities import QUANTITIES
 from harness.scorecard.run import Request
+from harness.vocabulary.versions import RESULTS_VERSION
 
 CONDITION_COLUMNS = (
     "distance_m",
@@ -152,8 +153,8 @@ def _estimate(estimate: Estimate) -> dict[str, float]:
 
 
 def _csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows with equal keys as CSV text; NaN and None are empty cells, floats have nine digits."""
-    listed = list(rows)
+    """Rows with equal keys, and the version, as CSV text; NaN and None are empty cells, floats have nine digits."""
+    listed = [{**row, "results_version": RESULTS_VERSION} for row in rows]
     if not listed:
         return ""
     buffer = io.StringIO()

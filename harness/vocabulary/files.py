@@ -75,6 +75,24 @@ def _move_shared(temporary: Path, path: Path, mode: int) -> None:
     os.replace(temporary, path)
 
 
+def inside(folder: Path, *parts: str) -> Path:
+    """``folder`` with ``parts`` below it, for names that somebody else may have chosen.
+
+    Raises UserError where a part is no plain name (empty, "..", with a separator or a zero byte), or where a link that
+    lies in ``folder`` leads out of it: what is written would land elsewhere. ``folder`` itself may be a link.
+    """
+    for part in parts:
+        if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
+            raise UserError(f"{part!r} is no name of a file or folder", legal="letters, digits, - and _")
+    path = Path(folder).joinpath(*parts)
+    if not path.resolve().is_relative_to(Path(folder).resolve()):
+        raise UserError(
+            f"{path}: is a link that leads out of {folder}, to {path.resolve()}",
+            fix=f"remove the link, or name its goal with --out; {folder} itself may be a link",
+        )
+    return path
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write ``content`` atomically. Raises UserError as `atomic_path` does."""
     with atomic_path(path) as temporary:

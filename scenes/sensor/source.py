@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.seeds import random_stream
 from scenes.sensor.camera import AnyCamera, CameraConfig
-from scenes.sensor.model import SensorModel, model_of
+from scenes.sensor.model import FrameSummer, SensorModel, model_of
+from scenes.sensor.totals import FrameTotals
 from scenes.sensor.unit import frame_errors_m
 from scenes.view import NoiseFreeView
 
@@ -36,6 +38,13 @@ class SimulatedUnit:
     def exposure(self) -> Any:
         """What the model keeps of the view for all frames."""
         return self.model.expose(self.view)
+
+    @cached_property
+    def at_once(self) -> FrameSummer | None:
+        """What sums frames of the view without drawing each; None where only frames will do."""
+        asked = np.zeros(self.view.range_m.shape, bool)
+        asked[self.cut] = True
+        return self.model.at_once(self.exposure, asked)
 
     @cached_property
     def region(self) -> Region:
@@ -102,15 +111,33 @@ class SimulatedCapture:
         """The rounding step of the output."""
         return self.unit.camera.z_step_m
 
+    @cached_property
+    def errors_m(self) -> np.ndarray:
+        """(n_frames,): by how much each frame is displaced as a whole, metres of half path."""
+        camera, config = self.unit.camera, self.unit.config
+        stream = random_stream(self.seed, "frame errors", *self.labels)
+        errors_m = frame_errors_m(camera.unit, config.effects, config.minutes_since_power_on, stream)
+        return np.array(list(islice(errors_m, self.n_frames)))
+
+    def totals(self, frames: np.ndarray) -> FrameTotals | None:
+        """Sums over the frames of these numbers (t,), drawn at once: not those that `frames` yields, but equal to them
+        in distribution, and independent of the sums over other frames. The same frames give the same sums, whichever
+        others are asked for. None where only frames will do."""
+        summer, errors_m = self.unit.at_once, self.errors_m[frames]
+        if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
+            return None
+
+        def stream(block: int) -> np.random.Generator:
+            return random_stream(self.seed, "frames at once", block, *self.labels)
+
+        return summer.totals(frames, errors_m, stream).cut(self.unit.cut)
+
     def frames(self) -> Iterator[Frame]:
         """Yield the frames; each call repeats the same noise."""
         rng = random_stream(self.seed, "frames", *self.labels)
-        camera, effects = self.unit.camera, self.unit.config.effects
-        stream = random_stream(self.seed, "frame errors", *self.labels)
-        errors_m = frame_errors_m(camera.unit, effects, self.unit.config.minutes_since_power_on, stream)
         cut = self.unit.cut
         for number in range(self.n_frames):
-            decoded = self.unit.model.frame(self.unit.exposure, rng, next(errors_m))
+            decoded = self.unit.model.frame(self.unit.exposure, rng, self.errors_m[number])
             yield Frame(
                 name=f"frame {number}",
                 z_m=decoded.z_m[cut],

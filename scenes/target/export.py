@@ -10,6 +10,7 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
+from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.target.mesh import Part, Target
 from scenes.target.truth import to_rows
 
@@ -33,13 +34,15 @@ def write_mesh(target: Target, path: Path) -> None:
 
 
 def write_truth(target: Target, path: Path) -> None:
-    """Write the truth as JSON: the declaration, ``T_camera_board`` (metres) and one row in millimetres per damage."""
+    """Write the truth as JSON: the version, the declaration, ``T_camera_board`` (metres) and one row in millimetres per
+    damage."""
     write_text(path, json.dumps(truth_data(target), indent=2) + "\n")
 
 
 def truth_data(target: Target) -> dict[str, Any]:
     """The truth as plain data."""
     return {
+        "results_version": RESULTS_VERSION,
         "target": target.config.to_data(),
         "T_camera_board": target.T_camera_board.tolist(),
         "damages": to_rows(target.truth),

@@ -14,6 +14,8 @@ import pytest
 
 from detectors import load_detector
 from detectors.average import AverageConfig, RunningAverage
+from detectors.crop import AutoCrop, crop
+from detectors.interface import FindsAtOnce
 from detectors.segment import euclidean_clusters
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.capture import Cloud, Frame
@@ -88,3 +90,15 @@ def test_measure_eight_holes(benchmark: Any) -> None:
     found = detector.find(cloud, evidence, 8.0)
     measured = benchmark(lambda: [detector.measure(cloud, evidence, d) for d in found])
     assert len(measured) == 8
+
+
+def test_findings_at_21_thresholds(benchmark: Any) -> None:
+    detector, cloud = load_detector("thesis", {"crop": {"kind": "none"}}), _board()
+    assert isinstance(detector, FindsAtOnce)
+    evidence = detector.analyse(cloud)
+    found = benchmark(detector.centres_at, cloud, evidence, [2.0 * 2.0 ** (k / 4) for k in range(21)])
+    assert len(found[8]) == 8
+
+
+def test_crop_to_the_largest_surface(benchmark: Any) -> None:
+    assert benchmark(crop, _board(), AutoCrop()).any()

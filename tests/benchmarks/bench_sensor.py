@@ -7,15 +7,17 @@ the compiled kernel that the camera uses, the same in Dr.Jit (traced at each cal
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 
 from detectors.average import AverageConfig, RunningAverage
+from harness.engine.averages import averages_of
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
-from scenes.closed_form import plane_view
+from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.exposure import Exposure
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -110,6 +112,54 @@ def test_add_30_000_pixels_to_an_average(benchmark: Any) -> None:
     frame = next(capture.frames())
     running = RunningAverage(capture, AverageConfig())
     benchmark.pedantic(running.add, args=(frame,), rounds=300, iterations=1, warmup_rounds=5)
+
+
+# ---------------------------------------------------------------- averages drawn at once
+
+
+def unit_before_far_hole() -> SimulatedUnit:
+    """A unit before a board with a hole of 1 in and its own rim, 200 mm before a wall: rims to simulate one by one."""
+    lens = CAMERA.nominal_lens
+    outer = BOARD.grown(CAMERA.margin_px, lens.height, lens.width)
+    middle = lens.region_slopes(BOARD).reshape(-1, 2).mean(axis=0)
+
+    def covers(at: np.ndarray) -> np.ndarray:
+        x, y = at[..., 0] - middle[0], at[..., 1] - middle[1]
+        return (np.hypot(x, y) > 0.017) & (np.abs(x) < 0.19) & (np.abs(y) < 0.14)
+
+    return SimulatedUnit(
+        CAMERA, CameraConfig(), layered_view(CAMERA, outer, Plane(0.75, 0.1, 0.05), Plane(0.95, 0.1, 0.05), covers, 0.6)
+    )
+
+
+@pytest.mark.benchmark(group="averages of 50 frames, 30,000 pixels")
+@pytest.mark.parametrize(
+    "make", [lambda: unit_on(BOARD), unit_before_far_hole], ids=["bare board", "rims before a wall"]
+)
+def test_an_average_of_50_frames_drawn_at_once(benchmark: Any, make: Any) -> None:
+    unit = make()
+    captures = (unit.capture(50, seed) for seed in count())
+    assert unit.at_once is not None
+    benchmark.pedantic(
+        lambda: averages_of(next(captures), [50], AverageConfig(), exact=False), rounds=30, warmup_rounds=2
+    )
+
+
+@pytest.mark.benchmark(group="averages of 50 frames, 30,000 pixels")
+def test_an_average_of_50_frames_frame_by_frame(benchmark: Any) -> None:
+    capture = unit_on(BOARD).capture(50, 1)
+    benchmark.pedantic(lambda: averages_of(capture, [50], AverageConfig(), exact=True), rounds=3, warmup_rounds=1)
+
+
+@pytest.mark.benchmark(group="averages of 50 frames, 30,000 pixels")
+@pytest.mark.parametrize(
+    "make", [lambda: unit_on(BOARD), unit_before_far_hole], ids=["bare board", "rims before a wall"]
+)
+def test_sort_the_pixels_of_a_view_once(benchmark: Any, make: Any) -> None:
+    unit = make()
+    asked = np.zeros(unit.exposure.shape, bool)
+    asked[unit.cut] = True
+    benchmark.pedantic(unit.model.at_once, args=(unit.exposure, asked), rounds=10, warmup_rounds=1)
 
 
 # ---------------------------------------------------------------- each part, 30,000 pixels

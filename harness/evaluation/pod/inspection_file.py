@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.limits import TABLE_BYTES, bounded_bytes
 
 FEWEST_ROWS = 10
 """Below this nobody fits two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
@@ -39,8 +40,9 @@ def read_inspections(path: Path, size: str, response: str, target: str | None = 
     """The named columns of a file with a header row; UTF-8 with or without a byte order mark; comma, semicolon or tab
     between columns (with the latter two a comma within a number is its decimal mark).
 
-    Raises UserError: no such file, not UTF-8, a column that is missing, named twice or chosen twice, a row of another
-    length, what is no finite number (with its line), fewer than `FEWEST_ROWS` rows, a target with two sizes.
+    Raises UserError: no such file, one larger than `limits.TABLE_BYTES`, not UTF-8, a column that is missing, named
+    twice or chosen twice, a row of another length, what is no finite number (with its line), fewer than `FEWEST_ROWS`
+    rows, a target with two sizes.
     """
     header, rows, separator = _table(path)
     chosen = [name for name in (size, response, target) if name is not None]
@@ -106,7 +108,7 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]], str]:
     """Header, rows that are not blank with their lines, and the separator: the one that parts the header most."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = bounded_bytes(path, TABLE_BYTES).decode("utf-8-sig")
     except OSError as error:
         reason = (error.strerror or "no reason given").lower()
         raise UserError(f"{path}: cannot be read ({reason})", fix="name a CSV file") from error

@@ -15,6 +15,9 @@ import numpy as np
 
 from harness.evaluation.study.record_form import mistake_in
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.json_text import strict_json
+from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
+from harness.vocabulary.versions import check_version
 
 RECORD_VERSION = 1
 """Raised when a field's meaning, or what counts as a hit, changes: records of two versions cannot be compared."""
@@ -118,20 +121,15 @@ def read_record(path: Path) -> StudyRecord:
     """
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = json.loads(file.read_text("utf-8"))
+        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # its form says where a NaN stands
     except OSError as error:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{file}: is no JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
         raise UserError(f"{file}: is no study's record", legal=LEGAL)
-    if data["record_version"] != RECORD_VERSION:
-        raise UserError(
-            f"{file}: is a record of version {data['record_version']}",
-            legal=f"version {RECORD_VERSION}",
-            fix="run the study again with this version of tofpod",
-        )
+    check_version(data["record_version"], RECORD_VERSION, file, "a record", again="run the study again")
     if wrong := mistake_in(data):
         raise UserError(f"{file}: is damaged: {wrong}", fix=AGAIN)
     named = {field.name: data[field.name] for field in fields(StudyRecord) if field.name != "set_ups"}

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.problems import Place, Problem
+from harness.vocabulary.declaration.problems import MAX_PROBLEMS, Place, Problem
 from harness.vocabulary.declaration.shape import Declared
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source
 
@@ -61,9 +61,9 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
 
 
 def problems_of(error: ValidationError, declared: Declared, source: Source, base: KeyPath = ()) -> list[Problem]:
-    """The problems behind a ValidationError whose locations start at ``base``."""
+    """The problems behind a ValidationError whose locations start at ``base``; the first `MAX_PROBLEMS` of them."""
     located = []
-    for one in error.errors(include_url=False, include_input=False):
+    for one in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
         landing = shape.land(declared, (*base, *one["loc"]))
         located.append(_Located(one["type"], one["msg"], one.get("ctx", {}), landing))
     return [_problem(one, declared, source) for one in _meant(located, declared)]

@@ -11,6 +11,9 @@ from harness.vocabulary.errors import UserError
 SHOWN_COLUMNS = 110
 """Characters of a source line that a message shows; longer lines are cut around the caret."""
 
+MAX_PROBLEMS = 100
+"""That a message tells, and that are looked for in one mapping: who wrote more reads no further."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -32,9 +35,9 @@ class Place:
 
     def excerpt(self) -> list[str]:
         """The source line and a caret under the place, both indented."""
-        text = "".join(letter if letter.isprintable() else " " for letter in self.line_text)
-        start = max(0, self.column - 1 - SHOWN_COLUMNS // 2) if len(text) > SHOWN_COLUMNS else 0
-        shown = text[start : start + SHOWN_COLUMNS]
+        start = max(0, self.column - 1 - SHOWN_COLUMNS // 2) if len(self.line_text) > SHOWN_COLUMNS else 0
+        cut = self.line_text[start : start + SHOWN_COLUMNS]
+        shown = "".join(letter if letter.isprintable() else " " for letter in cut)
         offset = self.column - 1 - start
         width = max(1, min(self.width, len(shown) - offset))
         label = f"{self.line:5d}" if self.line else " " * 5
@@ -74,7 +77,9 @@ class DeclarationError(UserError):
         self.origin = origin
         self.problems = in_order(problems)
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
-        super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(map(str, self.problems)))
+        told = [*map(str, self.problems[:MAX_PROBLEMS])]
+        told += [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+        super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(told))
 
     def __reduce__(self) -> tuple[object, ...]:
         return DeclarationError, (self.origin, self.problems)

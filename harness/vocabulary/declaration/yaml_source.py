@@ -16,19 +16,19 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from harness.vocabulary.declaration.problems import DeclarationError, Place, Problem
+from harness.vocabulary.declaration.problems import MAX_PROBLEMS, DeclarationError, Place, Problem
 
 KeyPath = tuple[str | int, ...]
 """Where a value is in the data: keys of mappings and indices of lists."""
 
-MAX_BYTES = 1_000_000
-"""An experiment written by hand has a few kB."""
-MAX_NODES = 100_000
-"""Values after aliases are followed: what bounds an alias bomb."""
+MAX_BYTES = 500_000
+"""An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte."""
+MAX_NODES = 50_000
+"""Values as written, and after aliases are followed: what bounds an alias bomb."""
 MAX_DEPTH = 40
 """Nesting; the schema needs 8."""
 
@@ -154,13 +154,17 @@ def _decoded(origin: str, content: bytes) -> str:
 def _places_in(text: str, origin: str, start: int, is_argument: bool) -> Callable[[int, int], Place]:
     """A function from (index, end index) after ``start`` to the place."""
     line_starts = [0, *(match.end() for match in re.finditer("\n", text))]
+    lines: dict[int, str] = {}
+    """Each line once: its places share it, however many they are and however long it is."""
 
     def place(index: int, end: int) -> Place:
         index, end = min(index + start, len(text)), end + start
         line = bisect_right(line_starts, index) - 1
         first = line_starts[line]
-        line_end = text.find("\n", first)
-        line_text = text[first:] if line_end < 0 else text[first:line_end]
+        line_text = lines.get(line)
+        if line_text is None:
+            line_end = text.find("\n", first)
+            line_text = lines[line] = text[first:] if line_end < 0 else text[first:line_end]
         width = max(1, min(end, first + len(line_text)) - index)
         return Place(origin, 0 if is_argument else line + 1, index - first + 1, line_text, width)
 
@@ -170,10 +174,11 @@ def _places_in(text: str, origin: str, start: int, is_argument: bool) -> Callabl
 def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Node | None:
     """ruamel.yaml's node tree; its errors become a problem with a place."""
     try:
-        too_deep = _first_too_deep(text)
-        if too_deep is None:
+        too_much = _first_too_much(text)
+        if too_much is None:
             return YAML(typ="safe", pure=True).compose(text)
-        problem = Problem("nested too deep", place(too_deep, too_deep + 1), legal=f"at most {MAX_DEPTH} levels")
+        index, what, legal = too_much
+        problem = Problem(what, place(index, index + 1), legal=legal)
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -188,13 +193,17 @@ def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Nod
     raise DeclarationError(origin, [problem]) from None
 
 
-def _first_too_deep(text: str) -> int | None:
-    """The index of the first mapping or list beyond `MAX_DEPTH`: composing recurses, and scanning slows with depth."""
-    depth = 0
+def _first_too_much(text: str) -> tuple[int, str, str] | None:
+    """The index of the first mapping or list beyond `MAX_DEPTH`, or of the first value beyond `MAX_NODES`, with what it
+    is and what is legal: composing recurses, scanning slows with depth, and nodes take memory."""
+    depth, nodes = 0, 0
     for event in YAML(typ="safe", pure=True).parse(text):
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        nodes += isinstance(event, NodeEvent)
         if depth > MAX_DEPTH:
-            return int(event.start_mark.index)
+            return int(event.start_mark.index), "nested too deep", f"at most {MAX_DEPTH} levels"
+        if nodes > 2 * MAX_NODES:  # keys are nodes, too
+            return int(event.start_mark.index), "too many values", f"at most {MAX_NODES} values"
     return None
 
 
@@ -211,6 +220,8 @@ class _Builder:
     def build(self, node: Node, path: KeyPath, within: tuple[Node, ...]) -> Any:
         self.values[path] = here = self._place(node)
         self.nodes += 1
+        if len(self.problems) >= MAX_PROBLEMS:
+            return None
         if self.nodes > MAX_NODES:
             if self.nodes == MAX_NODES + 1:
                 self._problem("too many values", here, f"at most {MAX_NODES} values, aliases followed")
@@ -230,6 +241,8 @@ class _Builder:
     def _mapping(self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
+            if len(self.problems) >= MAX_PROBLEMS:
+                break
             at = self._place(key_node)
             key = self._key(key_node, at)
             if key is None:

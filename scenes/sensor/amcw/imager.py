@@ -20,8 +20,11 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.sensor.amcw import kernels, ranging
+from scenes.sensor.amcw.at_once import AtOnce
+from scenes.sensor.amcw.certainty import Engine
 from scenes.sensor.amcw.exposure import Exposure, exposure_of
 from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.amcw.linear import Window
 from scenes.sensor.amcw.unwrap import UnwrapTable, unwrap_table
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.decoded import Decoded
@@ -128,18 +131,13 @@ class AmcwImager:
 
     def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """The engine's joint bilateral filter: phasors and amplitudes (f, 3, h, w), and edge sums (f, h, w)."""
-        engine = self.camera.engine
         filtered = np.empty((len(amplitude), 3, *shape), f4)
         edge = np.empty((len(amplitude), *shape), f4)
         for f in range(len(amplitude)):
             kernels.joint_bilateral(
                 unit[:, f].reshape(2, *shape),
                 amplitude[f].reshape(shape),
-                self._window,
-                f4(engine.concentration.value),
-                f4(engine.dim_amplitude_units.value),
-                engine.drop_dim_neighbours.value,
-                engine.filter_on.value == "phasors",
+                *self.filter_settings,
                 filtered[f],
                 edge[f],
             )
@@ -153,19 +151,31 @@ class AmcwImager:
             filtered.reshape(n_frequencies, 3, -1),
             edge.reshape(n_frequencies, -1),
             saturated,
-            self._geometry,
-            self.outside_mask.reshape(-1),
-            self.unwrap.for_kernel,
-            self._gates,
-            f4(error_m),
+            self.engine.geometry,
+            self.engine.outside_mask,
+            self.engine.lattice,
+            self.engine.gates,
+            np.full(saturated.size, error_m, f4),
             z_m.reshape(-1),
             reason.reshape(-1),
             total.reshape(-1),
         )
-        if self._flying_gate:
-            ranging.gate_flying_pixels(z_m, total, reason, self._flying_gate)
+        if self.engine.flying:
+            ranging.gate_flying_pixels(z_m, total, reason, self.engine.flying)
         ranging.round_valid(z_m.reshape(-1), reason.reshape(-1), f4(self.camera.z_step_m))
         return Decoded(z_m, reason, total / f4(n_frequencies))
+
+    @cached_property
+    def filter_settings(self) -> tuple[np.ndarray, np.float32, np.float32, bool, bool]:
+        """`kernels.joint_bilateral`'s window, concentration, dim, drop_dim and by_amplitude."""
+        facts = self.camera.engine
+        return (
+            self._window,
+            f4(facts.concentration.value),
+            f4(facts.dim_amplitude_units.value),
+            facts.drop_dim_neighbours.value,
+            facts.filter_on.value == "phasors",
+        )
 
     @cached_property
     def _window(self) -> np.ndarray:
@@ -177,6 +187,25 @@ class AmcwImager:
         squared = np.arange(-half, half + 1) ** 2
         gauss = np.exp(-squared / (2 * engine.spatial_sigma_px.value**2))
         return np.asarray(np.outer(gauss, gauss), f4)
+
+    @cached_property
+    def engine(self) -> Engine:
+        """All that decides after the filter."""
+        return Engine(
+            self._geometry, self.outside_mask.reshape(-1), self.unwrap.for_kernel, self._gates, self._flying_gate
+        )
+
+    @cached_property
+    def linear_window(self) -> Window:
+        """The filter, as `scenes.sensor.amcw.linear` takes it."""
+        window, concentration, dim, drop_dim, by_amplitude = self.filter_settings
+        space = window.astype(float)
+        return Window(space, space.ravel(), float(concentration), float(dim), drop_dim, by_amplitude)
+
+    def at_once(self, exposure: Exposure, asked: np.ndarray) -> AtOnce | None:
+        """What sums frames of an exposure without drawing each, at the pixels ``asked`` (h, w) bool; None where only
+        frames will do."""
+        return AtOnce.of(self, exposure, asked)
 
     @cached_property
     def _geometry(self) -> np.ndarray:

@@ -166,7 +166,7 @@ def _residual_limit2(gates: Gates, greatest: np.float32) -> np.float32:
 
 @numba.njit(**FAST)
 def _gate(  # type: ignore[no-untyped-def]
-    start, stop, filtered, edge, saturated, geometry, outside_mask, gates, half, residual2, error_m, z_m, reason, total
+    start, stop, filtered, edge, saturated, geometry, outside_mask, gates, half, residual2, errors_m, z_m, reason, total
 ):
     """Pixels ``start`` to ``stop`` of `range_and_gates`; ``half`` and ``residual2`` of these from `half_path`."""
     n_frequencies = filtered.shape[0]
@@ -181,7 +181,7 @@ def _gate(  # type: ignore[no-untyped-def]
             greatest = max(greatest, a)
             sum_of_all += a
             steepest = max(steepest, edge[f, i])
-        path = half[i - start] + error_m
+        path = half[i - start] + errors_m[i]
         range_m = (np.float32(4) * path * path - geometry[1, i]) / (
             np.float32(4) * path - np.float32(2) * geometry[0, i]
         )
@@ -214,7 +214,7 @@ def range_and_gates(
     outside_mask: np.ndarray,
     lattice: Lattice,
     gates: Gates,
-    error_m: np.float32,
+    errors_m: np.ndarray,
     z_m: np.ndarray,
     reason: np.ndarray,
     total: np.ndarray,
@@ -222,8 +222,8 @@ def range_and_gates(
     """Filtered phasors (f, 3, n) to z in metres, with the first gate that each pixel fails and the sum of amplitudes.
 
     Half the path s of light from the emitter at e by the point at range r along the unit ray u is
-    (r + |r u - e|)/2, so r = (4 s^2 - e.e) / (4 s - 2 u.e). ``geometry`` (3, n) is u.e, e.e, u_z. ``error_m`` is added
-    to half the path in every pixel. z is written for invalid pixels too.
+    (r + |r u - e|)/2, so r = (4 s^2 - e.e) / (4 s - 2 u.e). ``geometry`` (3, n) is u.e, e.e, u_z. ``errors_m`` (n,) is
+    added to half the path. z is written for invalid pixels too.
     """
     n_frequencies, _, n = filtered.shape
     turn = np.empty((n_frequencies, BLOCK), np.float32)
@@ -246,7 +246,7 @@ def range_and_gates(
             gates,
             half,
             residual2,
-            error_m,
+            errors_m,
             z_m,
             reason,
             total,

@@ -1,0 +1,112 @@
+"""Compiled passes of the automatic crop: where neighbours lie on one surface, where it bends, and its largest part."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
+
+
+@numba.njit(**PLAIN)
+def _is_step(points_m: np.ndarray, a: tuple[int, int], b: tuple[int, int], tilt: float, noise_m: float) -> bool:
+    """Whether z changes between two pixels by more than a surface of that tilt and noise explain, or is missing."""
+    dx = points_m[b[0], b[1], 0] - points_m[a[0], a[1], 0]
+    dy = points_m[b[0], b[1], 1] - points_m[a[0], a[1], 1]
+    dz = points_m[b[0], b[1], 2] - points_m[a[0], a[1], 2]
+    return not abs(dz) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
+
+
+@numba.njit(**PLAIN)
+def links(points_m: np.ndarray, tilt: float, noise_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each of pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h, w)."""
+    h, w = points_m.shape[:2]
+    right, down = np.zeros((h, w), dtype=np.bool_), np.zeros((h, w), dtype=np.bool_)
+    for r in range(h):
+        for c in range(w):
+            if c + 1 < w:
+                right[r, c] = not _is_step(points_m, (r, c), (r, c + 1), tilt, noise_m)
+            if r + 1 < h:
+                down[r, c] = not _is_step(points_m, (r, c), (r + 1, c), tilt, noise_m)
+    return right, down
+
+
+@numba.njit(**PLAIN)
+def _root(parents: np.ndarray, i: int) -> int:
+    while parents[i] != i:
+        parents[i] = parents[parents[i]]
+        i = parents[i]
+    return i
+
+
+@numba.njit(**PLAIN)
+def largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the largest set of nodes (h, w) that are joined by links to the right and downwards (both (h, w)),
+    of equal ones the first in the order of the pixels."""
+    h, w = nodes.shape
+    parents = np.arange(h * w)
+    for r in range(h):
+        for c in range(w):
+            if not nodes[r, c]:
+                continue
+            if c > 0 and nodes[r, c - 1] and right[r, c - 1]:
+                ours, theirs = _root(parents, r * w + c), _root(parents, r * w + c - 1)
+                parents[max(ours, theirs)] = min(ours, theirs)
+            if r > 0 and nodes[r - 1, c] and down[r - 1, c]:
+                ours, theirs = _root(parents, r * w + c), _root(parents, (r - 1) * w + c)
+                parents[max(ours, theirs)] = min(ours, theirs)
+    sizes = np.zeros(h * w, dtype=np.int64)
+    for i in range(h * w):
+        # a parent comes before its children: one step leads to the root
+        parents[i] = parents[parents[i]]
+        if nodes[i // w, i % w]:
+            sizes[parents[i]] += 1
+    largest = np.argmax(sizes)
+    inside = np.zeros((h, w), dtype=np.bool_)
+    for r in range(h):
+        for c in range(w):
+            inside[r, c] = nodes[r, c] and parents[r * w + c] == largest
+    return inside
+
+
+@numba.njit(**PLAIN)
+def unit_normals(surface_m: np.ndarray) -> np.ndarray:
+    """(h, w, 3) of a surface given by its points (h, w, 3), by central differences; 0 where it has no area."""
+    h, w = surface_m.shape[:2]
+    normals = np.empty((h, w, 3))
+    for r in range(h):
+        up, low = max(r - 1, 0), min(r + 1, h - 1)
+        for c in range(w):
+            left, far = max(c - 1, 0), min(c + 1, w - 1)
+            ux = (surface_m[r, far, 0] - surface_m[r, left, 0]) / max(far - left, 1)
+            uy = (surface_m[r, far, 1] - surface_m[r, left, 1]) / max(far - left, 1)
+            uz = (surface_m[r, far, 2] - surface_m[r, left, 2]) / max(far - left, 1)
+            vx = (surface_m[low, c, 0] - surface_m[up, c, 0]) / max(low - up, 1)
+            vy = (surface_m[low, c, 1] - surface_m[up, c, 1]) / max(low - up, 1)
+            vz = (surface_m[low, c, 2] - surface_m[up, c, 2]) / max(low - up, 1)
+            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            length = max(np.sqrt(x * x + y * y + z * z), 1e-15)
+            normals[r, c, 0], normals[r, c, 1], normals[r, c, 2] = x / length, y / length, z / length
+    return normals
+
+
+@numba.njit(**PLAIN)
+def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
+    """(h, w) bool: unit normals ``half`` pixels to the left and right, or above and below, enclose a wider angle."""
+    h, w = normals.shape[:2]
+    turned = np.zeros((h, w), dtype=np.bool_)
+    for r in range(h):
+        for c in range(w):
+            if half <= c < w - half:
+                cosine = 0.0
+                for k in range(3):
+                    cosine += normals[r, c + half, k] * normals[r, c - half, k]
+                turned[r, c] = cosine < least_cosine
+            if half <= r < h - half:
+                cosine = 0.0
+                for k in range(3):
+                    cosine += normals[r + half, c, k] * normals[r - half, c, k]
+                turned[r, c] |= cosine < least_cosine
+    return turned

@@ -1,0 +1,143 @@
+"""``python -m harness.clean``: remove stored renders, or folders of results. Asks before it removes anything."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from pathlib import Path
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake."""
+    options = _parser().parse_args(arguments)
+    return exit_code_of(lambda: int(options.run(options)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.clean",
+        description="Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
+        "followed, and what a running sweep uses is left alone.",
+        epilog="examples: python -m harness.clean cache --limit 5GB; python -m harness.clean cache --older-than 30d; "
+        "python -m harness.clean results averaging/69346a82f4194e03 --journal-only --dry-run",
+    )
+    parts = parser.add_subparsers(required=True, metavar="cache|results")
+    cache = parts.add_parser("cache", help="renders; each is rendered again when it is needed")
+    cache.add_argument("--limit", metavar="SIZE", help="the longest unused go until the rest fits, such as 5GB")
+    cache.add_argument("--older-than", metavar="AGE", help="those not used for so long, such as 12h, 30d or 4w")
+    cache.add_argument("--damaged", action="store_true", help="those that cannot be read")
+    cache.add_argument("--all", action="store_true", help="all of them")
+    cache.set_defaults(run=_clean_cache)
+    results = parts.add_parser("results", help="one folder of results, or all of an experiment")
+    results.add_argument("name", metavar="NAME[/DIGEST]", help="as python -m harness.ls results names it")
+    results.add_argument(
+        "--journal-only", action="store_true", help="only the records of trials: tables and report stay"
+    )
+    results.set_defaults(run=_clean_results)
+    for part in (cache, results):
+        part.add_argument(
+            "--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)"
+        )
+        part.add_argument("--dry-run", action="store_true", help="say what would be removed; remove nothing")
+        part.add_argument("--yes", action="store_true", help="do not ask")
+    return parser
+
+
+def _clean_cache(options: argparse.Namespace) -> int:
+    from harness.listing.removal import cache_removal, checked_inside
+    from harness.listing.renders import cache_folder
+    from harness.listing.text import bytes_of, seconds_of, size_text
+    from scenes.render.store import alone, removed
+
+    limit = None if options.limit is None else bytes_of(options.limit)
+    older_s = None if options.older_than is None else seconds_of(options.older_than)
+    if limit is None and older_s is None and not options.damaged and not options.all:
+        raise UserError(
+            "nothing is said of which renders go", legal="--limit SIZE, --older-than AGE, --damaged, --all; or several"
+        )
+    folder = cache_folder(options.out)
+    if not folder.is_dir():
+        print(f"{folder}: there is no cache")
+        return 0
+    checked_inside(options.out, folder)
+    with nullcontext() if options.dry_run else alone(folder):
+        wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
+        size = sum(one.size_bytes for one in wanted)
+        if not _agreed(options, f"{_files(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
+            return 0 if options.dry_run or not wanted else 1
+        gone = removed(wanted)
+    return _concluded(len(gone), len(wanted), sum(one.size_bytes for one in gone))
+
+
+def _clean_results(options: argparse.Namespace) -> int:
+    from harness.listing.removal import chosen_results, removable, remove_files
+    from harness.listing.text import size_text
+
+    folders = chosen_results(options.out, options.name)
+    with ExitStack() as held:
+        for folder in folders:
+            if not options.dry_run:
+                held.enter_context(_held(folder))
+        files = [one for folder in folders for one in removable(folder, journal_only=options.journal_only)]
+        size = sum(one.size_bytes for one in files)
+        for folder in folders:
+            print(folder)
+        what = "records of trials" if options.journal_only else "files"
+        if not _agreed(
+            options, f"{len(files)} {what} in {_files(len(folders), 'folder')}, {size_text(size)}", len(files)
+        ):
+            return 0 if options.dry_run or not files else 1
+        gone = remove_files(folders, files)
+    for folder in folders:
+        if not options.journal_only and folder.exists():
+            print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
+    return _concluded(len(gone), len(files), sum(one.size_bytes for one in gone))
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold a folder of results. Raises UserError where a sweep does, or where it cannot be written."""
+    from harness.engine.lock import locked
+
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(folder))
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
+        yield
+
+
+def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
+    """Whether to go on. Raises UserError where nobody can be asked."""
+    if options.dry_run or not count:
+        print(f"would remove {what}" if count else "nothing to remove")
+        return False
+    if options.yes:
+        return True
+    if not sys.stdin.isatty():
+        raise UserError(f"this would remove {what}", fix="say --yes where nobody can be asked, or --dry-run to look")
+    try:
+        return input(f"remove {what}? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
+
+
+def _concluded(gone: int, wanted: int, freed: int) -> int:
+    from harness.listing.text import size_text
+
+    print(f"removed {_files(gone, 'file')}, {size_text(freed)}")
+    if gone < wanted:
+        print(f"{_files(wanted - gone, 'file')} could not be removed", file=sys.stderr)
+    return 0 if gone == wanted else 1
+
+
+def _files(count: int, what: str) -> str:
+    return f"{count} {what}" + ("" if count == 1 else "s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""One sweep at a time in a folder of results: the lock is the system's, so a process that dies gives it back, and no
+clock is asked."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from harness.engine.shard import WHOLE, Shard
+from harness.vocabulary.errors import UserError
+
+LOCK = ".lock"
+NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS}
+"""What a file system without locks answers."""
+
+
+@contextlib.contextmanager
+def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
+    """Hold a folder that exists. A whole sweep holds it alone; shards share it, but each part is run once at a time.
+
+    Raises UserError where another process holds it. On systems without such locks (Windows, some network file systems)
+    nothing is held, which is told on stderr.
+    """
+    with contextlib.ExitStack() as held:
+        if shard.is_whole:
+            held.enter_context(_held(folder / LOCK, shared=False))
+        else:
+            held.enter_context(_held(folder / LOCK, shared=True))
+            held.enter_context(_held(folder / f"{LOCK}-{shard.number}-of-{shard.count}", shared=False))
+        yield
+
+
+@contextlib.contextmanager
+def _held(path: Path, *, shared: bool) -> Iterator[None]:
+    try:
+        import fcntl
+    except ImportError:
+        print(f"{path.parent}: is not locked, as this system cannot: start no second sweep in it", file=sys.stderr)
+        yield
+        return
+    with open(path, "a+") as file:
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError(
+                f"{path.parent}: another sweep is at work in this folder{_who(file)}",
+                fix="wait for it, or name another folder with --out",
+            ) from error
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            print(f"{path.parent}: is not locked, as its file system cannot: start no second sweep", file=sys.stderr)
+        if not shared:
+            file.truncate(0)
+            file.write(f"{os.getpid()}\n")
+            file.flush()
+        yield
+
+
+def _who(file: IO[str]) -> str:
+    file.seek(0)
+    said = file.read(20).strip()
+    return f" (process {said})" if said.isdigit() else ""

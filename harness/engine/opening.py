@@ -1,0 +1,43 @@
+"""Which engine runs a sweep, by what the user asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from harness.engine.shard import WHOLE, Shard
+from harness.engine.work import Engine, Limits
+
+DEFAULT_TIME_LIMIT_S = 900.0
+"""A trial takes seconds at most; a hang should not take a night."""
+DEFAULT_MEMORY_MB = 4000
+"""A trial takes some 300 MB, maps of many views up to 2 GB."""
+DEFAULT_LIMITS = Limits(DEFAULT_TIME_LIMIT_S, DEFAULT_MEMORY_MB)
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """``jobs``: processes, or workers that a cluster is asked for. ``scheduler``: address of one, or jobqueue:slurm and
+    the like; None: this machine. ``serial``: in this process."""
+
+    jobs: int = 2
+    limits: Limits = DEFAULT_LIMITS
+    scheduler: str | None = None
+    serial: bool = False
+    shard: Shard = WHOLE
+    retry_failed: bool = False
+    cache_limit_gb: float | None = None
+
+
+def engine_of(options: EngineOptions) -> Engine:
+    """The engine, not yet begun. Raises UserError where it is not installed or does not answer."""
+    if options.scheduler is not None:
+        from harness.engine.cluster import ClusterEngine
+
+        return ClusterEngine(options.scheduler, options.limits, options.jobs)
+    if options.serial:
+        from harness.engine.serial import SerialEngine
+
+        return SerialEngine()
+    from harness.engine.processes import LocalEngine
+
+    return LocalEngine(options.jobs, options.limits)

@@ -1,0 +1,128 @@
+"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended.
+
+An engine runs jobs somewhere: in this process, in processes of this machine, on a cluster. It never decides what is
+to be done, and it loses nothing: a job that raises, kills its process, hangs or eats the memory comes back as such, and
+takes no other with it.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+from harness.vocabulary.errors import UserError
+
+State = Literal["done", "failed", "crashed", "timed out", "skipped"]
+"""How a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by the time limit;
+skipped: it was never begun, because what it needs is not there."""
+STATES: tuple[State, ...] = get_args(State)
+Stage = Literal["renders", "trials"]
+"""Renders load Mitsuba and some 2 GB; everything else runs where trials run."""
+
+TRACEBACK_CHARACTERS = 4000
+"""Of a traceback, its end."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """``function(*arguments)``, somewhere. The function is importable by its name; arguments and result are plain data
+    or frozen dataclasses. ``needs``: stored views that it reads."""
+
+    name: str
+    stage: Stage
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    needs: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended. ``why``: of a user's mistake its message, of a bug (``is_bug``) the end of its traceback.
+    ``seconds``: of the work itself; ``peak_mb``: resident memory at most, 0 where unknown; ``worker``: who did it."""
+
+    state: State
+    value: Any = None
+    why: str = ""
+    is_bug: bool = False
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    worker: str = ""
+
+    def result(self) -> Any:
+        """The value; where there is none, the mistake or the bug as an exception here."""
+        if self.state == "done":
+            return self.value
+        raise RuntimeError(f"{self.state}: {self.why}") if self.is_bug else UserError(f"{self.state}: {self.why}")
+
+
+class Engine(Protocol):
+    """What runs jobs. Used as a context: left by an exception it drops what is under way, within two seconds."""
+
+    def __enter__(self) -> Engine:
+        """Start."""
+        ...
+
+    def __exit__(self, *error: object) -> None:
+        """End; jobs under way are dropped."""
+        ...
+
+    def room(self, stage: Stage) -> int:
+        """How many more jobs of a stage can be of use to it now: its queue stays short, whatever the plan's size."""
+        ...
+
+    def submit(self, job: Job) -> None:
+        """Take a job."""
+        ...
+
+    def ended(self) -> list[tuple[Job, Ended]]:
+        """Wait for jobs to end; at least one. Raises UserError where the engine itself is gone."""
+        ...
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a job may take: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: as much as it likes."""
+
+    seconds: float | None = None
+    memory_mb: int | None = None
+
+
+def attempt(job: Job, worker: str) -> Ended:
+    """Run a job here; whatever it raises is how it ended. What ends the process is the engine's to notice."""
+    _reset_peak()
+    began = time.monotonic()
+    state: State = "failed"
+    value, why, is_bug = None, "", False
+    try:
+        value = job.function(*job.arguments)
+        state = "done"
+    except UserError as mistake:
+        why = str(mistake)
+    except MemoryError:
+        why = "out of memory: it wants more than its worker may have (--memory-limit)"
+    except Exception as error:
+        why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
+    return Ended(state, value, why, is_bug, time.monotonic() - began, _peak_mb(), worker)
+
+
+def _reset_peak() -> None:
+    """Let the system count the peak of memory anew (Linux); elsewhere the peak is the process' so far."""
+    try:
+        with open("/proc/self/clear_refs", "w") as counter:
+            counter.write("5")
+    except OSError:
+        pass
+
+
+def _peak_mb() -> float:
+    """Resident memory at most since the last reset, MB."""
+    try:
+        with open("/proc/self/status") as lines:
+            (high,) = (line for line in lines if line.startswith("VmHWM"))
+        return round(int(high.split()[1]) * 1024 / 1e6, 1)
+    except (OSError, ValueError):
+        return 0.0

@@ -1,0 +1,144 @@
+"""``python -m harness.merge``: join the journals of shards and machines into one folder of results."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.engine.journal import Entry, Journal
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
+    options = _parser().parse_args(arguments)
+    return exit_code_of(lambda: _run(options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.merge",
+        description="Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
+        "another. Nothing is run; where a trial is in several, one that is done counts.",
+        epilog="example: python -m harness.merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
+        "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
+    )
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder with a journal")
+    parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
+    return parser
+
+
+@dataclass
+class Merged:
+    """What was copied, and what was wrong with the rest; ``different``: keys whose results are not alike."""
+
+    copied: int = 0
+    known: int = 0
+    damaged: list[Path] = field(default_factory=list)
+    different: list[str] = field(default_factory=list)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from harness.engine.journal import Journal
+    from harness.engine.lock import locked
+    from harness.vocabulary.files import write_text
+
+    _refuse_others(options.folders, options.into)
+    merged = Merged()
+    declared = next((path for folder in options.folders if (path := folder / "experiment.yaml").is_file()), None)
+    if declared is not None and not (options.into / "experiment.yaml").exists():
+        write_text(options.into / "experiment.yaml", declared.read_text())
+    options.into.mkdir(parents=True, exist_ok=True)
+    with locked(options.into):
+        into = Journal(options.into / "journal")
+        for folder in options.folders:
+            before = merged.copied
+            merge_into(into, Journal(folder / "journal"), merged)
+            print(f"{folder}: {merged.copied - before} trials copied")
+    return _told(merged, into)
+
+
+def merge_into(into: Journal, other: Journal, merged: Merged) -> None:
+    """Copy what ``into`` lacks, or has not done. Raises UserError where a newer tofpod wrote either."""
+    from harness.engine.journal import read_entry
+
+    for key, path in other.entries():
+        entry = read_entry(path, key)
+        if entry is None:
+            merged.damaged.append(path)
+            continue
+        known = into.read(key)
+        if known is None or (known.state != "done" and entry.state == "done"):
+            into.write(key, entry)
+            merged.copied += 1
+            continue
+        merged.known += 1
+        both_done = known.state == entry.state == "done"
+        if both_done and known.text != entry.text and _numbers(known) != _numbers(entry):
+            merged.different.append(key)
+
+
+def _numbers(entry: Entry) -> object:
+    """A record without its timings, which no two runs have in common."""
+    return _without_seconds(entry.record)
+
+
+def _without_seconds(value: object) -> object:
+    if isinstance(value, dict):
+        return {name: _without_seconds(one) for name, one in value.items() if not name.startswith("seconds")}
+    if isinstance(value, list):
+        return [_without_seconds(one) for one in value]
+    return value
+
+
+def _refuse_others(folders: list[Path], into: Path) -> None:
+    """Only journals of one experiment belong together; its folder's name is its digest."""
+    for folder in folders:
+        if not (folder / "journal").is_dir():
+            raise UserError(
+                f"{folder}: has no journal",
+                legal="folders such as results/averaging/0123456789abcdef, that a sweep has written",
+                fix="python -m harness.ls results lists them",
+            )
+        if folder.resolve() == into.resolve():
+            raise UserError(f"{folder}: is the folder to merge into", fix="name it with --into only")
+    names = {"/".join(folder.resolve().parts[-2:]) for folder in folders}
+    if len(names) > 1:
+        raise UserError(
+            f"these are results of different experiments: {', '.join(sorted(names))}",
+            legal="folders whose last two names are alike: the experiment's name and its digest",
+            fix="merge those of each experiment by themselves",
+        )
+    (name,) = names
+    if "/".join(into.resolve().parts[-2:]) != name:
+        raise UserError(
+            f"--into {into}: results of {name} are looked for in a folder of that name",
+            fix=f"--into {into}/{name}, and --out {into} for the sweep",
+        )
+
+
+def _told(merged: Merged, into: Journal) -> int:
+    print(f"{into.folder}: {merged.copied} trials copied, {merged.known} were there")
+    if merged.damaged:
+        some = ", ".join(str(path) for path in merged.damaged[:3])
+        print(f"{len(merged.damaged)} damaged or older records left out, to be run again: {some}", file=sys.stderr)
+    if merged.different:
+        some = ", ".join(merged.different[:3])
+        print(
+            f"{len(merged.different)} trials have different results in different folders, the first copied was kept: "
+            f"{some}. The machines do not compute alike (other processors, or versions?)",
+            file=sys.stderr,
+        )
+        return 1
+    out = into.folder.parent.parent.parent
+    print(f"next: the sweep's command without --shard, with --out {out}: it runs what is missing and writes the report")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

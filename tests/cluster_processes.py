@@ -1,0 +1,124 @@
+"""A scheduler and workers as processes of their own, as a user starts them; and jobs that misbehave."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+HOLD = 60.0
+"""Seconds, generous: what must have started or ended by then."""
+
+
+class Processes:
+    """A scheduler, and workers that come and go; all end with the context."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._file = folder / "scheduler.json"
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", self._file)
+        self.workers: list[subprocess.Popen[bytes]] = []
+        until(lambda: self._file.exists() and self._file.stat().st_size > 0)
+
+    @property
+    def address(self) -> str:
+        return str(json.loads(self._file.read_text())["address"])
+
+    def worker(self, *options: str, search: Path = ROOT) -> subprocess.Popen[bytes]:
+        """``search``: where tofpod is."""
+        local = ["--local-directory", self.folder / "scratch"]
+        given = ["--scheduler-file", self._file, "--nthreads", "1", "--host", "127.0.0.1", *local, *options]
+        self.workers.append(self._start("worker", *given, search=search))
+        return self.workers[-1]
+
+    def _start(self, kind: str, *options: object, search: Path = ROOT) -> subprocess.Popen[bytes]:
+        folders = os.pathsep.join([str(search), str(ROOT / "tests")])
+        log = open(self.folder / f"{kind}.log", "ab")  # noqa: SIM115 (the process has its own)
+        command = [sys.executable, "-m", "distributed.cli.dask_" + kind, *map(str, options), "--no-dashboard"]
+        environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
+        return subprocess.Popen(command, cwd=self.folder, env=environment, stdout=log, stderr=log)
+
+    def close(self) -> None:
+        for process in [*self.workers, self.scheduler]:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        for process in [*self.workers, self.scheduler]:
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+@contextmanager
+def processes(folder: Path) -> Iterator[Processes]:
+    """A scheduler without workers."""
+    folder.mkdir(parents=True, exist_ok=True)
+    started = Processes(folder)
+    try:
+        yield started
+    finally:
+        started.close()
+
+
+def until(holds, seconds: float = HOLD) -> None:
+    """Wait for something to hold."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.05)
+
+
+# ---------------------------------------------------------------- jobs
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def slow_square(number: int, seconds: float) -> int:
+    time.sleep(seconds)
+    return number * number
+
+
+def raises(number: int) -> int:
+    raise ValueError(f"no such number: {number}")
+
+
+def kill_own_process() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def hang() -> None:
+    while True:
+        time.sleep(0.05)
+
+
+def hold_the_interpreter() -> int:
+    return sum(itertools.repeat(0))  # one call of C that never ends: no other thread runs again
+
+
+def eat(megabytes: int) -> int:
+    held = []
+    for _ in range(megabytes // 10):
+        held.append(bytes(range(250)) * 40_000)
+        time.sleep(0.02)
+    return len(held)
+
+
+def loaded() -> list[str]:
+    return sorted(name for name in ("mitsuba", "drjit") if name in sys.modules)
+
+
+def note_and_sleep(path: str, seconds: float) -> int:
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(seconds)
+    return 0

@@ -1,0 +1,24 @@
+"""A plan run in the test's own process, where patches hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from harness.engine.journal import Journal
+from harness.engine.outcome import Outcome
+from harness.engine.plan import Plan
+from harness.engine.run import run_plan
+from harness.engine.serial import SerialEngine
+
+
+def run_serially(plan: Plan, folder: Path, **asked: Any) -> Outcome:
+    """Run what the journal in ``folder`` lacks."""
+    with SerialEngine() as engine:
+        return run_plan(plan, Journal(folder), engine, lambda _: None, **asked)
+
+
+def records_of(folder: Path, outcome: Outcome) -> list[dict[str, Any]]:
+    """Of all finished trials, in order of their keys."""
+    entries = [Journal(folder).read(key) for key in outcome.finished]
+    return [entry.record for entry in entries if entry is not None and entry.record is not None]

@@ -1,0 +1,349 @@
+"""Sweeps on a cluster: a scheduler and workers as processes of their own, faults included."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("distributed")
+
+from cluster_processes import (
+    HOLD,
+    ROOT,
+    Processes,
+    eat,
+    hang,
+    hold_the_interpreter,
+    kill_own_process,
+    loaded,
+    note_and_sleep,
+    processes,
+    raises,
+    slow_square,
+    square,
+    until,
+)
+from serial_run import records_of, run_serially
+from test_engine import TINY
+
+from harness.engine import cluster as cluster_engine
+from harness.engine import cluster_link
+from harness.engine.cluster import ClusterEngine
+from harness.engine.journal import Journal
+from harness.engine.plan import plan_of
+from harness.engine.rendering import render_into_cache
+from harness.engine.run import run_plan
+from harness.engine.serial import SerialEngine
+from harness.engine.setup import load_set_up
+from harness.engine.work import Ended, Engine, Job, Limits
+from harness.experiment.load import load_experiment
+from harness.vocabulary.errors import UserError
+from scenes.render.cache import read_view
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Two workers with nannies, which replace what dies."""
+    with processes(tmp_path_factory.mktemp("cluster")) as started:
+        started.worker("--nworkers", "2", "--memory-limit", "1GB")
+        yield started
+
+
+def run(engine: Engine, jobs: Iterable[Job]) -> dict[str, Ended]:
+    """Each job's end, by name."""
+    waiting, under_way, ended = list(jobs)[::-1], 0, {}
+    while waiting or under_way:
+        while waiting and engine.room(waiting[-1].stage) > 0:
+            engine.submit(waiting.pop())
+            under_way += 1
+        for job, how in engine.ended():
+            assert job.name not in ended, "a job ended twice"
+            ended[job.name] = how
+            under_way -= 1
+    return ended
+
+
+def squares(count: int, name: str = "square") -> list[Job]:
+    return [Job(f"{name} {n}", "trials", square, (n,)) for n in range(count)]
+
+
+NO_LIMITS = Limits()
+
+
+def engine_at(cluster: Processes, limits: Limits = NO_LIMITS) -> ClusterEngine:
+    return ClusterEngine(cluster.address, limits, 2)
+
+
+def test_results_are_those_of_this_process(cluster):
+    jobs = [*squares(300), Job("bad", "trials", raises, (7,))]
+    with SerialEngine() as serial:
+        here = run(serial, jobs)
+    with engine_at(cluster) as engine:
+        there = run(engine, jobs)
+    assert {name: (how.state, how.value, how.is_bug) for name, how in there.items()} == {
+        name: (how.state, how.value, how.is_bug) for name, how in here.items()
+    }
+    assert "ValueError: no such number: 7" in there["bad"].why
+    assert {how.worker.partition(":")[0] for how in there.values()} == {"127.0.0.1"}
+    assert len({how.worker for how in there.values()}) == 2
+
+
+def test_the_queue_stays_short_whatever_the_plan(cluster):
+    with engine_at(cluster) as engine:
+        taken = 0
+        while engine.room("trials") > 0:
+            engine.submit(Job(f"slow {taken}", "trials", slow_square, (taken, 0.3)))
+            taken += 1
+        assert taken < 20
+        ended = []
+        while len(ended) < taken:
+            ended += engine.ended()
+
+
+def test_a_job_that_kills_its_worker_costs_itself_only(cluster):
+    jobs = [*squares(60, "before"), Job("killer", "trials", kill_own_process, ()), *squares(60, "after")]
+    with engine_at(cluster) as engine:
+        ended = run(engine, jobs)
+    killer = ended.pop("killer")
+    assert killer.state == "crashed" and "its worker died" in killer.why
+    assert len(ended) == 120
+    assert all(how.state == "done" and how.value == int(name.split()[1]) ** 2 for name, how in ended.items())
+
+
+def test_a_worker_killed_from_outside_costs_nothing_among_others(cluster, tmp_path):
+    jobs = [*squares(40), Job("slow", "trials", note_and_sleep, (str(tmp_path / "pid"), 1.0)), *squares(40, "after")]
+    with engine_at(cluster) as engine:
+        for job in jobs:
+            engine.submit(job)
+        ended: dict[str, Ended] = {}
+        import threading
+
+        def kill() -> None:
+            until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+            os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+
+        killing = threading.Thread(target=kill)
+        killing.start()
+        while len(ended) < len(jobs):
+            ended |= {job.name: how for job, how in engine.ended()}
+        killing.join()
+    others = {name: how.state for name, how in ended.items() if name != "slow"}
+    assert set(others.values()) == {"done"} and len(others) == 80
+    assert ended["slow"].state in ("done", "crashed")  # crashed if by chance it was alone with its worker
+
+
+def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
+    jobs = [*squares(20, "before"), Job("endless", "trials", hang, ()), *squares(200, "after")]
+    with engine_at(cluster, Limits(seconds=2.0)) as engine:
+        ended = run(engine, jobs)
+        again = run(engine, squares(30))
+    endless = ended.pop("endless")
+    assert endless.state == "timed out" and "in hang" in endless.why and "--time-limit" in endless.why
+    assert {how.state for how in ended.values()} == {"done"}
+    assert {how.state for how in again.values()} == {"done"}
+
+
+def test_a_job_that_stops_its_whole_process_is_ended_by_the_nanny(cluster, monkeypatch):
+    monkeypatch.setattr(cluster_engine, "GRACE_S", 2.0)
+    monkeypatch.setattr(cluster_link, "ENDS_S", 1.0)
+    with engine_at(cluster, Limits(seconds=1.0)) as engine:
+        ended = run(engine, [Job("endless", "trials", hold_the_interpreter, ()), *squares(100)])
+        endless = ended.pop("endless")
+        assert endless.state == "timed out" and "does not answer" in endless.why
+        assert {how.state for how in ended.values()} == {"done"}
+
+
+def test_a_job_that_eats_memory_ends_with_its_worker_and_says_why(cluster):
+    jobs = [*squares(20, "before"), Job("hungry", "trials", eat, (3000,)), *squares(20, "after")]
+    with engine_at(cluster) as engine:
+        ended = run(engine, jobs)
+    hungry = ended.pop("hungry")
+    assert hungry.state == "crashed" and "--memory-limit" in hungry.why
+    assert {how.state for how in ended.values()} == {"done"}
+
+
+def test_a_limit_of_memory_is_told_before_the_nanny_acts(cluster):
+    with engine_at(cluster, Limits(memory_mb=600)) as engine:
+        ended = run(engine, [*squares(5), Job("hungry", "trials", eat, (3000,))])
+    assert ended["hungry"].state == "failed" and "out of memory" in ended["hungry"].why
+    assert ended["square 4"].value == 16
+
+
+def test_the_scheduler_gone_is_a_clear_message(tmp_path):
+    with processes(tmp_path / "mortal") as mortal:
+        mortal.worker("--no-nanny")
+        with pytest.raises(UserError, match="is gone") as told, engine_at(mortal) as engine:
+            engine.submit(Job("slow", "trials", slow_square, (1, 1.0)))
+            engine.submit(Job("slower", "trials", slow_square, (1, HOLD)))
+            assert [job.name for job, _ in engine.ended()] == ["slow"]
+            mortal.scheduler.kill()
+            engine.ended()
+        assert "finished trials are kept" in str(told.value.fix)
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "message"),
+    [
+        ("tcp://127.0.0.1:1", "does not answer"),
+        ("localhost:8786", "neither an address nor a kind"),
+        ("jobqueue:cloud", "neither an address nor a kind"),
+        ("jobqueue:slurm", "could not start a cluster of kind slurm"),
+    ],
+)
+def test_what_cannot_be_reached(scheduler, message):
+    with pytest.raises(UserError, match=message), ClusterEngine(scheduler, Limits(), 2):
+        pass
+
+
+def test_a_worker_with_other_code_is_refused(tmp_path):
+    other = tmp_path / "other"
+    for room in ("harness", "scenes", "detectors"):
+        shutil.copytree(ROOT / room, other / room, ignore=shutil.ignore_patterns("__pycache__"))
+    with open(other / "detectors" / "average.py", "a") as changed:
+        changed.write("\n# another version\n")
+    with processes(tmp_path / "cluster") as old:
+        old.worker("--no-nanny", search=other)
+        with pytest.raises(UserError, match="another version of tofpod"), engine_at(old):
+            pass
+
+
+def test_a_cluster_of_dask_jobqueue(tmp_path):
+    pytest.importorskip("dask_jobqueue")
+    local = {"cores": 1, "processes": 1, "memory": "1GB", "python": sys.executable}
+    (tmp_path / "jobqueue.yaml").write_text(json.dumps({"jobqueue": {"local": local}}))
+    code = (
+        "from cluster_processes import square\n"
+        "from harness.engine.cluster import ClusterEngine\n"
+        "from harness.engine.work import Job, Limits\n"
+        "if __name__ == '__main__':\n"
+        "    with ClusterEngine('jobqueue:local', Limits(), 1) as engine:\n"
+        "        engine.submit(Job('one', 'trials', square, (12,)))\n"
+        "        print(engine.ended()[0][1].value)\n"
+    )
+    search = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    environment = {**os.environ, "DASK_CONFIG": str(tmp_path), "PYTHONPATH": search}
+    (tmp_path / "one.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, "one.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=HOLD
+    )
+    assert done.stdout.split() == ["144"], done.stderr
+
+
+# ---------------------------------------------------------------- renders, and whole sweeps
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("experiment") / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+def renders_and_set_ups(experiment: Path, cache: Path) -> tuple[list[Job], list[Job]]:
+    plan = plan_of(load_experiment(experiment), cache)
+    renders = [
+        Job(
+            job.path.name,
+            "renders",
+            render_into_cache,
+            (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder)),
+        )
+        for job in plan.renders
+    ]
+    views = [view for group in plan.groups for batch in group.batches for view in batch.views]
+    loads = [
+        Job(f"load {n} {again}", "trials", load_set_up, (view.set_up,), (view.render.path,))
+        for n, view in enumerate(views)
+        for again in range(4)
+    ]
+    return renders, loads
+
+
+@pytest.mark.parametrize("is_seen", [True, False], ids=["shared", "apart"])
+def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tmp_path, monkeypatch, is_seen, capsys):
+    # a relative folder is another one for workers that were started elsewhere
+    monkeypatch.chdir(tmp_path)
+    cache = tmp_path / "cache" if is_seen else Path("cache")
+    renders, loads = renders_and_set_ups(experiment, cache)
+    with engine_at(cluster, Limits(seconds=HOLD)) as engine:
+        rendered = run(engine, renders)
+        again = run(engine, renders[:1])
+        ended = run(engine, loads)
+        looks = run(engine, [Job(f"look {n}", "trials", loaded, ()) for n in range(40)])
+    assert [how.state for how in rendered.values()] == ["done", "done"], rendered
+    assert [how.value[0] for how in rendered.values()] == [False, False]
+    assert again[renders[0].name].value[0] is True
+    assert all(read_view(Path("cache") / job.name) is not None for job in renders)
+    assert {how.state for how in ended.values()} == {"done"}, ended
+    assert len({how.worker for how in looks.values()}) == 2
+    assert all(how.value == [] for how in looks.values()), "a worker loaded Mitsuba"
+    assert ("renders are sent over the network" in capsys.readouterr().err) == (not is_seen)
+    assert not list(Path("cache").glob(".seen-*"))
+
+
+def test_a_render_that_fails_or_kills_its_process_costs_itself(cluster, tmp_path):
+    jobs = [
+        Job("dies.npz", "renders", kill_own_process, (str(tmp_path),)),
+        Job("fails.npz", "renders", raises, (str(tmp_path),)),
+        *squares(20),
+    ]
+    jobs[0] = Job("dies.npz", "renders", die_in, (str(tmp_path),))
+    with engine_at(cluster) as engine:
+        ended = run(engine, jobs)
+        again = run(engine, squares(20))
+    assert ended["dies.npz"].state == "crashed" and "signal 9" in ended["dies.npz"].why
+    assert ended["fails.npz"].state == "failed" and "no such number" in ended["fails.npz"].why
+    assert {how.state for name, how in ended.items() if "npz" not in name} == {"done"}
+    assert {how.state for how in again.values()} == {"done"}
+
+
+def die_in(folder: str) -> None:
+    kill_own_process()
+
+
+def sweep_command(experiment: Path, out: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", "harness.sweep", str(experiment), "--out", out, *arguments]
+
+
+def test_a_plan_gives_the_same_records_on_a_cluster_that_shares_nothing(cluster, experiment, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    declared, here_at, there_at = load_experiment(experiment), tmp_path / "journal here", tmp_path / "journal there"
+    with engine_at(cluster) as engine:
+        there = run_plan(plan_of(declared, Path("cache")), Journal(there_at), engine, lambda _: None)
+    here = run_serially(plan_of(declared, tmp_path / "cache"), here_at)
+    assert not there.failures and there.renders.over == 2 and len(there.examples) == len(here.examples) == 2
+    assert here.renders.found == 2, "what was rendered there is not in the cache here"
+    assert there.finished == here.finished and len(here.finished) == 4
+    assert without_seconds(records_of(here_at, here)) == without_seconds(records_of(there_at, there))
+
+
+def without_seconds(value: object) -> object:
+    """What trials found, timings apart."""
+    if isinstance(value, dict):
+        return {key: without_seconds(one) for key, one in value.items() if not str(key).startswith("seconds")}
+    return [without_seconds(one) for one in value] if isinstance(value, list) else value
+
+
+def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    more = ("--set", "repeats=400", "--scheduler", cluster.address)
+    command = sweep_command(experiment, "out", *more)
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    ended: Callable[[], list[Path]] = lambda: list(tmp_path.rglob("journal/*/damaged*.jsonl"))  # noqa: E731
+    until(lambda: len(ended()) > 2 or process.poll() is not None, 2 * HOLD)
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    _, said = process.communicate(timeout=HOLD)
+    print(f"left after {time.monotonic() - began:.2f} s")
+    assert process.returncode == 130, said
+    assert "Traceback" not in said and "--scheduler" in said
+    assert len(ended()) > 2

@@ -1,0 +1,145 @@
+"""The local engine: each job comes back with how it ended, and takes no other with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import faulty_jobs
+import pytest
+
+from harness.engine.processes import LocalEngine
+from harness.engine.serial import SerialEngine
+from harness.engine.work import STATES, Ended, Engine, Job, Limits, attempt
+from harness.vocabulary.errors import UserError
+
+
+def run(engine: Engine, jobs: list[Job]) -> dict[str, Ended]:
+    """All jobs, by name."""
+    waiting, found = list(jobs), {}
+    with engine:
+        while len(found) < len(jobs):
+            while waiting and engine.room(waiting[0].stage) > 0:
+                engine.submit(waiting.pop(0))
+            found.update({job.name: ended for job, ended in engine.ended()})
+    return found
+
+
+def doubles(count: int) -> list[Job]:
+    return [Job(f"double {n}", "trials", faulty_jobs.double, (n,)) for n in range(count)]
+
+
+def job(function: object) -> Job:
+    return Job(function.__name__, "trials", function, ())  # type: ignore[attr-defined, arg-type]
+
+
+def test_every_fault_costs_its_own_job_only():
+    faults = [
+        job(faulty_jobs.raises),
+        job(faulty_jobs.refuses),
+        job(faulty_jobs.kills_its_process),
+        job(faulty_jobs.aborts),
+        job(faulty_jobs.hangs),
+        job(faulty_jobs.eats_memory),
+    ]
+    innocent = doubles(30)
+    jobs = [one for pair in zip(faults, innocent[: len(faults)], strict=True) for one in pair] + innocent[len(faults) :]
+    found = run(LocalEngine(2, Limits(seconds=5.0, memory_mb=1000)), jobs)
+    assert {name: ended.state for name, ended in found.items() if ended.state != "done"} == {
+        "raises": "failed",
+        "refuses": "failed",
+        "kills_its_process": "crashed",
+        "aborts": "crashed",
+        "hangs": "timed out",
+        "eats_memory": "failed",
+    }
+    assert [found[one.name].value for one in innocent] == [2 * n for n in range(30)]
+    assert found["raises"].is_bug and found["raises"].why.rstrip().endswith("ValueError: a bug")
+    assert "Traceback" in found["raises"].why
+    assert not found["refuses"].is_bug and "to do: mend it" in found["refuses"].why
+    assert "SIGKILL" in found["kills_its_process"].why
+    assert "SIGABRT" in found["aborts"].why and "faulty_jobs.py" in found["aborts"].why
+    assert "not done after 5 s" in found["hangs"].why and "in hangs" in found["hangs"].why
+    assert "out of memory" in found["eats_memory"].why
+    assert 5.0 <= found["hangs"].seconds < 20
+    assert all(ended.state in STATES and ended.worker for ended in found.values())
+
+
+def test_quick_jobs_are_ready_before_the_last_has_ended():
+    """And those that wait for a process that dies, or hangs, are run by another."""
+    rest = doubles(40)
+    jobs = [*rest[:20], job(faulty_jobs.kills_its_process), *rest[20:30], job(faulty_jobs.hangs), *rest[30:]]
+    with LocalEngine(1, Limits()) as engine:
+        assert engine.room("trials") == 1
+        engine.submit(jobs[0])
+        assert engine.room("trials") == 0
+        engine.ended()
+        engine.submit(jobs[0])
+        assert engine.room("trials") == 1
+    found = run(LocalEngine(1, Limits(seconds=3.0)), jobs)
+    states = {name: ended.state for name, ended in found.items() if ended.state != "done"}
+    assert states == {"kills_its_process": "crashed", "hangs": "timed out"}
+    assert [found[one.name].value for one in rest] == [2 * n for n in range(40)]
+
+
+def test_time_and_memory_are_told():
+    ended = attempt(Job("a", "trials", faulty_jobs.double, (3,)), "somebody")
+    assert (ended.state, ended.value, ended.worker) == ("done", 6, "somebody")
+    assert 0 <= ended.seconds < 1
+    assert 20 < ended.peak_mb < 20_000
+
+
+def test_the_peak_of_memory_is_the_jobs_own():
+    before = attempt(job(faulty_jobs.imported), "x").peak_mb
+    import numpy as np
+
+    large = attempt(Job("a", "trials", np.ones, (40_000_000,)), "x")
+    assert large.peak_mb > before + 300
+    del large
+    assert attempt(job(faulty_jobs.imported), "x").peak_mb < before + 100
+
+
+def test_trial_processes_load_neither_mitsuba_nor_open3d():
+    assert run(LocalEngine(1, Limits()), [job(faulty_jobs.imported)])["imported"].value == []
+
+
+def test_serial_runs_here_and_in_order():
+    jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
+    found = run(SerialEngine(), jobs)
+    assert found["pid"].value == os.getpid()
+    assert list(found) == [one.name for one in jobs]
+    assert found["raises"].state == "failed"
+
+
+def test_leaving_early_ends_processes_at_once():
+    engine = LocalEngine(2, Limits())
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), engine:
+        engine.submit(Job("pid", "trials", os.getpid, ()))
+        ((_, ended),) = engine.ended()
+        engine.submit(job(faulty_jobs.hangs))
+        began = time.monotonic()
+        raise KeyboardInterrupt
+    assert time.monotonic() - began < 2
+    with pytest.raises(ProcessLookupError):
+        os.kill(ended.value, 0)
+
+
+def test_processes_that_cannot_start_are_a_message(monkeypatch):
+    monkeypatch.setattr("harness.engine.processes._serve", faulty_jobs.dies_at_once)
+    with pytest.raises(UserError, match="3 worker processes in a row died as they started"):
+        run(LocalEngine(1, Limits()), doubles(1))
+
+
+def test_a_process_killed_between_jobs_costs_nothing():
+    with LocalEngine(1, Limits()) as engine:
+        engine.submit(Job("pid", "trials", os.getpid, ()))
+        ((_, first),) = engine.ended()
+        os.kill(first.value, signal.SIGKILL)
+        time.sleep(0.2)
+        states = []
+        for one in doubles(2):
+            engine.submit(one)
+            states += [ended.state for _, ended in engine.ended()]
+    assert states == ["done", "done"]

@@ -1,0 +1,175 @@
+"""Parts of a sweep, run by themselves and joined: the same bytes as in one go."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from serial_run import run_serially
+from test_engine_study import written
+from tiny_sweep import TINY, content, results, sweep
+
+from harness import merge
+from harness.engine.journal import Journal, record_text
+from harness.engine.lock import locked
+from harness.engine.parts import parts_of
+from harness.engine.plan import Plan, plan_of
+from harness.engine.shard import Shard
+from harness.experiment.load import load_experiment
+from harness.vocabulary.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a study of random boards and its run in one go."""
+    home = tmp_path_factory.mktemp("shards")
+    written(home)
+    done = sweep(home / "tiny.yaml", home / "whole")
+    assert done.returncode == 0, done.stderr
+    return home
+
+
+def plan(home: Path) -> Plan:
+    return plan_of(load_experiment(home / "tiny.yaml"), home / "whole" / ".cache" / "renders")
+
+
+def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, capsys):
+    """Three folders without a common file; merged, and the report written where no render is."""
+    name = results(home / "whole").name
+    for number in (1, 2, 3):
+        shutil.copytree(home / "whole" / ".cache", home / f"part{number}" / ".cache")
+        done = sweep(home / "tiny.yaml", home / f"part{number}", "--shard", f"{number}/3")
+        assert done.returncode == 0, done.stderr
+        assert f"shard {number}/3: " in done.stdout
+        assert not list((home / f"part{number}").glob("tiny/*/report.html"))
+    parts = [str(home / f"part{number}" / "tiny" / name) for number in (1, 2, 3)]
+    into = home / "joined" / "tiny" / name
+    assert merge.main([*parts, "--into", str(into)]) == 0
+    assert f"--out {home / 'joined'}" in capsys.readouterr().out
+    done = sweep(home / "tiny.yaml", home / "joined")
+    assert done.returncode == 0, done.stderr
+    assert content(into) == content(results(home / "whole"))
+
+
+def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
+    """One after the other: none runs what another has run, and together they are all."""
+    study = plan(home)
+    counts = [run_serially(study, tmp_path, shard=Shard(number, 3)).trials for number in (3, 1, 2)]
+    assert [one.failed for one in counts] == [0, 0, 0]
+    assert sum(one.done for one in counts) == study.trial_count
+    whole = run_serially(study, tmp_path)
+    assert (whole.trials.done, whole.trials.found) == (0, study.trial_count)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
+def test_every_judged_trial_belongs_to_one_shard(home, count):
+    study = plan(home)
+    seen: list[tuple[int, int, int]] = []
+    for number in range(1, count + 1):
+        first, then = parts_of(study, Shard(number, count))
+        for parts in then:
+            seen += [(id(part.batch), part.group, repeat) for part in parts for repeat in part.repeats]
+        for group, parts in enumerate(first):
+            assert bool(parts) == bool(then[group]), "a shard calibrates what it judges, and nothing else"
+    assert len(seen) == len(set(seen))
+    assert len(seen) == sum(g.most_repeats(b) for g in study.groups for b in g.then)
+
+
+def test_a_shard_renders_only_what_it_needs(home):
+    study = plan(home)
+    (first, then), (_, all_then) = parts_of(study, Shard(1, 4)), parts_of(study, Shard(1, 1))
+    mine = {path for parts in (*first, *then) for part in parts for path in part.paths}
+    judged = {path for parts in all_then for part in parts for path in part.paths}
+    assert judged - mine
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "3", "a/b", "-1/3", "1/0", "1/3/5", "1/100001"])
+def test_shards_that_are_no_part_are_refused(text):
+    with pytest.raises(UserError, match="no part of a whole"):
+        Shard.of(text)
+
+
+def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
+    with locked(tmp_path, Shard(1, 3)):
+        with locked(tmp_path, Shard(2, 3)):
+            pass
+        for other in (Shard(1, 3), Shard(1, 1)):
+            with pytest.raises(UserError, match="another sweep is at work"), locked(tmp_path, other):
+                pass
+    with locked(tmp_path):
+        pass
+
+
+# ---- merging ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(home, tmp_path) -> tuple[Path, Path]:
+    """A finished folder, and where to merge into."""
+    whole = results(home / "whole")
+    shutil.copytree(whole, tmp_path / "a" / "tiny" / whole.name)
+    return tmp_path / "a" / "tiny" / whole.name, tmp_path / "b" / "tiny" / whole.name
+
+
+def test_merging_twice_copies_once(two, capsys):
+    other, into = two
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    count = len(list(Journal(other / "journal").entries()))
+    assert f"{count} trials copied, 0 were there" in capsys.readouterr().out
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert f"0 trials copied, {count} were there" in capsys.readouterr().out
+    assert not [path for path in into.rglob("*.part*")]
+
+
+def test_what_is_done_takes_the_place_of_what_is_not(two):
+    from harness.engine.journal import Entry
+
+    other, into = two
+    keys = [key for key, _ in Journal(other / "journal").entries()]
+    Journal(into / "journal").write(keys[0], Entry("crashed", why="its process was ended by SIGKILL"))
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    entry = Journal(into / "journal").read(keys[0])
+    assert entry is not None and entry.state == "done"
+
+
+def test_different_results_for_one_trial_are_told(two, capsys):
+    from dataclasses import replace
+
+    other, into = two
+    journal = Journal(other / "journal")
+    key = next(key for key, _ in journal.entries() if key.startswith("damaged"))
+    entry = journal.read(key)
+    assert entry is not None and entry.record is not None
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    slower = {**entry.record, "runs": [{**run, "seconds_detect": 9.0} for run in entry.record["runs"]]}
+    journal.write(key, replace(entry, text=record_text(slower)))
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    changed = {**entry.record, "runs": [{**run, "detections": 99} for run in entry.record["runs"]]}
+    journal.write(key, replace(entry, text=record_text(changed)))
+    assert merge.main([str(other), "--into", str(into)]) == 1
+    assert "1 trials have different results" in capsys.readouterr().err
+
+
+def test_mistakes_in_merging(two, tmp_path, capsys):
+    other, into = two
+    (tmp_path / "empty").mkdir()
+    stranger = tmp_path / "c" / "tiny" / "0123456789abcdef"
+    shutil.copytree(other, stranger)
+    for arguments, said in (
+        ([str(tmp_path / "empty"), "--into", str(into)], "has no journal"),
+        ([str(other), "--into", str(other)], "is the folder to merge into"),
+        ([str(other), str(stranger), "--into", str(into)], "different experiments"),
+        ([str(other), "--into", str(tmp_path / "elsewhere")], "looked for in a folder of that name"),
+    ):
+        assert merge.main(arguments) == 2
+        assert said in capsys.readouterr().err
+    assert not into.exists()
+
+
+def test_a_shard_of_the_thesis_target(tmp_path):
+    """Not a study: repeats of one board are what is shared out."""
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    tiny = plan_of(load_experiment(tmp_path / "tiny.yaml", ["repeats=5"]), tmp_path)
+    split = [parts_of(tiny, Shard(number, 2))[1][0][0].repeats for number in (1, 2)]
+    assert split == [range(2), range(2, 5)]

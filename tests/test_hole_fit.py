@@ -1,0 +1,123 @@
+"""The compiled fit of the hole model against MINPACK, and its covariance against a plain one."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from detectors.hole_image import Patch, Sight, blurred_hole, crossed, derivatives
+from detectors.hole_kernels import correlated_products, plane_sums
+from detectors.hole_model import IMAGES, TOLERANCE, WALL_PRIOR, fit_hole
+
+PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
+CENTRE_M = np.array([0.03, -0.02, 0.7])
+
+
+def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> Patch:
+    """A hole seen by a camera that averages over 5 x 5 pixels, with the noise that this leaves."""
+    random = np.random.default_rng(seed)
+    shape = (34, 37)
+    used = random.random(shape) > 0.02
+    sight = Sight.of(CENTRE_M, PER_PX_M, np.array([-14e-3, 0.0, 1e-3]))
+    blank = Patch(np.zeros(shape), used, PER_PX_M @ PER_PX_M.T, (5.0, 5.0), noise_m, sight)
+    noise = cv2.blur(random.standard_normal(shape), (5, 5)) * 5.0 * noise_m
+    residual = np.where(used, blurred_hole(blank, hole) + noise + 1e-4, np.nan)
+    return Patch(residual, used, blank.metric_m2, blank.blur_px, noise_m, sight)
+
+
+def by_minpack(patch: Patch, start: tuple[float, float, float, float, float]) -> tuple[np.ndarray, float, bool]:
+    """(hole, offset, converged) by the same least squares, written plainly, with scipy's MINPACK."""
+    u, v, radius_m, depth_m, offset_m = start
+    weight = patch.noise_m * math.sqrt(patch.blur_area_px) / WALL_PRIOR[1]
+    data = patch.residual_m[patch.used]
+
+    def hole_of(q: np.ndarray) -> np.ndarray:
+        radius = math.exp(q[2])
+        return np.array([q[0], q[1], radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
+
+    def misfit(q: np.ndarray) -> np.ndarray:
+        hole = hole_of(q)
+        image = blurred_hole(patch, hole)[patch.used]
+        return np.append(image + q[4] - data, weight * (hole[4] - WALL_PRIOR[0]))
+
+    def jacobian(q: np.ndarray) -> np.ndarray:
+        hole = hole_of(q)
+        by = derivatives(patch, hole, blurred_hole(patch, hole))[:, patch.used]
+        slope = 0.5 * math.pi * math.sin(math.pi * q[5])
+        columns = [by[0], by[1], hole[2] * by[2] - 2.0 * hole[3] * by[3], by[3] / hole[2] ** 2, np.ones(len(data))]
+        rows = np.column_stack([*columns, by[4] * slope])
+        return np.vstack([rows, [0.0, 0.0, 0.0, 0.0, 0.0, weight * slope]])
+
+    begin = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
+    stop = {"xtol": TOLERANCE, "ftol": TOLERANCE, "gtol": 1e-9, "max_nfev": IMAGES}
+    # its default scaling is MINPACK's own, by the columns of the Jacobian
+    found = least_squares(misfit, begin, jacobian, method="lm", x_scale="jac", **stop)
+    return hole_of(found.x), float(found.x[4]), bool(found.success)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("radius_mm", "depth_mm"), [(2.1, 12.7), (3.2, 6.0), (4.8, 33.0), (6.4, 3.0), (12.7, 12.7), (4.0, -5.0)]
+)
+def test_the_descent_ends_where_minpack_does(radius_mm: float, depth_mm: float, seed: int) -> None:
+    hole = np.array([18.3, 16.4, radius_mm * 1e-3, depth_mm * 1e-3, 0.6])
+    patch = patch_of(hole, 1.5e-4, seed)
+    start = (17.6, 16.9, 1.2e-3 * radius_mm, 0.7e-3 * depth_mm, 0.0)
+    found = fit_hole(patch, *start)
+    expected, offset, converged = by_minpack(patch, start)
+    assert found.converged == converged
+    ours = np.array([found.u_px, found.v_px, found.radius_m, found.depth_m, found.offset_m, found.wall])
+    apart = np.abs(ours - [*expected[:4], offset, expected[4]])
+    error = np.sqrt(np.diag(found.covariance))
+    # where diameter and depth can hardly be told apart, rounding moves both along the valley of the sum of squares
+    assert (apart < np.maximum(1e-9, 1e-4 * error)).all()
+    assert np.abs(ours[2] - expected[2]) < 1e-9 + 1e-5 * error[2]
+
+
+def test_a_hopeless_start_is_told_and_not_looped_over() -> None:
+    patch = patch_of(np.array([18.3, 16.4, 3e-3, 0.01, 0.6]), 1.5e-4, 0)
+    flat = Patch(np.where(patch.used, 1e-4, np.nan), patch.used, patch.metric_m2, (5.0, 5.0), 1.5e-4, patch.sight)
+    fit = fit_hole(flat, 1000.0, -1000.0, 50.0, 0.1, 0.0)
+    assert np.isfinite([fit.u_px, fit.v_px, fit.radius_m]).all()
+
+
+@pytest.mark.parametrize("window", [(5, 5), (1, 1), (3, 7)])
+def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
+    across, down = window
+    columns = np.random.default_rng(1).standard_normal((6, 19, 23))
+    padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
+    filtered = [cv2.boxFilter(one, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in padded]
+    summed = np.stack(filtered).reshape(6, -1)
+    np.testing.assert_allclose(correlated_products(columns, across, down), summed @ summed.T, rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_plane_sums_equal_a_design_matrix(parallel: bool) -> None:
+    random = np.random.default_rng(2)
+    points, surface = random.uniform(0.5, 1.0, (9, 11, 3)), random.uniform(0.5, 1.0, (9, 11))
+    finite = random.random((9, 11)) > 0.3
+    v, u = np.nonzero(finite)
+    design = np.column_stack([np.ones(len(u)), u - 4.2, v - 3.1])
+    p = points[finite]
+    across = p[:, :2] if parallel else p[:, :2] / p[:, 2:]
+    targets = np.column_stack([across, surface[finite]])
+    square, right = plane_sums(points, surface, finite, 4.2, 3.1, parallel)
+    np.testing.assert_allclose(square, design.T @ design, rtol=1e-12)
+    np.testing.assert_allclose(right, design.T @ targets, rtol=1e-12, atol=1e-12)
+
+
+def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
+    emitter = np.array([-14e-3, 0.0, 1e-3])
+    found = Sight.of(CENTRE_M, PER_PX_M, emitter)
+    normal = np.cross(*PER_PX_M)
+    np.testing.assert_array_equal(crossed(*PER_PX_M), normal)
+    normal /= np.copysign(np.linalg.norm(normal), normal @ CENTRE_M)
+    ray, z = CENTRE_M / CENTRE_M[2], CENTRE_M[2]
+    slopes = ((PER_PX_M - np.outer(PER_PX_M[:, 2], ray)) / z)[:, :2].T
+    np.testing.assert_allclose(found.drift_px, np.linalg.pinv(slopes) @ (normal - normal[2] * ray)[:2] / z, rtol=1e-10)
+    on_axis = emitter - CENTRE_M * float(normal @ emitter) / float(normal @ CENTRE_M)
+    np.testing.assert_allclose(found.beam_px, np.linalg.pinv(PER_PX_M.T) @ on_axis, rtol=1e-10)

@@ -1,0 +1,338 @@
+"""Result folders and stored renders, listed and removed: nothing that is not tofpod's, nothing in use, no way out."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from harness import clean, ls
+from harness.engine.journal import Entry, Journal
+from harness.engine.lock import locked
+from harness.listing.text import age_text, bytes_of, seconds_of, size_text
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Region
+from harness.vocabulary.versions import RESULTS_VERSION
+from scenes.closed_form import plane_view
+from scenes.render.cache import write_view
+from scenes.render.store import in_use
+from scenes.sensor.camera import load_camera
+
+ROOT = Path(__file__).resolve().parents[1]
+DAY_S = 86_400.0
+
+
+def results(out: Path, digest: str, name: str = "study", records: int = 0, **said: object) -> Path:
+    """A folder of results; with a provenance where anything is said of it."""
+    folder = out / name / digest
+    folder.mkdir(parents=True)
+    (folder / "experiment.yaml").write_text("name: study\n")
+    journal = Journal(folder / "journal")
+    for number in range(records):
+        journal.write(f"damaged-{number:05d}-{number:016x}", Entry("done", text='{"runs":[]}'))
+    if said:
+        whole = {"results_version": RESULTS_VERSION, "started": "2026-11-21T10:00:00+00:00", "commit": "abcdef0123"}
+        (folder / "provenance.json").write_text(json.dumps({**whole, "dirty": True, **said}))
+        (folder / "report.html").write_text("<html>")
+    return folder
+
+
+def listed(capsys: pytest.CaptureFixture[str], out: Path, *more: str) -> dict[str, dict]:
+    assert ls.main(["results", *more, "--out", str(out), "--json"]) == 0
+    return {row["digest"]: row for row in json.loads(capsys.readouterr().out)}
+
+
+# ---------------------------------------------------------------- what is listed
+
+
+def test_every_state_of_a_folder(tmp_path, capsys):
+    results(tmp_path, "0" * 16, trials={"done": 5, "resumed": 4, "failed": 0}, records=9)
+    results(tmp_path, "1" * 16, trials={"done": 5, "resumed": 0, "failed": 2}, records=7)
+    results(tmp_path, "2" * 16, records=3)
+    (results(tmp_path, "3" * 16) / "provenance.json").write_text("{")
+    (tmp_path / "study" / ("4" * 16)).mkdir()
+    results(tmp_path, "5" * 16, trials={"done": 5}, results_version=RESULTS_VERSION + 1)
+    running = results(tmp_path, "6" * 16, records=1)
+    captured = results(tmp_path, "7" * 16, name="wall")
+    (captured / "point-000").mkdir()
+    (captured / "summary.csv").write_text("point\n")
+    with locked(running):
+        rows = listed(capsys, tmp_path)
+    states = {digest[0]: row["state"] for digest, row in rows.items()}
+    assert states == dict(
+        zip(
+            "01234567",
+            ["complete", "unfinished", "unfinished", "broken", "broken", "complete", "running", "complete"],
+            strict=True,
+        )
+    )
+    notes = {digest[0]: row["note"] for digest, row in rows.items()}
+    assert notes["0"] == "complete: 9 trials"
+    assert notes["1"] == "unfinished: 5 of 7 trials done, 2 failed"
+    assert notes["2"] == "unfinished: 3 records"
+    assert notes["3"].startswith("broken: provenance.json")
+    assert "newer" in notes["5"] and str(RESULTS_VERSION + 1) in notes["5"]
+    assert notes["6"] == "running: 1 record"
+    assert notes["7"] == "complete: 1 real capture judged"
+    whole = rows["0" * 16]
+    assert (whole["done"], whole["failed"], whole["planned"], whole["records"]) == (9, 0, 9, 9)
+    assert whole["has_report"] and not rows["2" * 16]["has_report"]
+    assert whole["size_bytes"] >= 9 * 300
+    assert set(listed(capsys, tmp_path, "wall")) == {"7" * 16}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"[]", b"\xff", b"[" * 100_000, b'{"trials": 3}', b'{"trials": {"done": -1}, "started": 5, "commit": ["x"]}'],
+)
+def test_whatever_a_provenance_holds_the_list_goes_on(tmp_path, capsys, content):
+    (results(tmp_path, "0" * 16) / "provenance.json").write_bytes(content)
+    results(tmp_path, "1" * 16, trials={"done": 1})
+    rows = listed(capsys, tmp_path)
+    assert rows["1" * 16]["state"] == "complete" and len(rows) == 2
+    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+
+
+def test_the_list_as_text_fits_a_terminal(tmp_path, capsys):
+    results(tmp_path, "0" * 16, trials={"done": 5, "resumed": 4, "failed": 0}, records=9)
+    results(tmp_path, "2" * 16, records=3)
+    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == "  study"
+    assert lines[2].split() == [
+        "0" * 16,
+        "2026-11-21",
+        "abcdef0+",
+        *lines[2].split()[3:5],
+        "report",
+        "complete:",
+        "9",
+        "trials",
+    ]
+    assert lines[3].endswith("no report  unfinished: 3 records")
+    assert max(map(len, lines)) <= 100
+
+
+def test_neither_links_nor_other_folders_are_results(tmp_path, capsys):
+    out = tmp_path / "out"
+    there = results(tmp_path / "elsewhere", "0" * 16, records=2)
+    (out / "study").mkdir(parents=True)
+    (out / "study" / ("1" * 16)).symlink_to(there)
+    (out / "linked").symlink_to(there.parent)
+    (out / "baselines").mkdir()
+    (out / "baselines" / "regression.json").write_text("{}")
+    assert listed(capsys, out) == {}
+    assert listed(capsys, tmp_path / "nowhere") == {}
+    assert ls.main(["results", "nothing", "--out", str(out)]) == 2
+    assert "has no results of 'nothing'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """Three renders used 1, 10 and 40 days ago, the last one damaged, and a file that a killed process left."""
+    folder = tmp_path / ".cache" / "renders"
+    view = plane_view(load_camera("azure_kinect_nfov"), Region(200, 210, 300, 310), 0.8, 0.5)
+    for letter, days in (("a", 1), ("b", 10), ("c", 40)):
+        path = folder / f"{letter * 16}.npz"
+        write_view(path, view)
+        if letter == "c":
+            path.write_bytes(path.read_bytes()[:-50])
+        os.utime(path, (time.time() - days * DAY_S,) * 2)
+    left = folder / f".{'d' * 16}.abcd1234.part.npz"
+    left.write_bytes(b"x")
+    os.utime(left, (time.time() - 2 * DAY_S,) * 2)
+    (folder / "mine.txt").write_text("mine")
+    return folder
+
+
+def test_the_cache_is_counted(cache, tmp_path, capsys):
+    assert ls.main(["cache", "--out", str(tmp_path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["renders"], facts["damaged"], facts["leftovers"]) == (3, [f"{'c' * 16}.npz"], 1)
+    assert facts["size_bytes"] == sum(path.stat().st_size for path in cache.glob("[abc]*.npz"))
+    assert facts["longest_unused_s"] == pytest.approx(40 * DAY_S, abs=60)
+    assert ls.main(["cache", "--out", str(tmp_path), "--fast"]) == 0
+    text = capsys.readouterr().out
+    assert "latest 24 h ago, oldest 40 days ago" in text and "not looked for" in text
+    assert ls.main(["cache", "--out", str(tmp_path / "none")]) == 0
+
+
+# ---------------------------------------------------------------- what is removed
+
+
+def left_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir() if path.name != ".lock"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kept"),
+    [
+        (["--older-than", "5d"], "a"),
+        (["--older-than", "2w"], "ab"),
+        (["--damaged"], "ab"),
+        (["--limit", "0MB"], ""),
+        (["--limit", "1GB"], "abc"),
+        (["--all"], ""),
+        (["--older-than", "5d", "--damaged", "--dry-run"], "abc"),
+    ],
+)
+def test_renders_go_by_size_age_and_damage(cache, tmp_path, capsys, arguments, kept):
+    assert clean.main(["cache", *arguments, "--yes", "--out", str(tmp_path)]) == 0
+    leftover = {f".{'d' * 16}.abcd1234.part.npz"} if "--dry-run" in arguments else set()
+    assert left_in(cache) == {"mine.txt", *(f"{letter * 16}.npz" for letter in kept), *leftover}
+    said = capsys.readouterr().out
+    assert ("would remove 3 stored renders" in said) == ("--dry-run" in arguments)
+
+
+def test_a_cache_in_use_is_refused(cache, tmp_path, capsys):
+    with in_use(cache):
+        assert clean.main(["cache", "--all", "--yes", "--out", str(tmp_path)]) == 2
+    assert "a sweep that is running uses these renders" in capsys.readouterr().err
+    assert len(left_in(cache)) == 5
+
+
+def test_a_cache_that_is_a_link_is_refused(cache, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".cache").symlink_to(cache.parent)
+    assert clean.main(["cache", "--all", "--yes", "--out", str(out)]) == 2
+    assert "is a link" in capsys.readouterr().err and len(left_in(cache)) == 5
+
+
+class Terminal:
+    """A standard input at which somebody sits, or nobody."""
+
+    def __init__(self, *, is_there: bool) -> None:
+        self._is_there = is_there
+
+    def isatty(self) -> bool:
+        return self._is_there
+
+
+def test_nothing_is_removed_unasked(cache, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", Terminal(is_there=False))
+    assert clean.main(["cache", "--all", "--out", str(tmp_path)]) == 2
+    assert "--yes" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", Terminal(is_there=True))
+    for answer, code, count in (("", 1, 5), ("n", 1, 5), ("y", 0, 1)):
+        monkeypatch.setattr("builtins.input", lambda _, answer=answer: answer)
+        assert clean.main(["cache", "--all", "--out", str(tmp_path)]) == code
+        assert len(left_in(cache)) == count
+    assert clean.main(["cache", "--out", str(tmp_path)]) == 2
+
+
+def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
+    first = results(tmp_path, "0" * 16, records=2, trials={"done": 2})
+    (first / "point-000").mkdir()
+    (first / "point-000" / "cloud.ply").write_text("ply")
+    (first / "journal" / "00" / f".damaged-00007-{'7' * 16}.abcd1234.part.jsonl").write_text("half")
+    second = results(tmp_path, "1" * 16, records=2, trials={"done": 2})
+    (second / "notes.md").write_text("mine")
+    (second / "journal" / "notes.md").write_text("mine")
+    (second / "outside").symlink_to(tmp_path.parent)
+    assert clean.main(["results", "study", "--dry-run", "--out", str(tmp_path)]) == 0
+    assert (first / "provenance.json").exists() and not (first / ".lock").exists()
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert not first.exists()
+    assert {str(path.relative_to(second)) for path in second.rglob("*")} == {
+        "notes.md",
+        "journal",
+        "journal/notes.md",
+        "outside",
+    }
+    assert "is kept" in capsys.readouterr().err and tmp_path.parent.is_dir()
+    (second / "notes.md").unlink()
+
+
+def test_the_journal_alone(tmp_path):
+    folder = results(tmp_path, "0" * 16, records=20, trials={"done": 20})
+    other = results(tmp_path, "1" * 16, records=1)
+    assert clean.main(["results", f"study/{'0' * 16}", "--journal-only", "--yes", "--out", str(tmp_path)]) == 0
+    assert left_in(folder) == {"experiment.yaml", "provenance.json", "report.html"}
+    assert len(list(Journal(other / "journal").entries())) == 1
+
+
+def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
+    first, second = (results(tmp_path, digit * 16, records=2) for digit in "01")
+    with locked(second):
+        assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 2
+    assert "another sweep" in capsys.readouterr().err
+    assert all(len(list(Journal(one / "journal").entries())) == 2 for one in (first, second))
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "../study", "study/..", "/etc", ".cache", "study/", "study/0", "none", "", "study/" + "9" * 16]
+)
+def test_names_that_name_no_results(tmp_path, capsys, name):
+    results(tmp_path, "0" * 16, records=1)
+    assert clean.main(["results", name, "--yes", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_results_that_are_links_are_refused(tmp_path, capsys):
+    there = results(tmp_path / "elsewhere", "0" * 16, records=1)
+    out = tmp_path / "out"
+    (out / "mine").mkdir(parents=True)
+    (out / "mine" / ("0" * 16)).symlink_to(there)
+    (out / "study").symlink_to(there.parent)
+    for name in ("study", f"study/{'0' * 16}", f"mine/{'0' * 16}"):
+        assert clean.main(["results", name, "--yes", "--out", str(out)]) == 2
+        assert "is a link" in capsys.readouterr().err
+    assert (there / "experiment.yaml").exists()
+
+
+# ---------------------------------------------------------------- words
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("5GB", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0), ("2TB", 2 * 10**12)]
+)
+def test_sizes(text, count):
+    assert bytes_of(text) == count
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("12h", 43_200), ("30d", 30 * DAY_S), ("1.5w", 10.5 * DAY_S)])
+def test_ages(text, seconds):
+    assert seconds_of(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "5", "GB", "-5GB", "5 gigs", "1e3GB", "nan", "5GBx", "５GB"])
+def test_what_is_no_size(text):
+    with pytest.raises(UserError, match="not a size"):
+        bytes_of(text)
+    with pytest.raises(UserError, match="not an age"):
+        seconds_of(text.replace("GB", "m"))
+
+
+def test_sizes_and_ages_as_text():
+    assert [size_text(n) for n in (0, 999, 1000, 12_910_000, 999_900_000, 5e9)] == [
+        "0 B",
+        "999 B",
+        "1 kB",
+        "12.9 MB",
+        "1 GB",
+        "5 GB",
+    ]
+    assert [age_text(s) for s in (-5, 10, 90, 7300, 3 * DAY_S)] == [
+        "just now",
+        "just now",
+        "2 min ago",
+        "2 h ago",
+        "3 days ago",
+    ]
+
+
+def test_help_of_clean_loads_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['x', '--help']\nimport harness.clean as program\n"
+        "try: program.main()\nexcept SystemExit as end: assert end.code == 0\n"
+        "heavy = {'mitsuba', 'numpy', 'scipy', 'numba', 'pandas', 'pydantic'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
