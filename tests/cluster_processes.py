@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from harness.engine.processes import ONE_THREAD
+
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 60.0
 """Seconds, generous: what must have started or ended by then."""
@@ -43,7 +45,9 @@ class Processes:
         folders = os.pathsep.join([str(search), str(ROOT / "tests")])
         log = open(self.folder / f"{kind}.log", "ab")  # noqa: SIM115 (the process has its own)
         command = [sys.executable, "-m", "distributed.cli.dask_" + kind, *map(str, options), "--no-dashboard"]
-        environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
+        # nothing pinned from outside: workers see to their threads themselves
+        environment = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+        environment["PYTHONPATH"] = folders
         return subprocess.Popen(command, cwd=self.folder, env=environment, stdout=log, stderr=log)
 
     def close(self) -> None:
@@ -116,6 +120,14 @@ def eat(megabytes: int) -> int:
 
 def loaded() -> list[str]:
     return sorted(name for name in ("mitsuba", "drjit") if name in sys.modules)
+
+
+def threads() -> dict[str, int]:
+    """What each library that computes may use, in the thread that a trial gets."""
+    import cv2
+    from threadpoolctl import threadpool_info
+
+    return {str(one["filepath"]): one["num_threads"] for one in threadpool_info()} | {"cv2": cv2.getNumThreads()}
 
 
 def note_and_sleep(path: str, seconds: float) -> int:

@@ -53,12 +53,12 @@ FAULTS = {"raise": raises, "kill": kills_its_process, "hang": hangs, "eat": eats
 FOLDER = "TOFPOD_TEST_FAULTS"
 
 
-def commit_a_fault() -> None:
-    """Take one of the files that a test has put into the folder named by the environment, and do as its name says;
-    each is done once, by whoever is first."""
+def commit_a_fault(kind: str) -> None:
+    """Take one of the files of a kind that a test has put into the folder named by the environment, and do as its name
+    says; each is done once, by whoever is first."""
     folder = os.environ.get(FOLDER)
     for name, fault in FAULTS.items() if folder else ():
-        for path in sorted(Path(str(folder)).glob(f"{name}*")):
+        for path in sorted(Path(str(folder)).glob(f"{kind}-{name}*")):
             try:
                 path.unlink()
             except FileNotFoundError:

@@ -30,6 +30,7 @@ from cluster_processes import (
     raises,
     slow_square,
     square,
+    threads,
     until,
 )
 from serial_run import records_of, run_serially
@@ -216,6 +217,15 @@ def test_a_worker_with_other_code_is_refused(tmp_path):
             pass
 
 
+@pytest.mark.skipif(os.cpu_count() == 1, reason="one thread anyway")
+def test_a_worker_computes_in_one_thread_whatever_its_environment(tmp_path):
+    with processes(tmp_path / "cluster") as bare:
+        bare.worker("--no-nanny")  # a nanny would set the environment
+        with engine_at(bare) as engine:
+            used = run(engine, [Job("threads", "trials", threads, ())])["threads"].value
+    assert len(used) > 1 and set(used.values()) == {1}, used
+
+
 def test_a_cluster_of_dask_jobqueue(tmp_path):
     pytest.importorskip("dask_jobqueue")
     local = {"cores": 1, "processes": 1, "memory": "1GB", "python": sys.executable}
@@ -287,7 +297,7 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tmp
     assert len({how.worker for how in looks.values()}) == 2
     assert all(how.value == [] for how in looks.values()), "a worker loaded Mitsuba"
     assert ("renders are sent over the network" in capsys.readouterr().err) == (not is_seen)
-    assert not list(Path("cache").glob(".seen-*"))
+    assert not list(Path("cache").glob(".*"))
 
 
 def test_a_render_that_fails_or_kills_its_process_costs_itself(cluster, tmp_path):

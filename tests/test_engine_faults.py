@@ -33,8 +33,12 @@ class Clumsy(ThesisDetector):
     name = "clumsy"
 
     def analyse(self, cloud):
-        commit_a_fault()
+        commit_a_fault("any")
         return super().analyse(cloud)
+
+    def find(self, cloud, evidence, threshold):
+        commit_a_fault("judged")
+        return super().find(cloud, evidence, threshold)
 '''
 REPEATS = "repeats=6"
 
@@ -79,11 +83,12 @@ def with_renders(home: Path, out: str) -> Path:
 
 
 def test_faults_in_trials_are_told_and_mended(home):
-    """One trial raises, one kills its process, one hangs, one wants too much memory: four of twelve are lost, the
-    summary and the exit code say so; the same command leaves them, --retry-failed ends as if nothing had been."""
+    """One trial raises, one hangs, one wants too much memory, one kills its process: four of twelve are lost, the
+    summary and the exit code say so; the same command leaves them, --retry-failed ends as if nothing had been. A fifth,
+    which sets the threshold, kills its process and is tried again at once."""
     with_renders(home, "disturbed")
     limits = ("--time-limit", "20", "--memory-limit", "1.5")
-    done = run(home, "disturbed", *limits, faults=("raise", "kill", "hang", "eat"))
+    done = run(home, "disturbed", *limits, faults=("any-raise", "any-kill", "any-hang", "any-eat", "judged-kill"))
     assert done.returncode == 1, done.stderr
     assert "2 failed, 1 crashed, 1 timed out" in done.stderr
     assert "ValueError: a bug" in done.stderr and "SIGKILL" in done.stderr and "--retry-failed" in done.stderr

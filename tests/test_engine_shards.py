@@ -35,15 +35,15 @@ def plan(home: Path) -> Plan:
 
 
 def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, capsys):
-    """Three folders without a common file; merged, and the report written where no render is."""
+    """Two folders without a common file; merged, and the report written where no render is."""
     name = results(home / "whole").name
-    for number in (1, 2, 3):
+    for number in (1, 2):
         shutil.copytree(home / "whole" / ".cache", home / f"part{number}" / ".cache")
-        done = sweep(home / "tiny.yaml", home / f"part{number}", "--shard", f"{number}/3")
+        done = sweep(home / "tiny.yaml", home / f"part{number}", "--shard", f"{number}/2")
         assert done.returncode == 0, done.stderr
-        assert f"shard {number}/3: " in done.stdout
+        assert f"shard {number}/2: " in done.stdout
         assert not list((home / f"part{number}").glob("tiny/*/report.html"))
-    parts = [str(home / f"part{number}" / "tiny" / name) for number in (1, 2, 3)]
+    parts = [str(home / f"part{number}" / "tiny" / name) for number in (1, 2)]
     into = home / "joined" / "tiny" / name
     assert merge.main([*parts, "--into", str(into)]) == 0
     assert f"--out {home / 'joined'}" in capsys.readouterr().out

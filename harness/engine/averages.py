@@ -45,32 +45,29 @@ def averages_of(
     """Averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
     `detectors.average.prefix_averages`, which is used where ``exact`` or nothing else will do.
 
-    Prefixes nest as there: the average of 50 frames contains the one of 10. Raises UserError as it does.
+    Those that are drawn at once nest as there: the average of 50 frames contains the one of 20. So do those drawn frame
+    by frame; the two kinds have noise of their own. What an average is does not hang on which others are asked for.
+    Raises UserError as `detectors.average.prefix_averages` does.
     """
-    wanted = sorted(set(counts))
-    clouds = None
-    if not exact and config.method == "mean" and wanted and wanted[0] >= 1 and wanted[-1] >= FEWEST_FRAMES:
-        clouds = _at_once(capture, wanted, config)
-    return clouds if clouds is not None else prefix_averages(capture, counts, config)
+    many = sorted({n for n in counts if n >= FEWEST_FRAMES})
+    clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
+    rest = [n for n in counts if n not in clouds]
+    return clouds | (prefix_averages(capture, rest, config) if rest or not counts else {})
 
 
-def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud] | None:
+def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
+    """Of the counts those that can be."""
     summer = capture.unit.at_once
     if summer is None or counts[-1] > capture.n_frames:
-        return None
-    judged = {n: _verdict(capture, summer, n, config) for n in counts}
-    kept = {n: verdict.kept for n, verdict in judged.items() if verdict is not None}
-    parts = _parts(capture, kept) if len(kept) == len(counts) else None
-    if parts is None:
-        return None
+        return {}
+    judged = {n: verdict for n in counts if (verdict := _verdict(capture, summer, n, config)) is not None}
+    parts = _parts(capture, {n: verdict.kept for n, verdict in judged.items()}) if judged else None
     clouds: dict[int, Cloud] = {}
-    for n in counts:
-        verdict = judged[n]
-        assert verdict is not None
-        together = [part for frames, part in parts if frames[0] < n and verdict.kept[frames[0]]]
+    for n, verdict in judged.items() if parts is not None else ():
+        together = [part for frames, part in parts or () if frames[0] < n and verdict.kept[frames[0]]]
         cloud = _cloud(capture, reduce(add, together), verdict.left_out) if together else None
         if cloud is None or (config.judge_frames and _disturbed(cloud, _frame_noise_m(capture, summer), config)):
-            return None
+            continue
         clouds[n] = cloud
     return clouds
 

@@ -29,9 +29,8 @@ class Calibration:
                 area_m2 = run.get("inspected_m2", np.nan)
                 self._quiet.setdefault(run["point"], {})[key] = (run["quiet_threshold"], area_m2)
 
-    def thresholds(self, *, may_lack: bool) -> tuple[dict[str, float], list[Failure]]:
-        """By point digest; and a failure for each point that has none. ``may_lack``: trials have failed before, so that
-        too few of them are no mistake of the experiment's. Raises UserError as `threshold_of` where they are."""
+    def thresholds(self) -> tuple[dict[str, float], list[Failure]]:
+        """By point digest; and a failure for each point that has none."""
         found: dict[str, float] = {}
         failures: list[Failure] = []
         for point in self._group.points:
@@ -39,9 +38,7 @@ class Calibration:
             try:
                 threshold = threshold_of(point, [quiet[key] for key in sorted(quiet)])
             except UserError as error:
-                if not may_lack:
-                    raise
-                failures.append(Failure(f"threshold of {point.label}", error.message))
+                failures.append(Failure(f"threshold of {point.label}", str(error)))
                 continue
             if threshold is None:
                 failures.append(Failure(f"threshold of {point.label}", "no hole-free run ended"))

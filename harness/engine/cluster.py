@@ -16,7 +16,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from harness.engine.cluster_link import Answer, Event, Joined, Left, Link, Parcel, linked, tell
+from harness.engine.cluster_link import Answer, Event, Joined, Left, Link, Parcel, bare, linked, tell
 from harness.engine.cluster_worker import Bundle, Carried, Worker
 from harness.engine.work import TRACEBACK_CHARACTERS, Ended, Job, Limits, Stage
 from harness.vocabulary.errors import UserError
@@ -32,7 +32,9 @@ LOOKS_S = 1.0
 """Between looks whether all is well."""
 GRACE_S = 30.0
 """Beyond the time limits of all that a worker has: then its process does not answer, as its own clock should have."""
-WAIT_FOR_WORKERS_S = {"address": 60.0, "jobqueue": 600.0}
+WAIT_FOR_WORKERS_S = 60.0
+"""For workers that are started by hand. A batch system's queue may take hours: there a line is told now and then."""
+TELL_AGAIN_S = 300.0
 TRIES = 3
 """Of a job that never began, as what it needs was lost on the way."""
 
@@ -68,7 +70,9 @@ class ClusterEngine:
         self._mean_s = BUNDLE_S
         """Of a trial; at first as if each were worth a bundle of its own."""
         self._looked = time.monotonic()
-        self._alone_since: float | None = None
+        self._lacking = ""
+        """Workers that could do what waits, since then; told last at ``_lack_told``."""
+        self._lacking_since = self._lack_told = time.monotonic()
         self._probe: Path | None = None
         self._nonce = secrets.token_hex(16)
         self._told: set[str] = set()
@@ -78,7 +82,6 @@ class ClusterEngine:
         with contextlib.ExitStack() as stack:
             self._link = stack.enter_context(linked(self._scheduler, self._wanted))
             self._link.watch(lambda: None if self._probe is None else str(self._probe))
-            self._alone_since = time.monotonic()
             while not self._places:
                 self._step(must_fit=True)
             self._stack = stack.pop_all()
@@ -104,21 +107,16 @@ class ClusterEngine:
         return max(1, each * len(self._places)) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
-        """Take a job. Raises UserError where it is a render and no worker can."""
+        """Take a job."""
         folder = Path(job.arguments[-1]) if job.stage == "renders" else next((path.parent for path in job.needs), None)
         if folder is not None and self._probe is None:
             self._place_probe(folder)
-        places = self._places.values()
-        if job.stage == "renders" and places and not any(place.can_render for place in places):
-            raise UserError(
-                f"none of the {len(places)} workers can render: Mitsuba, Dr.Jit or trimesh differ there or are missing",
-                fix="install tofpod on the workers just as here",
-            )
         self._out[job.stage] += 1
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where the scheduler is gone, or no worker is left for long."""
+        """Wait for jobs to end. Raises UserError where the scheduler is gone, or for long no worker is left that could
+        do what waits."""
         while not self._done:
             self._hand_out()
             if not self._done:
@@ -210,6 +208,14 @@ class ClusterEngine:
             self._answered(event)
 
     def _joined(self, event: Joined, must_fit: bool) -> None:
+        if event.address in self._places:
+            return  # it came again before its first look ended: what it has stays with it
+        if isinstance(event.said, BaseException) and not isinstance(event.said, ImportError | AttributeError):
+            # it died meanwhile, or the network failed: no sign of another installation
+            said = f"{type(event.said).__name__}: {event.said}"
+            return self._tell_once(
+                f"the worker at {bare(event.address)} did not say what it is ({said}); it is not used"
+            )
         try:
             self._places[event.address] = self._place_of(event.address, event.said)
         except UserError as mistake:
@@ -222,7 +228,7 @@ class ClusterEngine:
         from harness.engine import plan
         from scenes.render import cache
 
-        where = f"the worker at {_bare(address)}"
+        where = f"the worker at {bare(address)}"
         if isinstance(said, BaseException):
             raise UserError(
                 f"{where} cannot run tofpod: {type(said).__name__}: {said}",
@@ -257,7 +263,7 @@ class ClusterEngine:
             why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
         for parcel in place.parcels:
             self._link.void(parcel)
-            self._suspect(parcel, place, Ended("crashed", why=why, worker=_bare(place.address)))
+            self._suspect(parcel, place, Ended("crashed", why=why, worker=bare(place.address)))
 
     def _suspect(self, parcel: Parcel, place: _Place, ended: Ended) -> None:
         """Alone, a job is to blame for what happened to its worker; among others it runs once more."""
@@ -300,7 +306,7 @@ class ClusterEngine:
             # the scheduler's allowed-failures is 0; that the worker left is told as well
             why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
             if was_alone:
-                self._over(parcel.jobs[0], Ended("crashed", why=why, worker=_bare(parcel.address)))
+                self._over(parcel.jobs[0], Ended("crashed", why=why, worker=bare(parcel.address)))
             else:
                 self._suspects += parcel.jobs
             return
@@ -310,7 +316,7 @@ class ClusterEngine:
         for job in parcel.jobs:
             self._tries[job.name] += 1
             if self._tries[job.name] >= TRIES:
-                self._over(job, Ended("failed", why=why, is_bug=True, worker=_bare(parcel.address)))
+                self._over(job, Ended("failed", why=why, is_bug=True, worker=bare(parcel.address)))
             else:
                 self._suspects.append(job)
 
@@ -334,19 +340,27 @@ class ClusterEngine:
             )
 
     def _look_for_workers(self) -> None:
-        if self._places:
-            self._alone_since = None
-            return
+        """A batch system's queue is waited for as long as it takes; its jobs are alike, so not for one that renders."""
+        renders_wait = self._waiting["renders"] or any(job.stage == "renders" for job in self._suspects)
+        lacking, fix = "", ""
+        if not self._places:
+            lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads 1`"
+        elif renders_wait and not any(place.can_render for place in self._places.values()):
+            lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
+            fix = f"install tofpod on the workers just as here; {len(self._places)} that cannot render are there"
         now = time.monotonic()
-        self._alone_since = self._alone_since or now
-        kind = "jobqueue" if self._scheduler.startswith("jobqueue:") else "address"
-        limit_s = WAIT_FOR_WORKERS_S[kind]
-        self._tell_once(f"waiting for workers of {self._scheduler}, at most {limit_s:.0f} s")
-        if now - self._alone_since > limit_s:
-            raise UserError(
-                f"no worker came to {self._scheduler} within {limit_s:.0f} s",
-                fix="start some with `dask worker ADDRESS --nthreads 1`, or look into the batch system's queue",
-            )
+        if lacking != self._lacking:
+            self._lacking, self._lacking_since, self._lack_told = lacking, now, now
+        spent_s = now - self._lacking_since
+        if lacking == "worker" and self._scheduler.startswith("jobqueue:"):
+            self._tell_once(f"waiting for workers of {self._scheduler}, as long as its queue takes")
+            if now - self._lack_told >= TELL_AGAIN_S:
+                self._lack_told = now
+                tell(f"no worker of {self._scheduler} after {spent_s / 60:.0f} minutes: look into its queue")
+        elif lacking:
+            self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_WORKERS_S:.0f} s")
+            if spent_s > WAIT_FOR_WORKERS_S:
+                raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_WORKERS_S:.0f} s", fix=fix)
 
     def _look_for_overdue(self) -> None:
         """A worker whose own clock stands still, as a job keeps its interpreter, is ended by its nanny."""
@@ -361,13 +375,14 @@ class ClusterEngine:
                 why = f"not done after {spent_s:.0f} s (--time-limit); its worker does not answer"
                 for parcel in place.parcels:
                     self._link.void(parcel)
-                    self._suspect(parcel, place, Ended("timed out", why=why, worker=_bare(place.address)))
+                    self._suspect(parcel, place, Ended("timed out", why=why, worker=bare(place.address)))
 
     # ---------------------------------------------------------------- the cache
 
     def _place_probe(self, folder: Path) -> None:
-        """A file that tells whether a worker sees the driver's cache of renders."""
-        self._probe = folder / f".seen-{self._nonce}"
+        """A file that tells whether a worker sees the driver's cache of renders; to `scenes.render.store` a leftover,
+        where this process is killed."""
+        self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
         write_text(self._probe, self._nonce)
         seen = self._link.sees(self._places, str(self._probe))
         for place in self._places.values():
@@ -382,8 +397,3 @@ class ClusterEngine:
         if message not in self._told:
             self._told.add(message)
             tell(message)
-
-
-def _bare(address: str) -> str:
-    """host:port."""
-    return address.rpartition("://")[2]

@@ -96,6 +96,8 @@ class Link:
     _views: OrderedDict[Path, Any] = field(default_factory=OrderedDict)
     _memory_mb: dict[str, float] = field(default_factory=dict)
     _sent: int = 0
+    _known: set[str] = field(default_factory=set)
+    """Addresses of workers that are there, looked at or about to be."""
 
     @property
     def is_alive(self) -> bool:
@@ -104,11 +106,10 @@ class Link:
 
     def watch(self, probe: Callable[[], str | None]) -> None:
         """Tell of all workers, those that are there and those to come. ``probe``: the file they are to look for."""
-        known: set[str] = set()
 
         def look_at(address: str) -> None:
-            if address not in known:
-                known.add(address)
+            if address not in self._known:
+                self._known.add(address)
                 self._later(self._look_at(address, probe))
 
         def heard(event: tuple[float, Any]) -> None:
@@ -118,7 +119,7 @@ class Link:
             if said.get("action") == "add-worker":
                 look_at(said["worker"])
             elif said.get("action") == "remove-worker":
-                known.discard(said["worker"])
+                self._known.discard(said["worker"])
                 self.events.put(Left(said["worker"], self._memory_mb.pop(said["worker"], None)))
 
         def too_big(event: tuple[float, Any]) -> None:
@@ -139,8 +140,10 @@ class Link:
                 said = answers.get(address)
             except Exception as error:
                 said = error
-            if isinstance(said, Worker | ImportError | AttributeError):
+            if isinstance(said, Worker | ImportError | AttributeError) or address not in self._known:
                 break
+        if address not in self._known:
+            return  # that it left is told already
         self.events.put(Joined(address, said if said is not None else OSError("no answer")))
 
     def sees(self, addresses: Iterable[str], probe: str) -> dict[str, str | None]:
@@ -303,3 +306,8 @@ def _quiet() -> Iterator[None]:
 def tell(message: str) -> None:
     """One line to the user, beside the progress."""
     print(message, file=sys.stderr, flush=True)
+
+
+def bare(address: str) -> str:
+    """host:port."""
+    return address.rpartition("://")[2]

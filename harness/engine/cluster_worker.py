@@ -64,6 +64,8 @@ class Worker:
 _one_at_a_time = threading.Lock()
 _hung = threading.Event()
 _renderer: RenderServer | None = None
+_pinned: Any = None
+"""The limit of threads, which holds as long as the process."""
 
 
 async def examine(probe: str | None, dask_worker: Any) -> Worker:
@@ -72,11 +74,18 @@ async def examine(probe: str | None, dask_worker: Any) -> Worker:
 
 
 def _examined(probe: str | None, dask_worker: Any) -> Worker:
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # read by libraries that are not loaded yet
+    global _pinned
+    # read by libraries that are not loaded yet; those that are (dask loads numpy, and so does this module) are asked
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    import cv2
+    from threadpoolctl import threadpool_limits
+
     import harness.engine.trial  # noqa: F401
     from harness.engine import plan
     from scenes.render import cache
 
+    _pinned = threadpool_limits(1)
+    cv2.setNumThreads(1)
     resources = dask_worker.state.total_resources
     return Worker(
         python=platform.python_version(),

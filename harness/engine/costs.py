@@ -49,9 +49,9 @@ LINE_OF_PATHS, LINE_OF_DIRECT, FEW_LINES = 0.07, 0.02, 3
 # ---------------------------------------------------------------- trials
 FRAME_PIXEL_S: Mapping[str, float] = {"amcw_imager": 1.7e-7, "scanned_lidar": 4.5e-8}
 """A frame drawn and averaged, a pixel, by kind of camera."""
-SORT_FRAMES = 14.0
+SORT_FRAMES = 15.0
 """A view's pixels are sorted once before averages are drawn at once: as much as so many frames take."""
-BLOCK_FRAMES = 1.0
+BLOCK_FRAMES = 1.5
 """A block of 32 frames that are drawn at once, likewise."""
 FRAMES_OF_BLOCK = 32
 LOAD_BYTE_S = 7e-9
@@ -110,10 +110,14 @@ def trial_cost(group: Group, batch: Batch, jobs: int) -> Cost:
     lines = len(camera_of(batch.views[0].render.camera).optics.frequencies_hz)
     kind = kind_of(batch.views[0].render.camera)
     counts = {point.config.capture.frames for point in points}
-    exact = kind not in AT_ONCE or max(counts, default=0) < FEWEST_FRAMES or all(_is_exact(point) for point in points)
-    loads = min(jobs, most) / most
-    blocks = len(counts) + max(counts, default=0) // FRAMES_OF_BLOCK
-    frames = max(counts, default=0) + len(counts) if exact else BLOCK_FRAMES * blocks + SORT_FRAMES * loads
+    whole = kind not in AT_ONCE or all(_is_exact(point) for point in points)
+    one_by_one = {count for count in counts if whole or count < FEWEST_FRAMES}
+    together = counts - one_by_one
+    exact, loads = not together, min(jobs, most) / most
+    frames: float = max(one_by_one, default=0) + len(one_by_one)
+    if together:
+        blocks = len(together) + max(together) // FRAMES_OF_BLOCK
+        frames += BLOCK_FRAMES * blocks + SORT_FRAMES * loads
     seconds = FRAME_PIXEL_S.get(kind, FRAME_PIXEL_S["amcw_imager"]) * frames * sum(pixels)
     seconds += LOAD_BYTE_S * sum(view_bytes(one, lines) for one in regions) * loads
     damages = len(batch.views[0].set_up.target.damages) if batch.role == "damaged" else 0

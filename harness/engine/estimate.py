@@ -242,7 +242,7 @@ def _thresholds(group: Group, keys: list[str], records: _Records) -> dict[str, f
             return None
         if entry.record is not None:
             calibration.add(key, entry.record["runs"])
-    return calibration.thresholds(may_lack=True)[0]
+    return calibration.thresholds()[0]
 
 
 def _count(number: int, what: str, plural: str = "s") -> str:

@@ -69,7 +69,8 @@ class Journal:
 
     def entries(self) -> Iterator[tuple[str, Path]]:
         """(key, file) of every entry, in order of keys."""
-        paths = {path.stem: path for path in self.folder.glob(f"??/*{SUFFIX}")}
+        found = self.folder.glob(f"??/[!.]*{SUFFIX}")  # a name with a dot is a file that is being written
+        paths = {path.stem: path for path in found}
         yield from sorted(paths.items())
 
     def _path(self, key: str) -> Path:

@@ -55,11 +55,12 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
             if error.errno not in NO_LOCKS:
                 raise
             print(f"{path.parent}: is not locked, as its file system cannot: start no second sweep", file=sys.stderr)
+        file.truncate(0)
         if not shared:
-            file.truncate(0)
             file.write(f"{os.getpid()}\n")
             file.flush()
         yield
+        file.truncate(0)
 
 
 def _who(file: IO[str]) -> str:

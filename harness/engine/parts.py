@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -9,6 +10,9 @@ from typing import Any
 
 from harness.engine.plan import Batch, Plan, RenderJob
 from harness.engine.shard import Shard
+
+MOST_REPEATS = 256
+"""Of a part, which is looked up and queued as one."""
 
 
 @dataclass(eq=False)
@@ -55,9 +59,14 @@ def parts_of(plan: Plan, shard: Shard) -> tuple[list[list[Part]], list[list[Part
             count = group.most_repeats(batch)
             repeats = range(max(mine.start - before, 0), min(mine.stop - before, count))
             before += count
-            if repeats:
-                judged.append(Part(number, batch, False, repeats))
+            judged += [Part(number, batch, False, some) for some in _pieces(repeats)]
         then.append(judged)
-        whole = [(batch, range(group.most_repeats(batch))) for batch in group.first]
-        first.append([Part(number, batch, True, repeats) for batch, repeats in whole if judged and repeats])
+        whole = [(batch, range(group.most_repeats(batch))) for batch in group.first if judged]
+        first.append([Part(number, batch, True, some) for batch, repeats in whole for some in _pieces(repeats)])
     return first, then
+
+
+def _pieces(repeats: range) -> Iterator[range]:
+    """Repeats in pieces of at most `MOST_REPEATS`."""
+    for start in range(repeats.start, repeats.stop, MOST_REPEATS):
+        yield range(start, min(start + MOST_REPEATS, repeats.stop))

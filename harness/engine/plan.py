@@ -163,6 +163,7 @@ def _point_task(point: Point, threshold: float | None) -> PointTask:
         detector=config.detector.name,
         settings_json=canonical_json(config.detector.settings),
         average=config.capture.average,
+        exact=config.capture.exact,
         radius_m=config.matching.radius_mm * MM,
         threshold=threshold,
         mapping=config.mapping,

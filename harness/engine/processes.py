@@ -7,16 +7,19 @@ pipe of its own, so who held which job is known.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from harness.engine.work import TRACEBACK_CHARACTERS, Ended, Job, Limits, Stage, attempt
 from harness.vocabulary.errors import UserError
@@ -25,8 +28,12 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 """One thread a process: sums are then in one order on every machine, and processes do not fight for cores."""
 MOST_RENDERERS = 2
 """Processes that render, of 2 GB each."""
+PR_SET_PDEATHSIG = 1
+"""Of Linux' prctl(2)."""
 LOOKS_S = 1.0
 """Between looks whether the driver is still there."""
+START_S = 300.0
+"""For a process to load what it needs; seconds, but from a network's disk."""
 DUMP_S = 0.3
 """What a process that hangs is given to say where; its own signal handler needs a millisecond."""
 SHORT_S = 0.5
@@ -45,16 +52,19 @@ class LocalEngine:
         self._limits: dict[Stage, Limits] = {"trials": limits, "renders": Limits(limits.seconds, None)}
         self._workers: dict[Stage, list[_Worker]] = {"trials": [], "renders": []}
         self._false_starts = 0
-        self._said = tempfile.TemporaryDirectory(prefix="tofpod-")
+        self._said: tempfile.TemporaryDirectory[str]
         self._number = 0
 
     def __enter__(self) -> LocalEngine:
+        self._said = tempfile.TemporaryDirectory(prefix="tofpod-")
         return self
 
     def __exit__(self, *error: object) -> None:
-        for workers in self._workers.values():
-            for worker in workers:
-                worker.kill()
+        everyone = [worker for workers in self._workers.values() for worker in workers]
+        for worker in everyone:
+            worker.strike()
+        for worker in everyone:
+            worker.kill()
         self._said.cleanup()
 
     def room(self, stage: Stage) -> int:
@@ -90,7 +100,8 @@ class LocalEngine:
             pipes = {worker.pipe: worker for worker in busy}
             for pipe in wait(list(pipes), timeout=_soonest(busy)):
                 ended += self._heard(pipes[pipe])  # type: ignore[index]
-            ended += [self._overdue(worker) for worker in self._busy() if worker.left_s() <= 0]
+            for worker in [one for one in self._busy() if one.left_s() <= 0]:
+                ended += self._overdue(worker)
         self._end_idle_renderers()
         return ended
 
@@ -104,12 +115,13 @@ class LocalEngine:
         try:
             said = worker.hear()
         except (EOFError, OSError):
+            words = worker.last_words()
             self._remove(worker)
             if worker.is_ready:
-                yield job, Ended("crashed", why=worker.last_words(), seconds=worker.spent_s(), worker=worker.name)
+                yield job, Ended("crashed", why=words, seconds=worker.spent_s(), worker=worker.name)
                 self._pass_on(worker)
             else:
-                self._start_again(job, worker)
+                self._start_again(job, words)
             return
         if said is None:
             self._false_starts = 0
@@ -120,25 +132,29 @@ class LocalEngine:
             worker.next_job = None
         yield job, said
 
-    def _start_again(self, job: Job, worker: _Worker) -> None:
+    def _start_again(self, job: Job, words: str) -> None:
         """A process that died before it could begin: another gets the job, unless none seems to be able to start."""
         self._false_starts += 1
         if self._false_starts >= FALSE_STARTS:
             raise UserError(
-                f"{FALSE_STARTS} worker processes in a row died as they started: {worker.last_words()}",
+                f"{FALSE_STARTS} worker processes in a row died as they started: {words}",
                 legal="trials need about 1 GB of memory a process, renders 2 GB",
-                fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short",
+                fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short, or a"
+                " higher --memory-limit",
             )
         self.submit(job)
 
-    def _overdue(self, worker: _Worker) -> tuple[Job, Ended]:
+    def _overdue(self, worker: _Worker) -> Iterator[tuple[Job, Ended]]:
         job, seconds = worker.job, worker.spent_s()
         assert job is not None
         where = worker.where_it_hangs()
         self._remove(worker)
+        if not worker.is_ready:
+            self._start_again(job, f"not ready after {seconds:.0f} s; it was at:\n{where}")
+            return
         self._pass_on(worker)
-        why = f"not done after {seconds:.0f} s (--time-limit); it was at:\n{where}"
-        return job, Ended("timed out", why=why, seconds=seconds, worker=worker.name)
+        why = f"not done after {seconds:.3g} s (--time-limit); it was at:\n{where}"
+        yield job, Ended("timed out", why=why, seconds=seconds, worker=worker.name)
 
     def _pass_on(self, worker: _Worker) -> None:
         """The next job of a process that is gone, which it never saw."""
@@ -180,7 +196,7 @@ class _Worker:
         self._since = time.monotonic()
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        with one_thread():
+        with one_thread(), _without_interrupts():
             self._process = context.Process(
                 target=_serve, args=(theirs, name, stage, limits.memory_mb, str(said)), name=name, daemon=True
             )
@@ -217,10 +233,10 @@ class _Worker:
         return 0.0 if self.job is not None else self.spent_s()
 
     def left_s(self) -> float:
-        """To the time limit; endless without one, and while the process starts."""
-        if self._limits.seconds is None or not self.is_ready:
-            return float("inf")
-        return self._limits.seconds - self.spent_s()
+        """To the time limit, endless without one; while the process starts, to the end of what that may take."""
+        if not self.is_ready:
+            return START_S - self.spent_s()
+        return float("inf") if self._limits.seconds is None else self._limits.seconds - self.spent_s()
 
     def where_it_hangs(self) -> str:
         """The end of the process' traceback, by its own signal handler."""
@@ -242,6 +258,10 @@ class _Worker:
             return f"its process was ended by {name}{hint}" + (f"\n{said}" if said else "")
         return f"its process ended itself with code {code}" + (f"\n{said}" if said else "")
 
+    def strike(self) -> None:
+        """Begin to end the process, without waiting for it."""
+        self._process.kill()
+
     def kill(self) -> None:
         """End the process, whatever it does."""
         self._process.kill()
@@ -261,30 +281,66 @@ def one_thread() -> Iterator[None]:
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process that is started here does not hear Ctrl-C, not even before it can say so itself."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _serve(pipe: Connection[Any, Any], name: str, stage: Stage, memory_mb: int | None, said: str) -> None:
     """Of a worker: jobs one after another until the driver closes the pipe."""
-    _serve_the_driver(said)
-    if memory_mb is not None:
-        limit_memory(memory_mb)
-    if stage == "trials":
-        # what every trial needs is loaded before time counts
-        import harness.engine.trial  # noqa: F401
-    pipe.send(None)
+    words = _serve_the_driver(said)
+    try:
+        if memory_mb is not None:
+            limit_memory(memory_mb)
+        if stage == "trials":
+            _load_what_trials_need()
+        pipe.send(None)
+    except BaseException:
+        traceback.print_exc(file=words)
+        words.flush()
+        os._exit(1)
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send(attempt(pipe.recv(), name))
 
 
-def _serve_the_driver(said: str) -> None:
+def _load_what_trials_need() -> None:
+    """Before time counts."""
+    import cv2
+
+    import harness.engine.trial  # noqa: F401
+
+    cv2.setNumThreads(1)
+
+
+def _serve_the_driver(said: str) -> IO[str]:
     """Ctrl-C is the driver's to hear; without a driver there is nothing to do; crashes and hangs tell where."""
     import faulthandler
 
+    _die_with_the_driver()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     words = open(said, "w")  # noqa: SIM115 (open as long as the process lives)
     faulthandler.enable(words)
     if hasattr(faulthandler, "register"):
         faulthandler.register(signal.SIGUSR1, words, all_threads=False)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    return words
+
+
+def _die_with_the_driver() -> None:
+    """Let the system end this process with its parent, even one that never lets Python run (Linux)."""
+    if not sys.platform.startswith("linux"):
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 def _end_with(driver: int) -> None:

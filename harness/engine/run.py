@@ -5,9 +5,9 @@ ends is in the journal; what the journal holds is not run again, nor is what onl
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,17 @@ from harness.engine.rendering import render_into_cache
 from harness.engine.shard import WHOLE, Shard
 from harness.engine.trial import TrialTask, run_trial
 from harness.engine.work import Ended, Engine, Job
+from scenes.render.cache import read_view
 
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
 RENDER_TRIES = 2
-"""A render whose process died is begun once more: two of them may have been too much for the memory."""
+"""A render whose process died is begun once more: two of them may have been too much for the memory. So is a trial that
+sets a threshold, since with another threshold all that was judged by it would be run again."""
+PARTS_AT_ONCE = 200
+"""That are looked up in the journal before the engine is asked again: some 0.1 s."""
+TOLD_WHOLE = 200
+"""Failures whose traceback is kept in memory; of the others the journal has it."""
 
 
 def run_plan(
@@ -45,23 +51,32 @@ def run_plan(
     state = _Run(plan, journal, engine, report, shard, retry_failed)
     state.start()
     while state.feed():
-        for job, ended in engine.ended():
+        for job, ended in engine.ended() if state.waits else ():
             state.take(job, ended)
+    if state.outcome.trials.over != state.outcome.trials.total:
+        raise RuntimeError(f"trials were lost: {state.outcome.trials}")
     state.outcome.seconds = time.monotonic() - began
     state.outcome.finished.sort()
+    state.outcome.examples = [one for number in sorted(state.examples) for one in state.examples[number]]
     state.outcome.failures.sort(key=lambda failure: failure.what)
     return state.outcome
 
 
-def render_missing(jobs: Iterable[RenderJob], engine: Engine) -> None:
-    """Have views rendered that the cache lacks, for pictures of trials that were run elsewhere."""
-    waiting = deque(_render_job(job) for job in {job.path: job for job in jobs if not job.path.exists()}.values())
-    under_way = 0
+def render_missing(jobs: Iterable[RenderJob], engine: Engine) -> list[Failure]:
+    """Have views rendered that the cache lacks or holds damaged, for pictures of trials that are done. Returns what
+    could not be."""
+    distinct = {job.path: job for job in jobs}
+    waiting = deque(_render_job(job) for job in distinct.values() if read_view(job.path) is None)
+    under_way, failures = 0, []
     while waiting or under_way:
         while waiting and engine.room("renders") > 0:
             engine.submit(waiting.popleft())
             under_way += 1
-        under_way -= len(engine.ended())
+        for job, ended in engine.ended():
+            under_way -= 1
+            if ended.state != "done":
+                failures.append(Failure(f"view {job.name} for a picture", ended.why, ended.is_bug, ended.state))
+    return failures
 
 
 def _render_job(job: RenderJob) -> Job:
@@ -83,6 +98,8 @@ class _Views:
     jobs: dict[Path, RenderJob] = field(default_factory=dict)
     there: set[Path] = field(default_factory=set)
     lost: dict[Path, str] = field(default_factory=dict)
+    users: Counter[Path] = field(default_factory=Counter)
+    """Parts that are not over, and pictures: a view without any is not rendered."""
     wanted: deque[Path] = field(default_factory=deque)
     later: deque[Path] = field(default_factory=deque)
     """Will be wanted once thresholds are set; rendered when nothing is wanted now."""
@@ -104,7 +121,7 @@ class _Views:
             return self.wanted.popleft()
         while self.later:
             path = self.later.popleft()
-            if path not in self.asked:
+            if path not in self.asked and self.users[path]:
                 self.asked.add(path)
                 return path
         return None
@@ -131,11 +148,20 @@ class _Run:
         self._views = _Views(
             {job.path: job for parts in (*self._first, *self._then) for p in parts for job in p.renders}
         )
+        self._views.users.update(path for parts in (*self._first, *self._then) for p in parts for path in p.paths)
         self._to_open: deque[Part] = deque()
         self._queue: deque[_Trial] = deque()
         self._waiting: dict[Path, list[Part]] = {}
         self._pictures: deque[int] = deque()
         """Groups whose trials are over and whose pictures are not begun."""
+        self._prefetched: set[int] = set()
+        """Groups whose judged views are asked for."""
+        self._tried: set[str] = set()
+        """Calibrations whose process died once."""
+        self._ahead = 0
+        """Trials that are open and not begun."""
+        self.examples: dict[int, list[Any]] = {}
+        """By group."""
         self._under_way: dict[str, _Trial | RenderJob | int] = {}
         """By name of the job; a number is that of a group whose pictures are made."""
         self.outcome.renders.total = len(self._views.jobs)
@@ -151,9 +177,16 @@ class _Run:
             elif self._then[number]:
                 self._calibrated(number)
 
+    @property
+    def waits(self) -> bool:
+        """Whether the engine has something to do."""
+        return bool(self._under_way)
+
     def feed(self) -> bool:
-        """Hand the engine what it has room for. False where nothing is left to wait for."""
-        while self._to_open and len(self._queue) + len(self._waiting) < AHEAD:
+        """Hand the engine what it has room for, and look a few more parts up. False where nothing is left to do."""
+        for _ in range(PARTS_AT_ONCE):
+            if not self._to_open or self._ahead >= AHEAD:
+                break
             self._open(self._to_open.popleft())
         while self._engine.room("renders") > 0 and (path := self._views.next()) is not None:
             job = self._views.jobs[path]
@@ -161,7 +194,7 @@ class _Run:
         while self._engine.room("trials") > 0 and (self._queue or self._pictures_ready()):
             self._submit_trial() if self._queue else self._submit_pictures()
         self._report(Progress(self.outcome.renders, self.outcome.trials))
-        return bool(self._under_way)
+        return bool(self._under_way or self._to_open or self._queue)
 
     def _submit(self, job: Job, work: _Trial | RenderJob | int) -> None:
         self._under_way[job.name] = work
@@ -169,6 +202,7 @@ class _Run:
 
     def _submit_trial(self) -> None:
         trial = self._queue.popleft()
+        self._ahead -= 1
         # another shard with the same folder may have run a calibration meanwhile
         if not self._shard.is_whole and trial.part.sets_threshold and self._found(trial.part, trial.key):
             self._trial_over(trial)
@@ -198,18 +232,21 @@ class _Run:
         if not missing:
             self._part_over(part)
             return
-        if part.sets_threshold:
-            self._views.later += [job.path for later in self._then[part.group] for job in later.renders]
+        if part.sets_threshold and part.group not in self._prefetched:
+            self._prefetched.add(part.group)
+            self._views.later += [path for later in self._then[part.group] for path in later.paths]
         absent = self._views.want(part.renders)
         lost = [self._views.lost[path] for path in absent if path in self._views.lost]
         if lost:
             self._skip(missing, lost[0])
         elif absent:
             part.absent, part.trials = absent, missing
+            self._ahead += len(missing)
             for path in absent:
                 self._waiting.setdefault(path, []).append(part)
         else:
             self._queue += missing
+            self._ahead += len(missing)
 
     def _trials(self, part: Part) -> Iterator[_Trial]:
         group = self._groups[part.group]
@@ -240,9 +277,13 @@ class _Run:
             self._render_over(work, ended)
         elif isinstance(work, int):
             if ended.state == "done":
-                self.outcome.examples += ended.value
+                self.examples[work] = ended.value
             else:
                 self.outcome.failures.append(Failure(job.name, ended.why, ended.is_bug, ended.state))
+        elif ended.state == "crashed" and work.part.sets_threshold and work.key not in self._tried:
+            self._tried.add(work.key)
+            self._queue.append(work)
+            self._ahead += 1
         else:
             entry = Entry.of(ended)
             self._journal.write(work.key, entry)
@@ -262,7 +303,9 @@ class _Run:
 
     def _failed(self, key: str, entry: Entry) -> None:
         self.outcome.trials.failed += 1
-        self.outcome.failures.append(Failure(key, entry.why, entry.is_bug, entry.state))
+        failure = Failure(key, entry.why, entry.is_bug, entry.state)
+        told = len(self.outcome.failures) < TOLD_WHOLE
+        self.outcome.failures.append(failure if told else replace(failure, why=failure.in_short))
 
     def _render_over(self, job: RenderJob, ended: Ended) -> None:
         counts, path = self.outcome.renders, job.path
@@ -284,6 +327,7 @@ class _Run:
         self._views.lost[path] = self.outcome.failures[-1].in_short
         for part in self._waiting.pop(path, ()):
             trials, part.trials = part.trials, []
+            self._ahead -= len(trials)
             self._skip(trials, self._views.lost[path])
 
     def _view_there(self, part: Part, path: Path) -> None:
@@ -307,9 +351,9 @@ class _Run:
 
     def _part_over(self, part: Part) -> None:
         """After the parts that set thresholds the judged ones may begin; after those there are pictures to make."""
-        for job in part.renders:
-            if job.path not in self._views.asked:
-                self._views.asked.add(job.path)
+        for path in part.paths:
+            self._views.users[path] -= 1
+            if not self._views.users[path] and path not in self._views.asked:
                 self.outcome.renders.total -= 1  # nobody needs it
         part.is_over = True
         group = self._groups[part.group]
@@ -321,7 +365,7 @@ class _Run:
 
     def _calibrated(self, number: int) -> None:
         """Each point's threshold; then what is judged by it may begin."""
-        thresholds, failures = self._calibrations[number].thresholds(may_lack=bool(self.outcome.failures))
+        thresholds, failures = self._calibrations[number].thresholds()
         self.outcome.thresholds |= thresholds
         self.outcome.failures += failures
         if thresholds:
@@ -336,6 +380,9 @@ class _Run:
     def _want_pictures(self, number: int) -> None:
         group = self._groups[number]
         if any(point.digest in self.outcome.thresholds for point in group.points):
+            for job in group.damaged.renders:
+                self.outcome.renders.total += not self._views.users[job.path] and job.path not in self._views.asked
+                self._views.users[job.path] += 1
             self._views.want(group.damaged.renders)
             self._pictures.append(number)
 

@@ -17,11 +17,15 @@ class SerialEngine:
         self._pinned = contextlib.ExitStack()
 
     def __enter__(self) -> SerialEngine:
+        import cv2
         from threadpoolctl import threadpool_limits
 
         # libraries that are loaded later read the environment, those that are loaded by now are asked
         self._pinned.enter_context(one_thread())
         self._pinned.enter_context(threadpool_limits(1))
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        self._pinned.callback(cv2.setNumThreads, threads)
         return self
 
     def __exit__(self, *error: object) -> None:

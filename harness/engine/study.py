@@ -57,11 +57,11 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder = experiment.folder(out)
     _refuse_newer(folder)
-    plan = plan_of(experiment, _cache(out))
-    # The first file written: an unwritable folder shows before any work is done.
-    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
-    journal = Journal(folder / "journal")
     try:
+        plan = plan_of(experiment, _cache(out))
+        # The first file written: an unwritable folder shows before any work is done.
+        write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+        journal = Journal(folder / "journal")
         with in_use(_cache(out)), locked(folder, options.shard), engine_of(options) as engine:
             with progress_display() as show:
                 outcome = run_plan(plan, journal, engine, show, shard=options.shard, retry_failed=options.retry_failed)
@@ -79,11 +79,11 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 table, text = _final_table(tables)
             else:
                 table, text = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
+        if options.cache_limit_gb is not None:
+            trim_cache(_cache(out), round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
-    if options.cache_limit_gb is not None:
-        trim_cache(_cache(out), round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     _conclude(folder, table, text, outcome)
     return 1 if outcome.failures else 0
 
@@ -135,8 +135,9 @@ def _write_study(
     result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
     shown = shown_in(plan, result.limits)
     # of trials that were run on other machines the views may not be here
-    render_missing((job for one in shown for job in one.batch.renders), engine)
-    examples = study_examples(shown, outcome.thresholds)
+    lost = render_missing((job for one in shown for job in one.batch.renders), engine)
+    outcome.failures += lost
+    examples = study_examples([] if lost else shown, outcome.thresholds)
     title = experiment.config.title or experiment.config.name
     write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
     return study_table(result), study_text(result)
@@ -161,7 +162,8 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
         first = next((failure for failure in outcome.failures if failure.state != "skipped"), None)
         alike = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
         why = first.why if first is not None and len(alike) == 1 else _reasons(outcome)
-        raise UserError(f"no trial of {name} succeeded: {why}")
+        what = "trial was judged" if outcome.finished else "trial succeeded"
+        raise UserError(f"no {what} of {name}: {why}")
     print(bug.why, file=sys.stderr)
     count = outcome.trials.failed
     print(f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})", file=sys.stderr)
@@ -288,7 +290,11 @@ def _conclude(folder: Path, table: Table, text: str, outcome: Outcome) -> None:
 def _tell_failures(outcome: Outcome) -> None:
     if outcome.failures:
         print(f"{_counted(outcome)}: {_reasons(outcome)}", file=sys.stderr)
-        print("the same command with --retry-failed runs these trials again", file=sys.stderr)
+        counts = _counts(outcome)
+        if set(counts) - {"skipped"}:
+            print("the same command with --retry-failed runs again what failed, crashed or timed out", file=sys.stderr)
+        if "skipped" in counts:
+            print("the same command runs again what was skipped", file=sys.stderr)
 
 
 def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> int:

@@ -105,6 +105,8 @@ def failed_by_point(plan: Plan, whats: Iterable[str], thresholds: Mapping[str, f
     """How many trials of each point raised, from the journal keys of failures."""
     keys = set(whats)
     counts: dict[str, int] = {}
+    if not keys:
+        return counts
     for group in plan.groups:
         for batch in group.batches:
             given = {} if batch in group.first else thresholds

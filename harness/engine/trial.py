@@ -89,8 +89,7 @@ def _clouds(
     counts = sorted({point.frames for point, n in zip(points, views, strict=True) if n is None or number < n})
     if not counts:
         return {}
-    exact = any(point.exact for point in points)
-    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, config, exact)
+    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, config, exact=points[0].exact)
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
@@ -174,7 +173,7 @@ class _Judged:
 def _by_average(points: Sequence[PointTask]) -> Iterator[tuple[AverageConfig, list[PointTask]]]:
     groups: dict[str, list[PointTask]] = {}
     for point in points:
-        groups.setdefault(canonical_json(point.average.to_data()), []).append(point)
+        groups.setdefault(canonical_json([point.average.to_data(), point.exact]), []).append(point)
     for group in groups.values():
         yield group[0].average, group
 

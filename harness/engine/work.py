@@ -102,8 +102,9 @@ def attempt(job: Job, worker: str) -> Ended:
         state = "done"
     except UserError as mistake:
         why = str(mistake)
-    except MemoryError:
-        why = "out of memory: it wants more than its worker may have (--memory-limit)"
+    except MemoryError as error:
+        where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
+        why = f"out of memory ({str(error) or 'no more'}), of what its process may have (--memory-limit)\n{where}"
     except Exception as error:
         why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
     return Ended(state, value, why, is_bug, time.monotonic() - began, _peak_mb(), worker)

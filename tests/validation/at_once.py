@@ -1,6 +1,6 @@
 """Averages drawn at once against averages of frames on rendered thesis boards, a table of ratios: minutes.
 
-Run ``python -m tests.validation.at_once --captures 400`` from the project's root. For each camera and board it renders
+Run ``python tests/validation/at_once.py --captures 400``. For each camera and board it renders
 the view, draws that many averages of 50 frames either way, and prints for even, uneven and listed pixels (see
 `scenes.sensor.amcw.at_once`) the ratios, at once over frame by frame, of the variance of z between captures, of the
 sample variance and of the share beyond three deviations; the correlation with neighbours both ways; and the mean's and
@@ -96,7 +96,7 @@ def row(pixels: np.ndarray, frames: tuple[np.ndarray, ...], at_once: tuple[np.nd
 
 def main(arguments: list[str]) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.validation.at_once", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tests/validation/at_once.py", description=__doc__)
     parser.add_argument("--captures", type=int, default=400)
     parser.add_argument("--cameras", nargs="+", default=["azure_kinect_nfov", "kinect_v2"])
     parser.add_argument("--boards", nargs="+", default=list(BOARDS), choices=list(BOARDS))

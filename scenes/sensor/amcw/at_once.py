@@ -4,8 +4,23 @@
 order, its frames are a moving sum of one normal a pixel, displaced and rounded (`linear_frames`); where a gate is sure
 to stop it, nothing is drawn; all others, at rims mostly, go through the whole chain with the windows that they need
 (`listed`), and pixels beside them get the same noise. Frames are independent, so sums over parts of a capture add up.
-What is not as in a frame: amplitudes are drawn for the mean only, and independent of z; a pixel without a range has, in
-all its frames, the reason that its mean has; variance of second order (0.4 % at most) is put on the centre's noise.
+What is not as in a frame: amplitudes have their own noise, independent of that of z (in frames their correlation is
+0.1 at most, at rims of a camera that weighs by amplitude); a pixel without a range has, in all its frames, the reason
+that its mean has; variance of second order (2.5 % at most) is put on the centre's noise.
+
+Thesis boards (flat, blind, 20 mm, 200 mm, none behind), 150 averages of 50 frames drawn at once over 150 of frames, by
+tests/validation/at_once.py; deviations of the ratios by chance are some 0.005 (even), 0.01 (others), 0.05 (beyond 3):
+
+| camera | pixels | variance of the average | share beyond 3 deviations | correlation at lags 1, 2, 3, 4 |
+|---|---|---|---|---|
+| Azure | even, 30,000 | 1.001 1.000 1.000 0.999 1.000 | 1.00 1.00 1.01 0.98 1.00 | .58 .42 .28 .14, both ways |
+| Azure | uneven, 2,000 to 4,000 | 0.995 0.996 1.002 1.004 1.002 | 0.94 0.94 1.00 1.05 0.99 | equal to 0.01 |
+| Azure | listed, 900 to 1,500 | 1.008 1.008 1.006 0.999 1.000 | 1.07 1.07 1.03 0.93 0.95 | equal to 0.01 |
+| Kinect v2 | even, 20,000 | 0.998 0.998 0.997 1.001 0.999 | 1.00 0.99 0.98 1.01 1.01 | .60 .28 .00 .00, both ways |
+| Kinect v2 | uneven, 400 to 900 | 1.008 1.012 1.004 0.992 1.002 | 1.11 1.00 0.95 1.06 0.90 | equal to 0.01 |
+| Kinect v2 | listed, 900 to 1,500 | 1.005 1.017 0.986 0.997 0.992 | 1.06 1.06 0.97 1.00 1.00 | equal to 0.01 |
+
+Means differ by 0.92 to 1.04 standard errors (root mean square over pixels), counts of listed pixels by 0.97 to 1.07.
 """
 
 from __future__ import annotations

@@ -1,0 +1,219 @@
+"""The run loop with an engine that runs nothing and ends jobs in any order: no trial is lost, whatever happens when."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_engine_study import TINY as STUDY
+from tiny_sweep import TINY
+
+from harness.engine import run as engine_run
+from harness.engine.journal import Entry, Journal, record_text
+from harness.engine.outcome import Outcome
+from harness.engine.plan import Plan, plan_of
+from harness.engine.run import run_plan
+from harness.engine.shard import Shard
+from harness.engine.trial import TrialTask
+from harness.engine.work import Ended, Job, Stage, State
+from harness.experiment.load import load_experiment
+
+STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
+
+
+class Pretended:
+    """An engine: records are made up from the task, jobs end in the order that ``seed`` draws, or badly by ``ends``."""
+
+    def __init__(self, seed: int = 0, ends: Callable[[Job], State | None] = lambda job: None) -> None:
+        self._rng, self._ends = random.Random(seed), ends
+        self._jobs: list[Job] = []
+        self.begun: Counter[str] = Counter()
+
+    def __enter__(self) -> Pretended:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def room(self, stage: Stage) -> int:
+        return 4 - len(self._jobs)
+
+    def submit(self, job: Job) -> None:
+        self._jobs.append(job)
+        self.begun[job.name] += 1
+
+    def ended(self) -> list[tuple[Job, Ended]]:
+        job = self._jobs.pop(self._rng.randrange(len(self._jobs)))
+        state = self._ends(job)
+        if state is not None:
+            return [(job, Ended(state, why="a fault"))]
+        if job.stage == "renders":
+            return [(job, Ended("done", (False, 0.1)))]
+        if job.name.startswith("pictures"):
+            return [(job, Ended("done", [job.name]))]
+        return [(job, Ended("done", made_up(job.arguments[0])))]
+
+
+def made_up(task: TrialTask) -> str:
+    word = hashlib.sha256(f"{task.board} {task.repeat} {task.role}".encode()).digest()
+    quiet = 3 + word[0] / 256
+    runs = [
+        {"point": one.digest, "quiet_threshold": quiet if one.threshold is None else None, "inspected_m2": 0.06}
+        for one in task.points
+    ]
+    return record_text({"runs": runs})
+
+
+PLANS = {
+    "units that share renders": (TINY, ["sweep={source.camera.unit_seed: [1, 2], capture.frames: [1, 3]}"]),
+    "distances": (TINY, ["sweep={source.target.distance_m: [0.6, 0.7]}", "repeats=3"]),
+    "a given threshold": (TINY, ["threshold={k: 5.0}", "sweep={source.camera.unit_seed: [1, 2]}"]),
+    "many repeats": (TINY, ["repeats=280", "threshold={calibrate: {repeats: 260}}"]),
+    "a study": (STUDY, []),
+    "a study of two distances": (STUDY, ["sweep={source.target.distance_m: [0.6, 0.7]}"]),
+}
+
+
+@pytest.fixture(params=PLANS)
+def plan(request: pytest.FixtureRequest, tmp_path: Path) -> Plan:
+    text, changes = PLANS[request.param]
+    (tmp_path / "tiny.yaml").write_text(text)
+    return plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path / "renders")
+
+
+def go(plan: Plan, folder: Path, engine: Pretended, **asked: object) -> Outcome:
+    return run_plan(plan, Journal(folder), engine, lambda _: None, **asked)  # type: ignore[arg-type]
+
+
+def records(folder: Path) -> dict[str, str | None]:
+    found = {key: Journal(folder).read(key) for key, _ in Journal(folder).entries()}
+    return {key: entry.text for key, entry in found.items() if entry is not None}
+
+
+def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
+    expected = None
+    for seed in range(4):
+        engine = Pretended(seed)
+        outcome = go(plan, tmp_path / str(seed), engine)
+        assert set(engine.begun.values()) == {1}
+        assert outcome.failures == [] and len(outcome.finished) == plan.trial_count == outcome.trials.done
+        assert outcome.renders.done == len(plan.renders)
+        pictures = [f"pictures of set-up {n}" for n, group in enumerate(plan.groups) if not group.is_study]
+        assert outcome.examples == pictures
+        found = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
+        assert expected is None or found == expected
+        expected = found
+
+
+def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
+    """Any trials are missing from the journal, others are left as failed or skipped."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    rng = random.Random(1)
+    for number in range(6):
+        folder = tmp_path / str(number)
+        kept = 0
+        for key in whole.finished:
+            entry = Journal(tmp_path / "whole").read(key)
+            assert entry is not None
+            chance = rng.random()
+            if number == 0 or chance < 0.5:
+                Journal(folder).write(key, entry)
+                kept += 1
+            elif chance < 0.7:
+                Journal(folder).write(key, Entry(rng.choice((*STATES, "skipped")), why="before"))
+        engine = Pretended(number)
+        outcome = go(plan, folder, engine, retry_failed=True)
+        assert (outcome.trials.found, outcome.trials.over) == (kept, plan.trial_count)
+        assert outcome.failures == [] and outcome.finished == whole.finished
+        assert outcome.examples == whole.examples, "pictures are made again, though every trial may be there"
+        assert records(folder) == records(tmp_path / "whole")
+        if number == 0:
+            shown = {job.path.name for group in plan.groups if not group.is_study for job in group.damaged.renders}
+            assert {name for name in engine.begun if name.endswith(".npz")} == shown
+
+
+def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
+    """Renders, calibrations and judged trials end badly at random; mended by running on."""
+    for seed in range(6):
+        rng = random.Random(seed)
+
+        def ends(job: Job, rng: random.Random = rng) -> State | None:
+            return rng.choice(STATES) if rng.random() < 0.2 else None
+
+        folder = tmp_path / str(seed)
+        outcome = go(plan, folder, Pretended(seed, ends))
+        assert outcome.trials.over == outcome.trials.total
+        assert outcome.trials.failed <= len(outcome.failures)
+        assert {one.why for one in outcome.failures} <= {"a fault", *(f.why for f in outcome.failures)}
+        mended = go(plan, folder, Pretended(seed), retry_failed=True)
+        assert mended.failures == [] and len(mended.finished) == plan.trial_count
+
+
+def test_a_render_whose_process_dies_is_tried_once_more(plan, tmp_path):
+    died: Counter[str] = Counter()
+
+    def ends(job: Job) -> State | None:
+        died[job.name] += job.stage == "renders"
+        return "crashed" if died[job.name] == 1 else None
+
+    outcome = go(plan, tmp_path / "journal", Pretended(0, ends))
+    assert outcome.failures == [] and set(died.values()) <= {0, 2}
+
+
+def test_a_calibration_whose_process_dies_is_tried_once_more(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    plan = plan_of(load_experiment(tmp_path / "tiny.yaml"), tmp_path)
+    died: Counter[str] = Counter()
+
+    def ends(job: Job) -> State | None:
+        died[job.name] += job.name.startswith("hole_free")
+        return "crashed" if died[job.name] == 1 else None
+
+    outcome = go(plan, tmp_path / "journal", Pretended(0, ends))
+    assert outcome.failures == [] and sorted(died.values())[-2:] == [2, 2]
+
+
+def test_shards_that_finish_each_others_calibration(plan, tmp_path):
+    """While one shard works, another in the same folder does; in any order of events no judged trial is lost."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    for seed in range(6):
+        folder = tmp_path / str(seed)
+
+        def other_is_faster(job: Job, folder: Path = folder) -> None:
+            for key in whole.finished:
+                entry = Journal(tmp_path / "whole").read(key)
+                if entry is not None and key.startswith(("calibration", "hole_free")):
+                    Journal(folder).write(key, entry)
+
+        rng = random.Random(seed)
+        at = rng.randrange(1, 6)
+
+        def ends(job: Job, at: int = at, seen: list[str] = [], faster=other_is_faster) -> None:  # noqa: B006
+            seen.append(job.name)
+            if len(seen) == at:
+                faster(job)
+
+        total = 0
+        for number in (1, 2):
+            outcome = go(plan, folder, Pretended(seed, ends), shard=Shard(number, 2))
+            assert outcome.failures == [] and outcome.trials.over == outcome.trials.total
+            total += outcome.trials.over
+        joined = go(plan, folder, Pretended())
+        assert (joined.trials.done, joined.trials.found) == (0, plan.trial_count)
+        assert total >= plan.trial_count
+
+
+def test_work_ahead_is_bounded(tmp_path, monkeypatch):
+    """However many repeats: a few thousand tasks are in memory, and the engine gets its first at once."""
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    changes = ["repeats=100000", "threshold={k: 5.0}"]
+    plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path)
+    state = engine_run._Run(plan, Journal(tmp_path / "journal"), Pretended(), lambda _: None, Shard(), False)
+    state.start()
+    assert state.feed()
+    assert state._ahead <= engine_run.AHEAD + 256
+    assert state.outcome.trials.total == 200_000
