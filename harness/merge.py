@@ -51,9 +51,11 @@ def _run(options: argparse.Namespace) -> int:
     _refuse_others(options.folders, options.into)
     merged = Merged()
     declared = next((path for folder in options.folders if (path := folder / "experiment.yaml").is_file()), None)
-    if declared is not None and not (options.into / "experiment.yaml").exists():
+    if declared is not None:
+        # written again where it is there: a folder that cannot be written shows before anything is copied
         write_text(options.into / "experiment.yaml", declared.read_text())
-    options.into.mkdir(parents=True, exist_ok=True)
+    else:
+        raise UserError(f"{options.folders[0]}: has no experiment.yaml", fix="name folders as sweeps leave them")
     with locked(options.into):
         into = Journal(options.into / "journal")
         for folder in options.folders:

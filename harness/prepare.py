@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
     from harness.vocabulary.capture import Cloud
+    from scenes.sensor.source import SimulatedCapture
 
 
 def main() -> int:
@@ -43,9 +45,28 @@ def _prepare() -> int:
         evidence = detector.analyse(cloud)
         for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
             detector.measure(cloud, evidence, detection)
+    _prepare_studies(capture, cloud)
     _prepare_maps(cloud)
     print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def _prepare_studies(capture: SimulatedCapture, cloud: Cloud) -> None:
+    """The loops of averages drawn at once, of automatic crops and of findings at many thresholds."""
+    from dataclasses import replace
+
+    from detectors import load_detector
+    from detectors.average import AverageConfig
+    from detectors.interface import FindsAtOnce
+    from harness.engine.averages import FEWEST_FRAMES, averages_of
+
+    averages_of(replace(capture, n_frames=FEWEST_FRAMES), [FEWEST_FRAMES], AverageConfig(), exact=False)
+    for crop in ({"kind": "auto"}, {"kind": "none"}):
+        detector = load_detector("thesis", {"crop": crop})
+        with suppress(UserError):  # a capture so small may be no target to the crop, whose loops have run by then
+            evidence = detector.analyse(cloud)
+            assert isinstance(detector, FindsAtOnce)
+            detector.centres_at(cloud, evidence, [1.0, 2.0])
 
 
 def _prepare_maps(cloud: Cloud) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import signal
 import sys
 from pathlib import Path
 
@@ -15,6 +16,9 @@ def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(given)
+    if arguments is None:
+        # what batch systems and containers send first is to end as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     return exit_code_of(lambda: _run(options, given))
 
 

@@ -230,6 +230,8 @@ def test_dry_run_counts_and_runs_nothing(finished):
         (["--set", "repeats=0"], "repeats"),
         (["--set", "capture.framse=3"], "did you mean"),
         (["--set", "source.target.distance_m=0.3"], "covers columns"),
+        (["--serial", "--scheduler", "tcp://x:1"], "ask for different engines"),
+        (["--memory-limit", "0.1"], "0.5 GB or more"),
     ],
 )
 def test_mistakes_end_with_one_message_and_exit_2(finished, arguments, expected):

@@ -31,7 +31,7 @@ def results(out: Path, digest: str, name: str = "study", records: int = 0, **sai
     """A folder of results; with a provenance where anything is said of it."""
     folder = out / name / digest
     folder.mkdir(parents=True)
-    (folder / "experiment.yaml").write_text("name: study\n")
+    (folder / "experiment.yaml").write_text("# tofpod experiment 1\nname: study\n")
     journal = Journal(folder / "journal")
     for number in range(records):
         journal.write(f"damaged-{number:05d}-{number:016x}", Entry("done", text='{"runs":[]}'))
@@ -247,6 +247,15 @@ def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
     }
     assert "is kept" in capsys.readouterr().err and tmp_path.parent.is_dir()
     (second / "notes.md").unlink()
+
+
+def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
+    stranger = tmp_path / "photos" / ("0" * 16)
+    stranger.mkdir(parents=True)
+    (stranger / "report.html").write_text("mine")
+    assert clean.main(["results", "photos", "--yes", "--out", str(tmp_path)]) == 2
+    assert "no folder of results" in capsys.readouterr().err
+    assert (stranger / "report.html").read_text() == "mine"
 
 
 def test_the_journal_alone(tmp_path):

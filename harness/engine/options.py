@@ -7,15 +7,18 @@ import argparse
 from harness.engine.opening import DEFAULT_MEMORY_MB, DEFAULT_TIME_LIMIT_S, EngineOptions
 from harness.engine.shard import WHOLE, Shard
 from harness.engine.work import Limits
+from harness.vocabulary.errors import UserError
 
 DEFAULT_CACHE_GB = 20.0
+LEAST_MEMORY_GB = 0.5
+"""A process that has loaded what trials need holds 0.2 GB."""
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add them, in a group of their own."""
     add = parser.add_argument_group("how it is run").add_argument
     add("--jobs", type=whole_number, default=2, metavar="N", help="processes, or workers of a cluster (default: 2)")
-    add("--serial", action="store_true", help="run everything in this process, for a debugger")
+    add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     add(
         "--scheduler",
         metavar="ADDRESS",
@@ -48,6 +51,13 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
     """What was asked for. Raises UserError where it makes no sense."""
+    if options.serial and options.scheduler is not None:
+        raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
+    if options.memory_limit < LEAST_MEMORY_GB:
+        raise UserError(
+            f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with",
+            legal=f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials",
+        )
     return EngineOptions(
         jobs=options.jobs,
         limits=Limits(options.time_limit, round(1000 * options.memory_limit)),

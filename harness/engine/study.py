@@ -70,6 +70,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 return _conclude_shard(folder, outcome, options)
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
+            print("writing tables and report", file=sys.stderr)
             tables = tables_of(_records(journal, outcome), experiment)
             provenance = _provenance(experiment, plan, outcome, tables, command, started)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
@@ -163,7 +164,9 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
         alike = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
         why = first.why if first is not None and len(alike) == 1 else _reasons(outcome)
         what = "trial was judged" if outcome.finished else "trial succeeded"
-        raise UserError(f"no {what} of {name}: {why}")
+        old = not outcome.trials.done and any(failure.state != "skipped" for failure in outcome.failures)
+        again = "once that is mended, run the same command with --retry-failed: it runs these trials again"
+        raise UserError(f"no {what} of {name}: {why}", fix=again if old and "to do:" not in why else None)
     print(bug.why, file=sys.stderr)
     count = outcome.trials.failed
     print(f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})", file=sys.stderr)

@@ -22,6 +22,7 @@ RESULT_FILES = frozenset(
 """What sweeps and comparisons write into a folder of results, beside its journal."""
 CAPTURE_FILES = frozenset({"findings.csv", "findings.json", "annotated.png", "cloud.ply"})
 """What is written for each real capture."""
+OURS = b"# tofpod experiment "
 LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
 UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")
 """A file that a killed process was writing (`harness.vocabulary.files.atomic_path`)."""
@@ -87,7 +88,22 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     found = [path for path in folders_in(parent, DIGEST_NAME) if not slash or path.name == digest]
     if not found:
         raise UserError(f"{parent / digest if slash else parent}: holds no results", fix="python -m harness.ls results")
+    for folder in found:
+        # every sweep begins with its declaration, whose first line says whose it is
+        if not _begins_as_ours(folder / "experiment.yaml"):
+            raise UserError(
+                f"{folder}: has no experiment.yaml of tofpod's, so it is no folder of results",
+                fix="remove it by hand, if it is to go",
+            )
     return found
+
+
+def _begins_as_ours(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(OURS)) == OURS
+    except OSError:
+        return False
 
 
 def removable(folder: Path, *, journal_only: bool) -> list[Removable]:

@@ -167,6 +167,8 @@ def _edge_fails(filtered: Filtered, limit: float) -> np.ndarray:
 
     At any noise the frequencies' sums are independent, so their deviations from the limit add in squares.
     """
+    if np.isinf(limit):
+        return np.zeros(filtered.edge.shape[1], bool)
     spread = np.where(np.isfinite(filtered.edge), filtered.edge_spread, 0.0)
     below = (filtered.edge - DEVIATIONS * spread > limit) & np.isfinite(filtered.edge)
     above = np.maximum((filtered.edge_least - limit) / np.maximum(filtered.edge_loose, 1e-9), 0.0)
