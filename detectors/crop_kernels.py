@@ -7,6 +7,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from detectors.disjoint_sets import root_of
+
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 
 
@@ -34,14 +36,6 @@ def links(points_m: np.ndarray, tilt: float, noise_m: float) -> tuple[np.ndarray
 
 
 @numba.njit(**PLAIN)
-def _root(parents: np.ndarray, i: int) -> int:
-    while parents[i] != i:
-        parents[i] = parents[parents[i]]
-        i = parents[i]
-    return i
-
-
-@numba.njit(**PLAIN)
 def largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(h, w) bool: the largest set of nodes (h, w) that are joined by links to the right and downwards (both (h, w)),
     of equal ones the first in the order of the pixels."""
@@ -52,10 +46,10 @@ def largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) ->
             if not nodes[r, c]:
                 continue
             if c > 0 and nodes[r, c - 1] and right[r, c - 1]:
-                ours, theirs = _root(parents, r * w + c), _root(parents, r * w + c - 1)
+                ours, theirs = root_of(parents, r * w + c), root_of(parents, r * w + c - 1)
                 parents[max(ours, theirs)] = min(ours, theirs)
             if r > 0 and nodes[r - 1, c] and down[r - 1, c]:
-                ours, theirs = _root(parents, r * w + c), _root(parents, (r - 1) * w + c)
+                ours, theirs = root_of(parents, r * w + c), root_of(parents, (r - 1) * w + c)
                 parents[max(ours, theirs)] = min(ours, theirs)
     sizes = np.zeros(h * w, dtype=np.int64)
     for i in range(h * w):

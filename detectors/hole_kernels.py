@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from detectors.hole_image import differences, picture
+from detectors.triangular import forward, solved
 
 FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
@@ -115,28 +116,6 @@ def _factor(matrix: np.ndarray, factor: np.ndarray) -> bool:
 
 
 @numba.njit(**PLAIN)
-def _forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """x of L x = right."""
-    x = right.copy()
-    for a in range(len(x)):
-        for k in range(a):
-            x[a] -= factor[a, k] * x[k]
-        x[a] /= factor[a, a]
-    return x
-
-
-@numba.njit(**PLAIN)
-def _solved(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """x of L L' x = right."""
-    x = _forward(factor, right)
-    for a in range(len(x) - 1, -1, -1):
-        for k in range(a + 1, len(x)):
-            x[a] -= factor[k, a] * x[k]
-        x[a] /= factor[a, a]
-    return x
-
-
-@numba.njit(**PLAIN)
 def _norm(x: np.ndarray) -> float:
     total = 0.0
     for value in x:
@@ -154,14 +133,14 @@ def _damped_step(gram: np.ndarray, pull: np.ndarray, reach: float, damping: floa
     if not regular:
         # a direction that the image does not tell: the shortest step takes no part in it
         regular = _factor(gram + SINGULAR * np.eye(n), factor)
-    step = _solved(factor, pull)
+    step = solved(factor, pull)
     length = _norm(step)
     beyond = length - reach
     if regular and beyond <= 0.1 * reach:
         return step, 0.0
     least = 0.0
     if regular:
-        size = _norm(_forward(factor, step / length))
+        size = _norm(forward(factor, step / length))
         least = beyond / reach / size / size
     steepest = _norm(pull)
     most = steepest / reach if steepest > 0.0 else TINY / min(reach, 0.1)
@@ -173,13 +152,13 @@ def _damped_step(gram: np.ndarray, pull: np.ndarray, reach: float, damping: floa
             damping = max(TINY, 1e-3 * most)
         while not _factor(gram + damping * np.eye(n), factor):
             damping = max(2.0 * damping, SINGULAR)
-        step = _solved(factor, pull)
+        step = solved(factor, pull)
         length = _norm(step)
         before, beyond = beyond, length - reach
         near = abs(beyond) <= 0.1 * reach or (least == 0.0 and beyond <= before and before < 0.0)
         if near or trial == DAMPING_TRIALS - 1:
             break
-        size = _norm(_forward(factor, step / length))
+        size = _norm(forward(factor, step / length))
         if beyond > 0.0:
             least = max(least, damping)
         elif beyond < 0.0:

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from detectors.surface_kernels import huber_state, residuals, sides_changed, signed_sum, split, weighted_gram
+from detectors.triangular import solved
 
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 LAR_STEPS = 60
@@ -36,21 +37,6 @@ def lower_factor(gram: np.ndarray) -> tuple[np.ndarray, bool]:
             else:
                 return factor, False
     return factor, least > 1e-7 * most
-
-
-@numba.njit(**PLAIN)
-def solved(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """x (p,) of L L' x = right."""
-    x = right.copy()
-    for a in range(len(x)):
-        for k in range(a):
-            x[a] -= factor[a, k] * x[k]
-        x[a] /= factor[a, a]
-    for a in range(len(x) - 1, -1, -1):
-        for k in range(a + 1, len(x)):
-            x[a] -= factor[k, a] * x[k]
-        x[a] /= factor[a, a]
-    return x
 
 
 @numba.njit(**PLAIN)

@@ -11,6 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from detectors.disjoint_sets import root_of
+
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 SPREAD = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: a product's high bits scatter neighbouring keys (Knuth, The Art of Computer Programming
@@ -77,14 +79,6 @@ def grouped(cell_of: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(**PLAIN)
-def _root(parents: np.ndarray, i: int) -> int:
-    while parents[i] != i:
-        parents[i] = parents[parents[i]]
-        i = parents[i]
-    return i
-
-
-@numba.njit(**PLAIN)
 def _any_pair_within(points: np.ndarray, a0: int, a1: int, b0: int, b1: int, limit: float) -> bool:
     for i in range(a0, a1):
         for j in range(b0, b1):
@@ -120,11 +114,11 @@ def joined_cells(points: np.ndarray, starts: np.ndarray, keys: np.ndarray, dista
     parents = np.arange(len(keys))
     limit = distance * distance
     for c, o in _neighbours(keys):
-        ours, theirs = _root(parents, c), _root(parents, o)
+        ours, theirs = root_of(parents, c), root_of(parents, o)
         if ours != theirs and _any_pair_within(points, starts[c], starts[c + 1], starts[o], starts[o + 1], limit):
             parents[max(ours, theirs)] = min(ours, theirs)
     for c in range(len(keys)):
-        parents[c] = _root(parents, c)
+        parents[c] = root_of(parents, c)
     return parents
 
 
@@ -229,13 +223,13 @@ def clusters_by_level(
                 i = order[starts[c] + there[c]]
                 there[c] += 1
                 alone[:] = i
-                _take_in(points, _root(parents, c), alone, 1, scores[i], size, highest, extreme)
+                _take_in(points, root_of(parents, c), alone, 1, scores[i], size, highest, extreme)
         for c in range(cells):
             new, end = starts[c] + before[c], starts[c] + there[c]
-            ours = _root(parents, c)
+            ours = root_of(parents, c)
             for k in range(begins[c], begins[c + 1] if end > new else begins[c]):
                 o = adjacent[k]
-                theirs = _root(parents, o) if there[o] > 0 else ours
+                theirs = root_of(parents, o) if there[o] > 0 else ours
                 if ours != theirs and _any_pair_within(by_cell, new, end, starts[o], starts[o] + there[o], limit):
                     ours, gone = min(ours, theirs), max(ours, theirs)
                     parents[gone] = ours

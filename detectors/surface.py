@@ -16,7 +16,8 @@ import numpy as np
 from pydantic import Field
 
 from detectors import surface_kernels as kernels
-from detectors.lar_kernels import lar_stage, lower_factor, solved
+from detectors.lar_kernels import lar_stage, lower_factor
+from detectors.triangular import solved
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 

@@ -86,6 +86,21 @@ lands badly). A compile-time constant: the compiler turns a loop into vector cod
 the few arrays in it do not overlap, which it does for planes a constant apart."""
 
 
+@numba.njit(inline="always", **FAST)
+def exp_of_sixteenth(t):  # type: ignore[no-untyped-def]
+    """exp(16 t) as the sixteenth power of five terms of the series: for -0.46 <= t <= 0 the relative error is below
+    2e-4 at the smallest value (7e-4), and below 1e-6 where the value exceeds 0.1."""
+    e = np.float32(1 / 24) + t * np.float32(1 / 120)
+    e = np.float32(1 / 6) + t * e
+    e = np.float32(0.5) + t * e
+    e = np.float32(1) + t * e
+    e = np.float32(1) + t * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return e * e
+
+
 @numba.njit(**FAST)
 def _add_neighbour(
     row: np.ndarray,
@@ -115,18 +130,7 @@ def _add_neighbour(
         i = row[neighbour + p1 + x]
         amplitude = row[neighbour + p2 + x]
         gap = np.float32(1) - (row[centre + x] * r + row[centre + p1 + x] * i)
-        # exp(t) = (exp(t/16))^16 with five terms of the series: |t/16| <= 0.46, relative error below 2e-4 at the
-        # smallest weight (7e-4) and below 1e-6 where the weight exceeds 0.1
-        t = -total[p5 + x] * gap
-        e = np.float32(1 / 24) + t * np.float32(1 / 120)
-        e = np.float32(1 / 6) + t * e
-        e = np.float32(0.5) + t * e
-        e = np.float32(1) + t * e
-        e = np.float32(1) + t * e
-        e = e * e
-        e = e * e
-        e = e * e
-        e = e * e
+        e = exp_of_sixteenth(-total[p5 + x] * gap)
         kept = amplitude >= total[p6 + x]
         e = space * e if kept else np.float32(0)
         a = e * amplitude

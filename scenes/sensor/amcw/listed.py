@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.sensor.amcw import ranging
+from scenes.sensor.amcw.kernels import exp_of_sixteenth
 from scenes.sensor.amcw.linear_frames import LANES
 from scenes.sensor.normals import FAST
 
@@ -116,17 +117,7 @@ def _add_frames(planes, start, neighbour_start, space, by_amplitude, total):  # 
         i = planes[neighbour + p1 + x]
         amplitude = planes[neighbour + p2 + x]
         gap = np.float32(1) - (planes[centre + x] * r + planes[centre + p1 + x] * i)
-        # the same arithmetic as there, so that frames and lists agree
-        t = -total[p5 + x] * gap
-        e = np.float32(1 / 24) + t * np.float32(1 / 120)
-        e = np.float32(1 / 6) + t * e
-        e = np.float32(0.5) + t * e
-        e = np.float32(1) + t * e
-        e = np.float32(1) + t * e
-        e = e * e
-        e = e * e
-        e = e * e
-        e = e * e
+        e = exp_of_sixteenth(-total[p5 + x] * gap)
         kept = amplitude >= total[p6 + x]
         e = space * e if kept else np.float32(0)
         a = e * amplitude
