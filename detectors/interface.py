@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,8 @@ class Evidence:
     ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion
     (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
     surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score is.
+    ``warnings``: full sentences on what makes these numbers unreliable (the surface does not fit, ...); every program
+    shows them before anything else.
     """
 
     score: np.ndarray
@@ -25,17 +27,20 @@ class Evidence:
     surface_z_m: np.ndarray
     scale_m: float
     notes: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Detection:
     """One finding. ``score``: the lowest threshold at which it is found no more. ``pixels`` (n,): flat indices into the
     cloud's (h, w) grid, ascending; ``centre_m`` (3,): where it is, in the cloud's frame: what decides which damage it
-    counts for."""
+    counts for. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels inside the
+    target's outline that returned nothing (``pixels`` are then those invalid pixels)."""
 
     score: float
     pixels: np.ndarray
     centre_m: np.ndarray
+    kind: Literal["depth", "no return"] = "depth"
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,7 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
     threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
     detections = detector.find(cloud, evidence, threshold)
     judged = Judged(cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections))
+    printed.print_warnings((*recording.warnings, *evidence.warnings))
     printed.print_capture(recording, cloud, evidence, arguments.crop)
     print(printed.threshold_text(threshold, evidence, origin))
     printed.print_findings(judged.findings)
@@ -162,6 +163,7 @@ def _about(
     return {
         "capture": steps.capture_facts(recording, judged.cloud),
         "threshold": {"k": threshold, "mm": 1e3 * threshold * evidence.scale_m, "from": origin},
+        "warnings": evidence.warnings,
         "surface": {"one_unit_of_score_mm": 1e3 * evidence.scale_m, **evidence.notes},
         "settings": {
             "average": arguments.average,

@@ -64,9 +64,10 @@ def test_it_finds_the_hole_and_writes_everything(
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
-    assert header == "id,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,findings_version\n"
+    assert header == "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,findings_version\n"
     (row,) = rows_of(out / "findings.csv")
-    number = {key: float(value) for key, value in row.items()}
+    assert row["kind"] == "hole"
+    number = {key: float(value) for key, value in row.items() if key != "kind"}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
     place = [number["x_mm"], number["y_mm"], number["z_mm"]]
     np.testing.assert_allclose(place, TRUE_CENTRE_MM, atol=1.0)
@@ -82,7 +83,8 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     told = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
     (finding,) = told["findings"]
     row = rows_of(out / "findings.csv")[0]
-    for column in COLUMNS:
+    assert row["kind"] == finding["kind"] == "hole"
+    for column in set(COLUMNS) - {"kind"}:
         assert float(row[column]) == pytest.approx(finding[column], abs=1e-4)
     assert finding["size_from"] == "model" and finding["model"]["diameter_se_mm"] > 0
     assert finding["diameter_mm"] == finding["model"]["diameter_mm"] != finding["extent"]["diameter_mm"]

@@ -135,7 +135,7 @@ def test_every_page_names_its_version(path):
 
 def test_findings_carry_it_in_a_column():
     (head,) = csv.reader(io.StringIO(csv_text(())))
-    assert head == [*COLUMNS, VERSION_COLUMN] and FINDINGS_VERSION == 1
+    assert head == [*COLUMNS, VERSION_COLUMN] and FINDINGS_VERSION == 2
 
 
 def test_a_scorecards_baseline(tmp_path):

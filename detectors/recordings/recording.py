@@ -32,7 +32,9 @@ class Recording:
     """A real capture as a `harness.vocabulary.capture.FrameSource`.
 
     ``files``: all files whose content can change a number (frames, colour, intrinsics). ``scale_m``: metres in one
-    stored unit. ``notes``: what the user should know about how the files were understood. ``selection`` picks frames.
+    stored unit. ``notes``: what the user should know about how the files were understood. ``warnings``: full
+    sentences on what makes the distances doubtful; every program shows them before anything else. ``selection`` picks
+    frames.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Recording:
     lens: Lens | None = None
     organised: bool = True
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     selection: slice | None = None
 
     @cached_property

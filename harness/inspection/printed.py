@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -29,6 +29,12 @@ def print_frames(recording: Recording) -> None:
         valid = np.isfinite(frame.z_m)
         median = mm(float(np.median(frame.z_m[valid]))) if valid.any() else "none"
         print(f"frame {frame.name}: {100 * valid.mean():.1f} % valid, median distance {median}")
+
+
+def print_warnings(warnings: Iterable[str]) -> None:
+    """What makes the numbers below unreliable, a line each: printed before anything else."""
+    for warning in warnings:
+        print(f"warning: {warning}")
 
 
 def print_capture(recording: Recording, cloud: Cloud, evidence: Evidence, crop: str) -> None:
@@ -119,6 +125,7 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
         return
     titles = (
         "id",
+        "kind",
         f"u {grid}",
         f"v {grid}",
         "x mm",
@@ -157,7 +164,7 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def _cells(f: Finding) -> tuple[str, ...]:
     numbers = (f.u_px, f.v_px, f.x_mm, f.y_mm, f.z_mm, f.diameter_mm)
-    start = [str(f.id), *(number(n, 1) for n in numbers), f.size_from]
+    start = [str(f.id), f.kind, *(number(n, 1) for n in numbers), f.size_from]
     return (*start, number(f.depth_mm, 2), number(f.volume_mm3, 1), str(f.points), number(f.score, 2))
 
 

@@ -192,6 +192,8 @@ def _judge(
 
 def _print(inspection: Inspection) -> None:
     mapped, judged = inspection.mapped, inspection.judged
+    recorded = (warning for recording in inspection.recordings for warning in recording.warnings)
+    printed.print_warnings((*recorded, *judged.evidence.warnings))
     print_registrations(mapped, inspection.checks)
     cloud, merged = judged.cloud, mapped.merged
     for note in merged.notes:
@@ -243,6 +245,7 @@ def _about(
             "cell_mm": None if mapped.merged.surface_map is None else mapped.merged.surface_map.cell_m / MM,
             "notes": mapped.merged.notes,
         },
+        "warnings": evidence.warnings,
         "threshold": {
             "k": inspection.threshold,
             "mm": 1e3 * inspection.threshold * evidence.scale_m,

@@ -142,4 +142,5 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
         "lens": dataclasses.asdict(cloud.lens) if cloud.lens else None,
         "rounding_step_mm": 1e3 * cloud.z_step_m,
         "notes": recording.notes,
+        "warnings": recording.warnings,
     }

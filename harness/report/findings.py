@@ -26,9 +26,9 @@ from harness.vocabulary.units import MM
 DAMAGE_RGB = (255, 0, 255)
 """Magenta, as in the thesis' figure 3."""
 COLUMNS = (
-    "id", "u_px", "v_px", "x_mm", "y_mm", "z_mm", "diameter_mm", "depth_mm", "volume_mm3", "points", "score",
+    "id", "kind", "u_px", "v_px", "x_mm", "y_mm", "z_mm", "diameter_mm", "depth_mm", "volume_mm3", "points", "score",
 )  # fmt: skip
-FINDINGS_VERSION = 1
+FINDINGS_VERSION = 2
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 VERSION_COLUMN = "findings_version"
 FILES = ("findings.csv", "findings.json", "annotated.png", "cloud.ply")
@@ -38,11 +38,13 @@ FILES = ("findings.csv", "findings.json", "annotated.png", "cloud.ply")
 class Finding:
     """One row: the best of both measures, camera frame. NaN where nothing could be measured.
 
+    ``kind``: ``hole`` (behind the surface), ``bump`` (before it), or ``no return`` (nothing came back).
     ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth) or ``extent`` (the thesis'
     extreme points). ``depth_from``: likewise, or ``extreme residual`` of the cluster's points.
     """
 
     id: int
+    kind: str
     u_px: float
     v_px: float
     x_mm: float
@@ -86,6 +88,7 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
         depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
     return Finding(
         id=number,
+        kind=detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole",
         u_px=measured.u_px,
         v_px=measured.v_px,
         x_mm=float(centre_mm[0]),
@@ -145,8 +148,8 @@ def csv_text(findings: Sequence[Finding]) -> str:
     return text.getvalue()
 
 
-def _cell(value: float | int) -> str:
-    if isinstance(value, int):
+def _cell(value: float | int | str) -> str:
+    if isinstance(value, int | str):
         return str(value)
     return f"{value:.4f}" if math.isfinite(value) else ""
 
