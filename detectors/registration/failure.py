@@ -1,8 +1,10 @@
-"""When a registration must not be trusted, and why, in words. The limits follow from the sampling, not from results.
+"""Decides whether a registration can be trusted, and says why not.
 
-Every limit is a number of the view's own pixels or a stated false-alarm probability. None is relative to a camera's
-specification, which a capture does not carry: errors that a whole view shares are allowed one pixel's pitch, because
-views that lie farther apart blur a rim by more than the camera does.
+The limits follow from the sampling and from a stated blur, not from results.
+
+Real cameras err by what a whole view shares: an offset, wiggling, the lens. Such errors show as a distance between
+registered views that noise does not explain. They widen the covariance and are noted; a view is refused only where they
+would blur the merged map by more than `BLUR_M`, or by more than a pixel where pixels are coarser.
 """
 
 from __future__ import annotations
@@ -25,10 +27,13 @@ FALSE_ALARM_SIGMAS = 3.09
 """Of the residual's own scatter: a good registration is refused once in a thousand."""
 MEDIAN_SCATTER = 1.65
 """Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
-SHARED_PITCHES = 1.0
-"""Errors that a whole view shares (offset, wiggling, lens) are allowed so many pitches."""
+BLUR_M = 2.0 * MM
+"""Distance between registered views beyond which a map of them is blurred too much to judge: with two views each lies
+1 mm from their mean, which is a time-of-flight camera's noise in a single frame, and a third of the blur of a rim by a
+5 x 5 window over pixels of 1.4 mm."""
 UNDETERMINED_PITCHES = 3.0
-"""A predicted error over the target beyond this puts every point on a wrong pixel: the points do not fix the pose."""
+"""A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel: the points do
+not fix the pose."""
 MOVING_PITCHES = 0.5
 """An iteration that still moves the target by more has not found its place."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
@@ -53,11 +58,13 @@ def judge(registration: Registration, reference: ReferenceTarget, view: Prepared
     nowhere = _no_overlap(agreement) or _jump(judged, reference.view, view)
     if nowhere:
         return replace(judged, failure=nowhere)
+    open_ = _undetermined(judged, reference)
     both = (agreement, reference.sampling, sampling)
-    apart, open_ = _surfaces_apart(*both) or _marks_apart(*both), _undetermined(judged, reference)
+    apart = _surfaces_apart(*both) or _marks_apart(*both)
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=open_, notes=(*judged.notes, *([apart] if apart else [])))
-    return replace(judged, failure="; ".join(reason for reason in (open_, apart) if reason))
+    failure = "; ".join(reason for reason in (open_, apart) if reason)
+    return replace(judged, failure=failure) if failure else _widened(judged, reference, agreement, sampling)
 
 
 def still_moving(step_m: float, pitch_m: float) -> str:
@@ -99,11 +106,12 @@ def _undetermined(registration: Registration, reference: ReferenceTarget) -> str
     sampling = reference.sampling
     points = thinned(reference.points_m, 200)
     error = float(np.hypot(*predicted_error_m(registration, points, sampling.normal)))
-    if error <= UNDETERMINED_PITCHES * sampling.pitch_m:
+    limit = max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M)
+    if error <= limit:
         return ""
     return (
         f"not determined: {_weakest_motion(registration, points, sampling.normal)}; the predicted error over the target"
-        f" is {error / MM:.1f} mm, more than {UNDETERMINED_PITCHES:.0f} pixels"
+        f" is {error / MM:.1f} mm, which would blur the map (up to {limit / MM:.1f} mm are merged)"
     )
 
 
@@ -139,33 +147,80 @@ def _jump(registration: Registration, reference: PreparedView, view: PreparedVie
 
 
 def _surfaces_apart(agreement: Agreement, reference: Sampling, view: Sampling) -> str:
-    expected = _expected_m(reference, view)
     scatter = MEDIAN_SCATTER / np.sqrt(2 * independent(agreement.apart_points))
-    limit = expected * (1 + FALSE_ALARM_SIGMAS * scatter)
+    limit = _blur_m(reference, view) * (1 + FALSE_ALARM_SIGMAS * scatter)
     if not agreement.apart_m > limit:
         return ""
     return (
-        f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap (up to {limit / MM:.1f} mm"
-        " from noise and pixels): a wrong registration, or different targets"
+        f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap, which would blur the map (up"
+        f" to {limit / MM:.1f} mm are merged): a wrong registration, or different targets"
     )
 
 
 def _marks_apart(agreement: Agreement, reference: Sampling, view: Sampling) -> str:
-    # points on two grids of one pitch lie pitch / sqrt(6) apart, rms, where neither has an edge
-    limit = float(np.hypot(_expected_m(reference, view), max(reference.pitch_m, view.pitch_m) / np.sqrt(6)))
+    limit = float(np.hypot(_blur_m(reference, view), _between_grids_m(reference, view)))
     limit *= 1 + FALSE_ALARM_SIGMAS / np.sqrt(2 * independent(agreement.marks_points))
     if not agreement.marks_apart_m > limit:
         return ""
     return (
-        f"the marks of the views do not coincide: their points lie {agreement.marks_apart_m / MM:.1f} mm apart (up to"
-        f" {limit / MM:.1f} mm expected): a wrong registration, or different targets"
+        f"the marks of the views do not coincide: their points lie {agreement.marks_apart_m / MM:.1f} mm apart, which"
+        f" would blur the map (up to {limit / MM:.1f} mm are merged): a wrong registration, or different targets"
     )
 
 
-def _expected_m(reference: Sampling, view: Sampling) -> float:
-    """Standard deviation of the distance between two surfaces that are where they should be."""
-    shared = SHARED_PITCHES * max(reference.pitch_m, view.pitch_m)
-    return float(np.sqrt(reference.noise_m**2 + view.noise_m**2 + shared**2))
+def _blur_m(reference: Sampling, view: Sampling) -> float:
+    """Distance between views that may be merged: their noise beside `BLUR_M`, or a pixel where it is larger."""
+    return float(np.hypot(_noise_m(reference, view), max(BLUR_M, reference.pitch_m, view.pitch_m)))
+
+
+def _noise_m(reference: Sampling, view: Sampling) -> float:
+    """Standard deviation, by noise, of the distance between two surfaces that are where they should be."""
+    return float(np.hypot(reference.noise_m, view.noise_m))
+
+
+def _between_grids_m(reference: Sampling, view: Sampling) -> float:
+    """Root mean square distance between the nearest points of two grids of one pitch, where neither has an edge."""
+    return max(reference.pitch_m, view.pitch_m) / float(np.sqrt(6))
+
+
+def _widened(
+    registration: Registration, reference: ReferenceTarget, agreement: Agreement, sampling: Sampling
+) -> Registration:
+    """The registration whose covariance also holds what the views show of errors that a whole view shares, with a note
+    where there are such errors.
+
+    Their mean square is what the distances between the views have beyond noise and beyond the covariance as it is; it
+    is added to the shift, across the surface and within it, because one pair of views does not tell an error of the
+    level from a turn or a bend. An offset of a whole view does not show: the registration takes it up.
+    """
+    if not np.isfinite(registration.covariance).all():
+        return registration
+    normal, noise = reference.sampling.normal, _noise_m(reference.sampling, sampling)
+    within, across = predicted_error_m(registration, thinned(reference.points_m, 200), normal)
+    scatter = FALSE_ALARM_SIGMAS * MEDIAN_SCATTER / np.sqrt(2 * independent(agreement.apart_points))
+    more_across = _beyond_m(agreement.apart_m, float(np.hypot(noise, across)), scatter)
+    explained = float(np.sqrt(noise**2 + across**2 + within**2 + _between_grids_m(reference.sampling, sampling) ** 2))
+    scatter = FALSE_ALARM_SIGMAS / np.sqrt(2 * independent(agreement.marks_points))
+    more_within = _beyond_m(agreement.marks_apart_m, float(np.hypot(explained, more_across)), scatter)
+    if not more_across and not more_within:
+        return registration
+    along = np.outer(normal, normal)
+    covariance = registration.covariance.copy()
+    # an error within the plane has two axes to share its mean square
+    covariance[3:, 3:] += more_across**2 * along + 0.5 * more_within**2 * (np.eye(3) - along)
+    told = [f"{m / MM:.2g} mm {way}" for m, way in ((more_across, "across"), (more_within, "along")) if m]
+    note = (
+        f"the views disagree by {' and '.join(told)} the surface beyond what noise explains: an error that each view"
+        " shares (offset, wiggling, lens); the covariance is widened by it"
+    )
+    return replace(registration, covariance=covariance, notes=(*registration.notes, note))
+
+
+def _beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
+    """What must stand beside the explained part to give the measured root mean square; 0 within its own scatter."""
+    if not measured_m > explained_m * (1 + scatter):
+        return 0.0
+    return float(np.sqrt(measured_m**2 - explained_m**2))
 
 
 def moved_m(change: np.ndarray, points_m: np.ndarray) -> float:
