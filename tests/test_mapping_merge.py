@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,10 @@ from detectors.mapping.settings import FusedMerge, GridMerge, VolumeMerge
 from detectors.views import PreparedView
 from harness.vocabulary.capture import Cloud, LeftOut
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Region, invert, transform_points
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
-from tests.mapped_views import PITCH_M, Plane, arc, plane_height, prepared, reference, registered, seen, turned
+from tests.mapped_views import PITCH_M, Hole, Plane, arc, plane_height, prepared, reference, registered, seen, turned
 
 EVERY_WAY = [GridMerge(), FusedMerge(), VolumeMerge()]
 
@@ -161,6 +162,22 @@ def test_volume_is_the_same_twice_and_noise_falls_with_views() -> None:
         middle = (np.abs(points[:, 0]) < 0.05) & (np.abs(points[:, 1]) < 0.04)
         spread[count] = float(np.std(plane_height(points[middle], np.eye(4), plane)))
     assert spread[1] / spread[9] == pytest.approx(3.0, rel=0.15)
+
+
+def test_volume_keeps_face_and_floor_apart_from_the_walls_of_a_hole() -> None:
+    pytest.importorskip("open3d")
+    hole = Hole(25.4 * MM, 12.7 * MM, (0.01, 0.0))
+    plane, poses = Plane(5.0, 5.0, hole), arc(5, 25.0)
+    views = [seen(plane, T, name=str(i), blur=3) for i, T in enumerate(poses)]
+    found = merge(views, [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)], VolumeMerge())
+    assert re.search(r"[1-9]\d\d points on walls steeper than 60 degrees", " ".join(found.notes))
+    points = transform_points(invert(plane.T_reference_plane) @ found.T_reference_cloud, found.cloud.points_m[0])
+    from_axis = np.hypot(points[:, 0] - hole.at[0], points[:, 1] - hole.at[1])
+    near = from_axis < 0.6 * hole.diameter_m
+    floor = near & (points[:, 2] > 0.8 * hole.depth_m)
+    on_wall = near & (points[:, 2] > 0.25 * hole.depth_m) & (points[:, 2] < 0.75 * hole.depth_m)
+    # without the rule there are more points on the walls (391) than on the floor (375)
+    assert floor.sum() > 250 and on_wall.sum() < 0.1 * floor.sum()
 
 
 def test_volume_leaves_out_what_lies_outside_the_target() -> None:

@@ -4,6 +4,9 @@ Each view's depth is resampled to an image without distortion, with its own pixe
 as the map (`detectors.mapping.raster`): the field's own projection knows no lens. In the field every view counts alike
 and depth counts along its own optical axis (Curless and Levoy 1996, with Open3D's constant weight).
 
+Crossings on the walls of holes and at the target's edges are left out, so that what remains is the target's face and
+the floors of its damage: a field has no rays, and a surface fitted through walls is bent by them.
+
 Not modelled: noise and incidence in the weights; what a view sees through a hole carves the rim from aside, as every
 truncated field does within its truncation.
 """
@@ -17,11 +20,12 @@ from typing import Any
 import numpy as np
 
 from detectors.mapping.chosen_views import ChosenView
+from detectors.mapping.placing import T_reference_map_of, common_surface
 from detectors.mapping.raster import Grid, raster_between
 from detectors.open3d_library import open3d_on_one_thread
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region, invert
+from harness.vocabulary.geometry import Region, invert, transform_points
 
 TRUNCATION_VOXELS = 4.0
 """Distance at which the field is cut off: over 5 mm for pixels of 1.4 mm, ten times the noise of a single frame, so
@@ -29,6 +33,9 @@ that both faces of a half-inch board stay apart."""
 OVERSAMPLING = 2
 """Pixels of the undistorted image along a side of a pixel: the field takes the depth of the nearest one, which is wrong
 by up to half a pixel's width times the tangent of the incidence."""
+WALL_DEG = 60.0
+"""Between a crossing's normal and that of the target's smooth face, beyond which the crossing lies on a wall. A dent as
+deep as its radius has flanks of 45 degrees; a drilled wall has 90, less what the camera's blur takes."""
 LOOKED_UP_AT = 0.5
 """Added to the principal point: Open3D's integration cuts pixel positions off, so the first pixel's centre is 0.5."""
 BLOCK = 8
@@ -54,9 +61,13 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
     """
     images = [_undistorted(view) for view in views]
     voxel = voxel_m if voxel_m is not None else _pitch(views[0])
-    points, rgb = _crossings(views, images, voxel)
-    order = np.lexsort(points.T[::-1])
-    notes = (f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm",)
+    points, normals, rgb = _crossings(views, images, voxel)
+    facing = _facing(views, points, normals)
+    order = np.flatnonzero(facing)[np.lexsort(points[facing].T[::-1])]
+    notes = (
+        f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
+        f" {len(points) - len(order)} points on walls steeper than {WALL_DEG:.0f} degrees are left out",
+    )
     return _cloud(views, points[order], None if rgb is None else rgb[order]), notes
 
 
@@ -83,16 +94,35 @@ def _pitch(view: ChosenView) -> float:
     return float(np.median(view.cloud.points_m[view.inside][:, 2])) * view.slope_step
 
 
+def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface through all targets.
+
+    Raises UserError where the targets do not determine such a surface.
+    """
+    T_reference_map = T_reference_map_of(views[0])
+    surface = common_surface(views, T_reference_map)
+    x, y, _ = transform_points(invert(T_reference_map), points_m).T
+    step = _pitch(views[0])
+    by_x = (surface.evaluate(x + step, y) - surface.evaluate(x - step, y)) / (2 * step)
+    by_y = (surface.evaluate(x, y + step) - surface.evaluate(x, y - step)) / (2 * step)
+    face = np.column_stack([-by_x, -by_y, np.ones_like(x)])
+    face /= np.linalg.norm(face, axis=1, keepdims=True)
+    turned = normals @ T_reference_map[:3, :3]
+    along: np.ndarray = np.abs(np.einsum("ni,ni->n", turned, face))
+    return along >= np.cos(np.deg2rad(WALL_DEG)) * np.linalg.norm(turned, axis=1)
+
+
 def _crossings(
     views: Sequence[ChosenView], images: Sequence[_Pinhole], voxel: float
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     with open3d_on_one_thread() as o3d:
         return _integrated(o3d, views, images, voxel)
 
 
 def _integrated(
     o3d: Any, views: Sequence[ChosenView], images: Sequence[_Pinhole], voxel: float
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Places and normals (n, 3) of the zero crossings, in the first view's frame; colours where all views have them."""
     core = o3d.core
     coloured = all(image.rgb is not None for image in images)
     names, channels = ["tsdf", "weight"], [[1], [1]]
@@ -110,8 +140,8 @@ def _integrated(
             f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target",
             fix="choose smaller voxels, check the crop, or merge in another way",
         ) from error
-    points = found.point.positions.numpy().astype(np.float64)
-    return points, found.point.colors.numpy() if coloured else None
+    points, normals = (found.point[name].numpy().astype(np.float64) for name in ("positions", "normals"))
+    return points, normals, found.point.colors.numpy() if coloured else None
 
 
 def _add(o3d: Any, field: Any, image: _Pinhole, T_view_reference: np.ndarray, coloured: bool) -> None:
