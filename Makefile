@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sweep test lint smoke validate check benchmarks lock clean
+.PHONY: sweep test lint smoke validate check benchmarks strangers lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
@@ -27,6 +27,10 @@ check: .venv/.ready
 benchmarks: .venv/.ready
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only -o python_files='bench_*.py' -o addopts=''
 	$(BIN)/python tests/benchmarks/trials.py --peers
+
+# Recordings of many kinds of scene with known truth, answered by the default command: right, warned or wrong.
+strangers: .venv/.ready
+	PYTHONPATH=tests OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m strangers
 
 # Five minutes; needed after a change of pyproject.toml's dependencies only.
 lock: .venv/.ready

@@ -1,0 +1,70 @@
+"""Make recordings of all kinds, answer them with the default command, and print right, warned and wrong by kind."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from strangers.kinds import KINDS
+from strangers.recording import Stranger, recorded, written
+from strangers.score import Score, answered, scored
+
+
+def made(kind: str, seed: int, folder: Path) -> tuple[Stranger, Score]:
+    """Make one recording in ``folder``, answer it and score the answer."""
+    rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
+    stranger = KINDS[kind](rng)
+    stack, view, truths = recorded(stranger, rng)
+    path = written(stranger, stack, folder / "in")
+    code, said, rows = answered(path, folder / "out", stranger.format.arguments)
+    return stranger, scored(stranger, view, truths, code, said, rows)
+
+
+def main() -> int:
+    """Run the chosen kinds; returns 0 where no answer is wrong, else 1."""
+    parser = argparse.ArgumentParser(prog="python -m strangers", description=__doc__)
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default all: {', '.join(KINDS)}")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="recordings of each kind (default 1)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed (default 0)")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep all recordings and answers here")
+    arguments = parser.parse_args()
+    unknown = sorted(set(arguments.kinds) - set(KINDS))
+    if unknown:
+        parser.error(f"no such kind: {', '.join(unknown)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        return _report(arguments, arguments.keep or Path(scratch))
+
+
+def _report(arguments: argparse.Namespace, root: Path) -> int:
+    print(f"{'kind':22s} right warned wrong needless  clear found false")
+    total = np.zeros(7, int)
+    wrong = []
+    for kind in arguments.kinds or KINDS:
+        counts = np.zeros(7, int)
+        for seed in range(arguments.first, arguments.first + arguments.seeds):
+            _, score = made(kind, seed, root / kind / str(seed))
+            verdicts = [score.verdict == verdict for verdict in ("right", "warned", "wrong")]
+            counts += [*verdicts, score.needless, score.clear, score.found, score.false]
+            if score.verdict == "wrong":
+                wrong.append(f"{kind} {seed}: {'; '.join(score.why)}")
+        print(_row(kind, counts), flush=True)
+        total += counts
+    print(_row("all", total))
+    print("wrong without a word:" if wrong else "none is wrong without a word")
+    for line in wrong:
+        print(f"  {line}")
+    return int(bool(wrong))
+
+
+def _row(name: str, counts: np.ndarray) -> str:
+    widths = (6, 7, 6, 9, 7, 6, 6)
+    return f"{name:22s}" + "".join(f"{n:{width}d}" for n, width in zip(counts, widths, strict=True))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""The scorer of the strangers' recordings, by answers whose worth is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from strangers.kinds import KINDS
+from strangers.recording import recorded
+from strangers.score import scored
+
+
+def rows_of(truths):
+    """What a perfect detector would write."""
+    rows = []
+    for truth in truths:
+        x, y, z = (1e3 * v for v in truth.centre_m)
+        depth = 1e3 * truth.depth_m[0] if math.isfinite(truth.depth_m[0]) else 0.0
+        rows.append({"kind": truth.kind, "x_mm": f"{x}", "y_mm": f"{y}", "z_mm": f"{z}"})
+        rows[-1] |= {"diameter_mm": f"{1e3 * truth.diameter_m[1]}", "depth_mm": f"{depth}", "u_px": "0", "v_px": "0"}
+    return rows
+
+
+@pytest.fixture(scope="module")
+def board():
+    rng = np.random.default_rng(3)
+    stranger = KINDS["fifty_frames"](rng)
+    _, view, truths = recorded(stranger, rng)
+    assert sum(truth.clear for truth in truths) >= 2
+    return stranger, view, truths
+
+
+def test_true_answers_are_right(board):
+    score = scored(*board, 0, "", rows_of(board[2]))
+    assert (score.verdict, score.why, score.needless) == ("right", (), False)
+    assert scored(*board, 0, "warning: perhaps\n", rows_of(board[2])).needless
+
+
+def test_wrong_answers_are_wrong(board):
+    true = rows_of(board[2])
+    clear = [row for row, truth in zip(true, board[2], strict=True) if truth.clear]
+    clear.sort(key=lambda row: -float(row["diameter_mm"]))
+    on_wall = {**clear[0], "x_mm": "-400", "y_mm": "-330", "z_mm": "1300"}
+    other = {"hole": "bump", "bump": "hole"}[clear[0]["kind"]]
+    answers = {
+        "missed": [row for row in true if row is not clear[0]],
+        "another surface": [*true, on_wall],
+        f"a {other} where": [{**row, "kind": other} if row is clear[0] else row for row in true],
+        "diameter": [{**row, "diameter_mm": "200"} if row is clear[0] else row for row in true],
+        "depth": [{**row, "depth_mm": "-500"} if row is clear[0] else row for row in true],
+    }
+    for why, rows in answers.items():
+        score = scored(*board, 0, "", rows)
+        assert score.verdict == "wrong" and why in score.why[0], (why, score.why)
+        assert scored(*board, 0, "warning: not sure\n", rows).verdict == "warned"
+        assert scored(*board, 0, "8 frames\nwarning: too late\n", rows).verdict == "wrong"
+
+
+def test_a_refusal_is_a_warning_and_a_traceback_is_not(board):
+    assert scored(*board, 2, "error: no unit is known\n  fix: pass --unit\n", []).verdict == "warned"
+    assert scored(*board, 1, "Traceback ...\nKeyError\n", []).verdict == "wrong"
