@@ -44,11 +44,17 @@ TINY_M = 1e-9
 
 
 class SurfaceConfig(Config):
-    """``degree``: total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals;
+    """``shape``: ``polynomial`` of the stated degree; ``auto``: the simplest of plane, polynomials, quadric and free
+    form that the cloud's own evidence asks for (`detectors.background`), whatever ``degree`` says; ``free_form``: that
+    in any case. ``scale_mm``: the width above which a free form follows the cloud; chosen where none is given.
+
+    ``degree``: total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals;
     ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a FAST-LTS start, then bisquare: the
     one that survives contiguous damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: no term in
     both x and y (the thesis' script sets p11, p21, p12 to zero)."""
 
+    shape: Literal["polynomial", "auto", "free_form"] = "polynomial"
+    scale_mm: float | None = Field(default=None, gt=0)
     degree: int = Field(default=3, ge=0, le=8)
     method: Literal["lar", "bisquare", "lts", "least_squares"] = "lar"
     drop_cross_terms: bool = False

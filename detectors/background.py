@@ -1,0 +1,426 @@
+"""The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit is judged.
+
+The target is divided into cells of some 16 pixels or more, as the camera sees them. Their medians know little of the
+noise between neighbouring pixels and nothing of damage that is smaller than half a cell, so they are what shapes are
+chosen on: each shape predicts tiles of cells that it was not fitted to, and the simplest whose errors are not
+significantly larger than the best shape's is taken. Polynomials and quadrics come first; where neighbouring cells still
+depart together from the best of these, smooth free forms of ever shorter wavelength are tried on top of it.
+
+Not modelled: creases, several sheets, surfaces with real structure that is as small as damage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+
+from detectors.median import median_of, median_size_of
+from detectors.shapes import Fit, free_form, picture_places, polynomial, quadric
+from detectors.surface import SurfaceConfig, fit_surface
+from detectors.surface_kernels import bisquare_weights
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.units import MM
+
+MOST_CELLS, CELL_POINTS = 3600, 16
+"""Cells at most, and points in each at least: enough of both for shapes with dozens of coefficients."""
+FEW_CELLS = 40
+"""Below this nothing can be chosen or judged: a plane, or what degree is stated, is fitted and not questioned."""
+TILE_CELLS, FOLDS = 3, 5
+"""Side of what is predicted together, in cells, and the number of parts that these tiles are dealt to."""
+DEGREES = (1, 2, 3, 4, 5)
+TUNING = 4.685
+"""Tukey's bisquare, 95 % efficient."""
+WORTH = 0.1
+"""Of the noise of a pixel: a shape whose typical error of prediction is no more than this above the best is as good."""
+STEEPEST_DEG = 75.0
+"""Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """The surface without its damage.
+
+    ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud less the surface; NaN off the mask and
+    where the surface cannot be judged. ``noise_m`` (h, w): standard deviation of the pixels' residuals round about, off
+    findings, without the surface's own misfit. ``scale_m``: width above which shallow damage is taken for shape; None
+    where the shape is no free form. ``fits``: no structure is left that would pass for damage; else ``warning`` says
+    so in a sentence.
+    """
+
+    surface_z_m: np.ndarray
+    residual_m: np.ndarray
+    noise_m: np.ndarray
+    description: str
+    scale_m: float | None
+    fits: bool
+    warning: str
+    notes: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,): 1 for full cells.
+    ``of`` (n,): each point's cell; ``row``, ``column`` (c,): places in the grid of cells. ``noise`` (c,): standard
+    deviation of a pixel in the cell; ``side``: in the picture's units; ``side_m`` at the median distance."""
+
+    points: np.ndarray
+    weights: np.ndarray
+    noise: np.ndarray
+    of: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    side: float
+    side_m: float
+    central: bool
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A shape fitted to all cells. ``fit_to(points, weights)`` fits it to others; None where it cannot."""
+
+    name: str
+    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None]
+    fit: Fit
+    weights: np.ndarray
+    wavelength: float | None = None
+
+
+def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
+    """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true; all of them finite.
+
+    Deterministic. Raises UserError where the points do not determine the surface.
+    """
+    points = np.ascontiguousarray(cloud.points_m[mask])
+    central = cloud.projection == "central" and float(points[:, 2].min()) > 0
+    cells = _cells(points, central)
+    if cells is None:
+        return _unjudged(points, mask, config)
+    if config.shape == "polynomial":
+        name, fit = _stated(points, config)
+        return _judged(points, mask, cells, name, fit, None)
+    shape = _chosen(cells, config)
+    for _ in range(2):
+        cells = _refreshed(cells, points, shape.fit)
+        shape = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
+    return _judged(points, mask, cells, shape.name, shape.fit, shape.wavelength)
+
+
+# ---------------------------------------------------------------- cells
+
+
+def _cells(points: np.ndarray, central: bool) -> _Cells | None:
+    """None where the points fill too few."""
+    if len(points) < FEW_CELLS * CELL_POINTS:
+        return None
+    places = picture_places(points, central)
+    low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-12)
+    wanted = max(CELL_POINTS, len(points) / MOST_CELLS)
+    side = float(np.sqrt(extent.prod() * wanted / len(points)))
+    for _ in range(3):
+        where = np.floor((places - low) / side).astype(np.int64)
+        keys = where[:, 1] * (where[:, 0].max() + 1) + where[:, 0]
+        counts = np.bincount(keys)
+        side *= float(np.sqrt(wanted / max(median_of(counts[counts > 0].astype(float)), 1.0)))
+    held = np.flatnonzero(counts >= max(4, wanted / 4))
+    if len(held) < FEW_CELLS:
+        return None
+    number = np.full(len(counts), -1)
+    number[held] = np.arange(len(held))
+    of = number[keys]
+    row, column = np.divmod(held, where[:, 0].max() + 1)
+    inside = of >= 0
+    middle = np.stack([np.bincount(of[inside], places[inside, k]) / counts[held] for k in (0, 1)], axis=1)
+    strided = points[:: max(1, len(points) // 8192)]
+    start = fit_surface(
+        strided[:, 0], strided[:, 1], strided[:, 2], SurfaceConfig(degree=2, method="bisquare")
+    ).evaluate
+    level = float(np.median(points[:, 2]))
+    z = _group_medians(points[:, 2], of, len(held))[0]
+    first = np.column_stack([middle * (z[:, None] if central else 1.0), z])
+    weights = np.minimum(counts[held] / wanted, 1.0)
+    blank = _Cells(
+        first, weights, np.zeros(len(held)), of, row, column, side, side * (level if central else 1.0), central
+    )
+    return _refreshed(blank, points, lambda p: start(p[:, 0], p[:, 1]))
+
+
+def _refreshed(cells: _Cells, points: np.ndarray, fit: Fit) -> _Cells:
+    """The cells with medians and deviations of the points' residuals to a surface."""
+    residual = points[:, 2] - fit(points)
+    medians, deviations = _group_medians(residual, cells.of, len(cells.points))
+    z = fit(cells.points) + medians
+    known = np.isfinite(z)
+    moved = cells.points * (z / cells.points[:, 2])[:, None] if cells.central else cells.points.copy()
+    moved[:, 2] = z
+    # cells that the surface does not reach keep their points and count no more
+    moved[~known] = cells.points[~known]
+    weights = np.where(known, cells.weights, 0.0)
+    return replace(cells, points=moved, weights=weights, noise=deviations)
+
+
+@numba.njit(cache=True, nogil=True)
+def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Median of each group's finite values, and their median distance from it over 0.6745; NaN without values."""
+    starts = np.zeros(groups + 1, np.int64)
+    for i in range(len(values)):
+        if group[i] >= 0 and np.isfinite(values[i]):
+            starts[group[i] + 1] += 1
+    starts = np.cumsum(starts)
+    at, held = starts[:-1].copy(), np.empty(starts[-1])
+    for i in range(len(values)):
+        if group[i] >= 0 and np.isfinite(values[i]):
+            held[at[group[i]]] = values[i]
+            at[group[i]] += 1
+    medians, deviations = np.full(groups, np.nan), np.full(groups, np.nan)
+    for g in range(groups):
+        if starts[g + 1] > starts[g]:
+            some = held[starts[g] : starts[g + 1]]
+            medians[g] = np.median(some)
+            deviations[g] = np.median(np.abs(some - medians[g])) / 0.6745
+    return medians, deviations
+
+
+# ---------------------------------------------------------------- choice
+
+
+def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
+    surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
+    return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
+
+
+def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
+    candidates = [_fitted(cells, _degree_name(d), _of_degree(d), None) for d in DEGREES]
+    candidates.insert(2, _fitted(cells, "quadric", lambda p, w: quadric(p, w, cells.central), None))
+    shapes = [shape for shape in candidates if shape is not None]
+    errors = np.array([_prediction_errors(cells, shape) for shape in shapes])
+    worth = WORTH * _pixel_noise(cells)
+    best = shapes[_simplest(errors, worth)]
+    if config.shape == "auto" and _structure(cells, best.fit)[0] < FREE_FORM_FROM:
+        return best
+    base = shapes[int(np.argmin(errors.mean(axis=1)))]
+    free = [best] if config.shape == "auto" else []
+    for wavelength in _wavelengths(cells, config):
+        made = _fitted(cells, "free form", _of_wavelength(cells, base, wavelength), wavelength)
+        if made is not None:
+            free.append(made)
+    errors = np.array([_prediction_errors(cells, shape) for shape in free])
+    return free[_simplest(errors, worth)]
+
+
+def _degree_name(degree: int) -> str:
+    return "plane" if degree == 1 else f"polynomial of degree {degree}"
+
+
+def _of_degree(degree: int) -> Callable[[np.ndarray, np.ndarray], Fit | None]:
+    return lambda points, weights: polynomial(points, weights, degree)
+
+
+def _of_wavelength(cells: _Cells, base: _Shape, wavelength: float) -> Callable[[np.ndarray, np.ndarray], Fit | None]:
+    def fit_to(points: np.ndarray, weights: np.ndarray) -> Fit | None:
+        return free_form(points, weights, base.fit, wavelength, cells.side, cells.central)
+
+    return fit_to
+
+
+def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
+    """In the picture's units, long ones first: down to 8 cells, twice what is predicted together."""
+    if config.scale_mm is not None:
+        return [2 * config.scale_mm * MM * cells.side / cells.side_m]
+    longest = max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1
+    ladder, cells_long = [], float(longest)
+    while cells_long >= 2 * TILE_CELLS:
+        ladder.append(cells_long * cells.side)
+        cells_long /= 1.6
+    return ladder or [longest * cells.side]
+
+
+def _fitted(
+    cells: _Cells,
+    name: str,
+    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None],
+    wavelength: float | None,
+    widened: bool = False,
+) -> _Shape | None:
+    """The shape by bisquare weights; ``widened``: what borders on cells without weight loses its own, for the flank
+    of a dent departs too little to be noticed and enough to bend the surface. None where it cannot be fitted, or misses
+    one cell in fifty."""
+    fit: Fit | None = None
+    weights, floor = cells.weights, 0.2 * _pixel_noise(cells) / np.sqrt(CELL_POINTS)
+    for _ in range(6):
+        fit = fit_to(cells.points, weights)
+        if fit is None:
+            return None
+        error = cells.points[:, 2] - fit(cells.points)
+        known = np.isfinite(error) & (cells.weights > 0)
+        if known.sum() < 0.98 * (cells.weights > 0).sum():
+            return None
+        scale = max(median_size_of(error[known]) / 0.6745, floor)
+        robust = bisquare_weights(np.where(known, error, np.inf), TUNING * scale)
+        weights = cells.weights * (robust * ~_beside(cells, robust == 0) if widened else robust)
+    return None if fit is None else _Shape(name, fit_to, fit, weights, wavelength)
+
+
+def _beside(cells: _Cells, flagged: np.ndarray) -> np.ndarray:
+    """Cells that are flagged together with another beside them, and the neighbours of such pairs."""
+    image = _image(cells, flagged.astype(float), 0.0) > 0
+    pairs = cv2.filter2D(image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) >= 3
+    grown = cv2.dilate((image & pairs).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    beside: np.ndarray = grown[cells.row, cells.column]
+    return beside
+
+
+def _image(cells: _Cells, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
+    image = np.full((cells.row.max() + 1, cells.column.max() + 1), empty)
+    image[cells.row, cells.column] = values
+    return image
+
+
+def _pixel_noise(cells: _Cells) -> float:
+    return median_of(cells.noise[np.isfinite(cells.noise)])
+
+
+def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
+    """(tiles,) median size of the errors in each tile of cells, predicted from the tiles of the other folds."""
+    across = cells.column // TILE_CELLS
+    down = cells.row // TILE_CELLS
+    fold = (across + 2 * down) % FOLDS
+    error = np.full(len(cells.points), np.inf)
+    for left_out in range(FOLDS):
+        inside = fold == left_out
+        fit = shape.fit_to(cells.points, shape.weights * ~inside)
+        if fit is not None and inside.any():
+            error[inside] = cells.points[inside, 2] - fit(cells.points[inside])
+    error[~np.isfinite(error)] = 1e3
+    _, tile = np.unique(down * (across.max() + 1) + across, return_inverse=True)
+    return _group_medians(np.abs(error), tile, int(tile.max()) + 1)[0]
+
+
+def _simplest(errors: np.ndarray, worth: float) -> int:
+    """The first of shapes, simple ones first, whose mean error (shapes, tiles) is above the least by no more than
+    ``worth`` or a standard error of the difference."""
+    means = errors.mean(axis=1)
+    best = int(np.argmin(means))
+    for i in range(best):
+        difference = errors[i] - errors[best]
+        if means[i] - means[best] <= max(worth, float(difference.std()) / np.sqrt(len(difference))):
+            return i
+    return best
+
+
+# ---------------------------------------------------------------- goodness of fit
+
+
+FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
+"""Share of the target with structure beyond the noise: from the first on a free form is tried, from the second on the
+surface is said not to fit."""
+STRUCTURE_CELLS = 5
+"""Side of what is averaged to see structure larger than damage."""
+STRUCTURE_SIGMAS = 4.0
+SEEN = 0.5
+"""Of the noise of a pixel: structure below it changes no finding."""
+
+
+def _structure(cells: _Cells, fit: Fit) -> tuple[float, float, np.ndarray]:
+    """Share of the cells that take part in structure, its rms in metres, and the smoothed misfit of each cell."""
+    error = cells.points[:, 2] - fit(cells.points)
+    known = np.isfinite(error) & (cells.weights > 0)
+    image = _image(cells, np.where(known, error, np.nan))
+    noise = _cell_noise(image)
+    pixel = _pixel_noise(cells)
+    # compact findings stand out of their neighbourhood's median; structure makes the neighbourhood
+    size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
+    valid = np.isfinite(image)
+    limit = np.nanmedian(np.abs(image)) / 0.6745 * TUNING
+    used = valid & (np.abs(np.nan_to_num(image)) < max(limit, TUNING * noise))
+    count = cv2.boxFilter(used.astype(float), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    total = cv2.boxFilter(np.where(used, image, 0.0), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    smooth = total / np.maximum(count, 1)
+    enough = valid & (count >= 9)
+    beyond = enough & (
+        np.abs(smooth) > np.maximum(STRUCTURE_SIGMAS * noise / np.sqrt(np.maximum(count, 1)), SEEN * pixel)
+    )
+    share = float(beyond.sum() / max(enough.sum(), 1))
+    rms = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
+    return share, rms, smooth[cells.row, cells.column]
+
+
+def _cell_noise(image: np.ndarray) -> float:
+    """Standard deviation of cells' medians, from second differences along rows and columns: blind to slopes."""
+    bends = [
+        (image[2:] - 2 * image[1:-1] + image[:-2]).ravel(),
+        (image[:, 2:] - 2 * image[:, 1:-1] + image[:, :-2]).ravel(),
+    ]
+    finite = np.concatenate(bends)
+    finite = finite[np.isfinite(finite)]
+    return median_size_of(finite) / 0.6745 / np.sqrt(6.0) if len(finite) else 0.0
+
+
+def _judged(
+    points: np.ndarray, mask: np.ndarray, cells: _Cells, name: str, fit: Fit, wavelength: float | None
+) -> Background:
+    fitted = fit(points)
+    cells = _refreshed(cells, points, fit)
+    share, rms, _ = _structure(cells, fit)
+    noise = _noise_map(cells)
+    pixel = _pixel_noise(cells)
+    scale_m = None if wavelength is None else 0.5 * wavelength * cells.side_m / cells.side
+    fits = share < MISFIT_FROM
+    warning = (
+        ""
+        if fits
+        else (
+            f"the surface ({name}) does not fit here: structure of {1e3 * rms:.2g} mm rms at scales above"
+            f" {STRUCTURE_CELLS * cells.side_m / MM:.3g} mm, where a pixel's noise is {1e3 * pixel:.2g} mm, on"
+            f" {100 * share:.0f} % of the target; findings there may be the surface's own shape"
+        )
+    )
+    text = name
+    if scale_m is not None:
+        text += f", follows shapes wider than {scale_m / MM:.0f} mm: shallow dents that wide are taken for shape"
+    of = cells.of.copy()
+    pixels = np.where(of >= 0, noise[of], pixel)
+    notes = {"misfit_share": share, "misfit_rms_m": rms, "shape": name}
+    return Background(
+        _on(mask, fitted), _on(mask, points[:, 2] - fitted), _on(mask, pixels), text, scale_m, fits, warning, notes
+    )
+
+
+def _noise_map(cells: _Cells) -> np.ndarray:
+    """(c,) a pixel's noise about each cell: the median over 7 x 7 cells, at least the target's median."""
+    image = _image(cells, cells.noise)
+    rows, columns = image.shape
+    padded = np.pad(image, 3, constant_values=np.nan)
+    around = np.stack([padded[i : i + rows, j : j + columns] for i in range(7) for j in range(7)])
+    with np.errstate(all="ignore"):
+        local = np.nanmedian(around[:, cells.row, cells.column], axis=0)
+    pixel = _pixel_noise(cells)
+    return np.fmax(local, pixel)
+
+
+def _on(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+    image = np.full(mask.shape, np.nan)
+    image[mask] = values
+    return image
+
+
+def _unjudged(points: np.ndarray, mask: np.ndarray, config: SurfaceConfig) -> Background:
+    stated = config if config.shape == "polynomial" else config.model_copy(update={"degree": 1})
+    name, fit = _stated(points, stated)
+    fitted = fit(points)
+    residual = points[:, 2] - fitted
+    noise = np.full(len(points), median_size_of(residual) / 0.6745)
+    return Background(
+        _on(mask, fitted),
+        _on(mask, residual),
+        _on(mask, noise),
+        f"{name} (too few points to judge)",
+        None,
+        True,
+        "",
+        {},
+    )
