@@ -29,7 +29,7 @@ def main() -> int:
     """Run the chosen kinds; returns 0 where no answer is wrong, else 1."""
     parser = argparse.ArgumentParser(prog="python -m strangers", description=__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default all: {', '.join(KINDS)}")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="recordings of each kind (default 1)")
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="recordings of each kind (default 2)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed (default 0)")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep all recordings and answers here")
     arguments = parser.parse_args()

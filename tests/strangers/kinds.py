@@ -571,7 +571,7 @@ def undamaged(rng: Rng) -> Stranger:
 @kind
 def rubble(rng: Rng) -> Stranger:
     """Stones and nothing else: there is no target to inspect."""
-    cam = camera(rng)
+    cam = camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])
     stones = []
     for _ in range(60):
         d, radius = rng.uniform(0.5, 0.9), rng.uniform(0.02, 0.07)
