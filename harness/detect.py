@@ -39,7 +39,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         type=Path,
         metavar="PATH",
-        help="folder or list of depth .png, .ply, .pcd; .npy .npz .mat .mkv; a ROS 2 bag (folder, .mcap, .db3)",
+        help="folder or list of depth .png, .ply, .pcd; .npy .npz .mat .mkv; a ROS bag (folder, .mcap, .db3, .bag)",
     )
     add(
         "--out",
@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="calibrate the threshold on this capture of an undamaged target",
     )
-    add("--topic", help="of a ROS 2 bag: the topic with the clouds (default: points2, or the only one)")
+    add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
     add("--frames-report", action="store_true", help="list every frame with its valid part and median distance")
     several_arguments.add_to(parser)
     return parser

@@ -18,9 +18,12 @@ from rosbags.rosbag2 import CompressionMode
 
 from detectors.average import AverageConfig, average
 from detectors.recordings import bag_files, open_capture
+from detectors.recordings.bags import lens_of_info
+from detectors.recordings.image_messages import stored_depth
 from detectors.recordings.point_messages import frame_from_message
 from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lens import Lens
 
 POINTS = plane.points_m(plane.depth_mm())
 VALID = np.isfinite(POINTS[..., 2])
@@ -184,28 +187,195 @@ def test_the_usual_topic_the_only_one_or_the_named_one(tmp_path: Path) -> None:
     assert len(list(open_capture([only]).frames())) == 1
 
 
+# ---- depth images ----------------------------------------------------------------------------------------------------
+
+STORED = plane.depth_mm()
+DEPTH, LENS_TOPIC = "/camera/depth/image_raw", "/camera/depth/camera_info"
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    encoding=st.sampled_from(("16UC1", "mono16", "32FC1")),
+    big=st.booleans(),
+    padding=st.integers(0, 40),
+    packed=st.sampled_from(("", "png", "rvl")),
+)
+def test_every_encoding_of_one_depth_image_is_one_image(encoding: str, big: bool, padding: int, packed: str) -> None:
+    if packed:
+        stored = stored_depth("m", bags.packed_depth(STORED, encoding, packed))
+    else:
+        stored = stored_depth("m", bags.depth_image(STORED, encoding, big, padding))
+    if encoding != "32FC1":
+        assert stored.dtype == np.uint16
+        np.testing.assert_array_equal(stored, STORED)
+        return
+    # a / (n - b) is quantised: within one step of n
+    true_m = np.where(STORED == 0, np.nan, STORED / 1e3) if packed else STORED / 1e3
+    np.testing.assert_allclose(stored, true_m, rtol=2e-4 if packed else 1e-7)
+
+
+@pytest.mark.parametrize("kind", ("ros1", "db3", "mcap"))
+@pytest.mark.parametrize("compressed", (False, True))
+def test_a_bag_of_depth_images_has_their_lens(tmp_path: Path, kind: str, compressed: bool) -> None:
+    pictures = [(DEPTH, bags.IMAGE, bags.depth_image(plane.depth_mm(i, noise_mm=0.6))) for i in range(3)]
+    others = [
+        ("/camera/color/camera_info", bags.INFO, bags.info(shift_px=9.0)),
+        ("/camera/ir/image_raw", bags.IMAGE, bags.depth_image(STORED, "mono16")),
+        (LENS_TOPIC, bags.INFO, bags.info()),
+    ]
+    if kind == "ros1":
+        path = bags.write_ros1(tmp_path / "a.bag", [*others, *pictures], "lz4" if compressed else None)
+    else:
+        storage = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
+        mode = storage if compressed else CompressionMode.NONE
+        path = bags.write_bag(tmp_path / "a", [*others, *pictures], mcap=kind == "mcap", compression=mode)
+    recording = open_capture([path])
+    assert recording.lens == plane.LENS and recording.z_step_m == 1e-3
+    frames = list(recording.frames())
+    assert len(frames) == 3
+    for i, frame in enumerate(frames):
+        stored = plane.depth_mm(i, noise_mm=0.6)
+        np.testing.assert_array_equal(np.nan_to_num(frame.z_m), (stored * 1e-3).astype(np.float32))
+    assert frames[0].reason[plane.NO_RETURN] == Reason.NO_RETURN
+
+
+def test_clouds_of_ros_1_are_read(tmp_path: Path) -> None:
+    path = bags.write_ros1(tmp_path / "a.bag", [("/c", bags.INFO, bags.info()), *bags.clouds(2)], "bz2")
+    recording = open_capture([path])
+    assert recording.lens == plane.LENS and len(list(recording.frames())) == 2
+
+
+def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None:
+    picture, lens = (DEPTH, bags.IMAGE, bags.depth_image(STORED)), (LENS_TOPIC, bags.INFO, bags.info())
+    both = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
+    recording = open_capture([both])
+    assert recording.first_frame().rgb is None and "not the clouds on /points2" in recording.notes[0]
+    assert open_capture([both], topic="points2").first_frame().rgb is not None
+    lacking = bags.write_bag(tmp_path / "lacking", [picture, *bags.clouds(1)])
+    assert "the clouds on /points2 are read" in open_capture([lacking]).notes[0]
+    several = [picture, ("/camera/aligned_depth_to_color/image_raw", bags.IMAGE, bags.depth_image(STORED)), lens]
+    said = refusal(bags.write_bag(tmp_path / "several", several))
+    assert "2 topics hold depth images" in said and "--topic /camera/aligned_depth_to_color/image_raw" in said
+    copies = [picture, (f"{DEPTH}/compressedDepth", bags.PACKED, bags.packed_depth(STORED)), lens]
+    assert open_capture([bags.write_bag(tmp_path / "copies", copies)]).lens == plane.LENS
+
+
+def test_realsense_names_and_its_unit(tmp_path: Path) -> None:
+    sensor = "/device_0/sensor_0"
+    messages = [
+        (f"{sensor}/Depth_0/info/camera_info", bags.INFO, bags.info(model="Inverse Brown Conrady")),
+        (f"{sensor}/option/Depth_Units/value", "std_msgs/msg/Float32", bags.number(0.00025)),
+        ("/device_0/sensor_1/Color_0/info/camera_info", bags.INFO, bags.info(shift_px=9)),
+        (f"{sensor}/Depth_0/image/data", bags.IMAGE, bags.depth_image(4 * STORED, "mono16")),
+        (f"{sensor}/Infrared_0/image/data", bags.IMAGE, bags.depth_image(STORED, "mono16")),
+    ]
+    recording = open_capture([bags.write_ros1(tmp_path / "a.bag", messages)])
+    assert recording.lens == plane.LENS and recording.scale_m == 0.00025
+    np.testing.assert_allclose(np.nan_to_num(recording.first_frame().z_m), STORED / 1e3, rtol=1e-6)
+    assert any("depth unit 0.25 mm, from /device_0" in note for note in recording.notes)
+
+
+def test_the_lens_of_a_camera_info() -> None:
+    shape = plane.LENS.height, plane.LENS.width
+    distorted = (0.1, -0.2, 0.001, 0.002, 0.03)
+    lens = lens_of_info(bags.info(d=distorted), shape)
+    assert isinstance(lens, Lens) and lens.distortion == (*distorted, 0, 0, 0)
+    rectified = bags.info(d=distorted)
+    rectified.p = np.array([140.0, 0, 45, 0, 0, 141, 35, 0, 0, 0, 1, 0])
+    flat = lens_of_info(rectified, shape, is_rectified=True)
+    assert isinstance(flat, Lens) and (flat.fx, flat.cy, any(flat.distortion)) == (140, 35, False)
+    # the centre of a binned pixel lies between those of its four; the region's first pixel is (10, 20)
+    binned = bags.info()
+    binned.binning_x = binned.binning_y = 2
+    binned.roi = type(binned.roi)(x_offset=10, y_offset=20, width=40, height=30, do_rectify=False)
+    small = lens_of_info(binned, (15, 20))
+    assert isinstance(small, Lens)
+    np.testing.assert_allclose(small.slopes(3, 4), plane.LENS.slopes(10 + 6.5, 20 + 8.5))
+    assert "distortion model equidistant" in str(lens_of_info(bags.info(d=(0.1, 0, 0, 0), model="equidistant"), shape))
+    assert "for images of 96 x 72 pixels, not 10 x 10" in str(lens_of_info(bags.info(), (10, 10)))
+    unset = bags.info()
+    unset.k = np.zeros(9)
+    assert "not calibrated" in str(lens_of_info(unset, shape))
+
+
+def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
+    picture = (DEPTH, bags.IMAGE, bags.depth_image(STORED))
+    none = bags.write_bag(tmp_path / "none", [picture])
+    assert "the bag's: none" in refusal(none) and "--intrinsics FILE" in refusal(none)
+    assert open_capture([none], lens=plane.LENS).lens == plane.LENS
+    fisheye = bags.info(d=(0.1, 0, 0, 0), model="equidistant")
+    assert "equidistant" in refusal(bags.write_bag(tmp_path / "fish", [picture, (LENS_TOPIC, bags.INFO, fisheye)]))
+    short = bags.depth_image(STORED)
+    short.data = short.data[:-1]
+    cut = bags.write_bag(tmp_path / "cut", [(DEPTH, bags.IMAGE, short), (LENS_TOPIC, bags.INFO, bags.info())])
+    assert "is truncated" in refusal(cut)
+
+
+@settings(max_examples=40, deadline=None)
+@given(form=st.sampled_from(("png", "rvl")), cut=st.floats(0, 1), place=st.floats(0, 1), byte=st.integers(0, 255))
+def test_a_damaged_compressed_image_is_read_or_told(form: str, cut: float, place: float, byte: int) -> None:
+    message = bags.packed_depth(STORED, "16UC1", form)
+    data = message.data.copy()
+    data[int(place * (data.size - 1))] ^= byte
+    message.data = data[: int(cut * data.size)]
+    try:
+        assert stored_depth("m", message).dtype == np.uint16
+    except UserError as mistake:
+        assert str(mistake)
+
+
+@pytest.mark.parametrize("part", (0.0, 0.001, 0.3, 0.9, 0.999))
+def test_a_truncated_bag_of_ros_1_is_named(tmp_path: Path, part: float) -> None:
+    path = bags.write_ros1(tmp_path / "a.bag", bags.clouds(2))
+    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+    message = refusal(path)
+    assert "a.bag: is truncated or damaged" in message and "rosbag reindex" in message
+
+
+@settings(max_examples=25, deadline=None)
+@given(place=st.floats(0, 1), byte=st.integers(1, 255))
+def test_a_changed_byte_of_ros_1_is_read_or_told(
+    tmp_path_factory: pytest.TempPathFactory, place: float, byte: int
+) -> None:
+    path = bags.write_ros1(tmp_path_factory.mktemp("ros1") / "a.bag", bags.clouds(1))
+    content = bytearray(path.read_bytes())
+    content[int(place * (len(content) - 1))] ^= byte
+    path.write_bytes(content)
+    try:
+        assert len(list(open_capture([path]).frames())) <= 1
+    except UserError as mistake:
+        assert str(mistake)
+
+
+def test_a_chunk_of_ros_1_may_not_unpack_to_more_than_it_says(tmp_path: Path) -> None:
+    path = bags.write_ros1(tmp_path / "a.bag", bags.clouds(1), "bz2")
+    content = bytearray(path.read_bytes())
+    at = content.index(b"size=") + 5
+    struct.pack_into("<I", content, at, 1000)
+    path.write_bytes(content)
+    assert "unpacks to more than the" in refusal(path)
+    struct.pack_into("<I", content, at, bag_files.MAX_CHUNK_BYTES + 1)
+    path.write_bytes(content)
+    assert "up to 1024 MiB" in refusal(path)
+
+
 # ---- what it refuses -------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
     none = bags.write_bag(tmp_path / "none", [("/picture", bags.IMAGE, bags.image())])
-    assert "no topic with sensor_msgs/msg/PointCloud2; its topics: /picture (sensor_msgs/msg/Image)" in refusal(none)
+    assert "or depth images; its topics: /picture (sensor_msgs/msg/Image)" in refusal(none)
     some = bags.write_bag(tmp_path / "some", [("/picture", bags.IMAGE, bags.image()), *bags.clouds(1)])
     assert "no topic points; its topics: /picture" in refusal(some, topic="points")
-    assert "/picture holds sensor_msgs/msg/Image" in refusal(some, topic="picture")
+    assert "/picture message 0: holds 'mono8' pictures, no depth" in refusal(some, topic="picture")
     np.save(tmp_path / "d.npy", plane.depth_mm())
-    assert "is no ROS 2 bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
-
-
-def test_a_bag_of_ros_1_is_told_how_to_be_converted(tmp_path: Path) -> None:
-    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
-    assert "rosbags-convert" in refusal(tmp_path / "old.bag")
+    assert "is no ROS bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
 
 
 @pytest.mark.parametrize("mcap", (False, True))
 def test_an_empty_bag_is_refused(tmp_path: Path, mcap: bool) -> None:
     folder = bags.write_bag(tmp_path / "bag", [], mcap=mcap)
-    assert "no topic with sensor_msgs/msg/PointCloud2; its topics: none" in refusal(folder)
+    assert "no topic with sensor_msgs/msg/PointCloud2 or depth images; its topics: none" in refusal(folder)
 
 
 def test_a_topic_without_messages_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""ROS 2 bags as files: which of them hold the messages, and reading them by ``rosbags`` without trusting them."""
+"""ROS bags as files: which of them hold the messages, and reading them by ``rosbags`` without trusting them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 
 if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Ros1Reader
     from rosbags.rosbag2 import Reader
 
 BAG_SUFFIXES = (".mcap", ".db3")
+ROS1_SUFFIX = ".bag"
 METADATA = "metadata.yaml"
-LEGAL_BAG = "a ROS 2 bag: its folder with metadata.yaml, one .db3 or one .mcap"
+LEGAL_BAG = "a ROS 2 bag (its folder with metadata.yaml, one .db3 or one .mcap) or a .bag of ROS 1"
 MAX_MESSAGE_BYTES = 2**28
 """256 MiB: a cloud of four million points with 64 bytes each."""
 MAX_CHUNK_BYTES = 2**30
@@ -31,6 +33,10 @@ COMPUTED = re.compile(r"\bvirtual\b|\bgenerated\b|\bas\s*\(|\bas\s+(select|with)
 """Of an SQLite table's declaration: words that only a virtual table or a computed column has."""
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MCAP_CHUNK = 6
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+ROS1_CHUNK = b"\x05"
+ROS1_HEADER_BYTES = 1 << 20
+"""Of a record's header: that of a connection holds the names of its topic and type."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +104,11 @@ def messages(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
     """
     from rosbags.typesys import Stores, get_typestore
 
-    types = get_typestore(Stores.ROS2_JAZZY)
     number = 0
     for file in bag.files:
+        is_ros1 = file.suffix.lower() == ROS1_SUFFIX
+        types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+        decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
         with _opened(file) as reader:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
             found = reader.messages(wanted) if wanted else iter(())
@@ -114,7 +122,7 @@ def messages(bag: Bag, topic: str) -> Iterator[tuple[str, Any]]:
                 content = _unpacked(name, content) if bag.packed else content
                 _refuse_huge(name, len(content))
                 with _readable(file):
-                    message = types.deserialize_cdr(content, connection.msgtype)
+                    message = decode(content, connection.msgtype)
                 yield name, message
                 number += 1
 
@@ -140,16 +148,19 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Reader]:
+def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
+    from rosbags.rosbag1 import Reader as Ros1Reader
     from rosbags.rosbag2 import Reader
 
-    if file.suffix.lower() == ".mcap":
-        stat = file.stat()
+    suffix, stat = file.suffix.lower(), file.stat()
+    if suffix == ".mcap":
         _refuse_bad_chunks(file, stat.st_size, stat.st_mtime_ns)
+    elif suffix == ROS1_SUFFIX:
+        _refuse_bad_ros1_chunks(file, stat.st_size, stat.st_mtime_ns)
     else:
         _refuse_programs(file)
     with _readable(file):
-        reader = Reader(file)
+        reader = Ros1Reader(file) if suffix == ROS1_SUFFIX else Reader(file)
         reader.open()
     try:
         yield reader
@@ -161,6 +172,7 @@ def _opened(file: Path) -> Iterator[Reader]:
 def _readable(file: Path) -> Iterator[None]:
     """Tell a user what the library's exceptions mean; it leaves many of its checks to Python."""
     from apsw import Error as SqliteError
+    from rosbags.rosbag1 import ReaderError as Ros1Error
     from rosbags.rosbag2 import ReaderError
     from rosbags.serde import SerdeError
 
@@ -168,15 +180,16 @@ def _readable(file: Path) -> Iterator[None]:
     python = (struct.error, TypeError, ValueError, LookupError, OSError, EOFError, AssertionError, OverflowError)
     try:
         yield
-    except (ReaderError, SerdeError, SqliteError, RuntimeError, *python) as error:
+    except (ReaderError, Ros1Error, SerdeError, SqliteError, RuntimeError, *python) as error:
         raise _damaged(file, str(error) or type(error).__name__) from error
 
 
 def _damaged(file: Path, why: str) -> UserError:
+    mend = f"rosbag reindex {file}" if file.suffix.lower() == ROS1_SUFFIX else "ros2 bag reindex, or mcap recover"
     return UserError(
         f"{file}: is truncated or damaged, or is no bag ({why})",
         legal=LEGAL_BAG,
-        fix="copy it again; of a recording that was cut off: ros2 bag reindex, or mcap recover",
+        fix=f"copy it again; of a recording that was cut off: {mend}",
     )
 
 
@@ -202,7 +215,9 @@ def _unpacked(name: str, content: bytes) -> bytes:
 
 
 def _pieces(name: str, form: str, content: bytes) -> Iterator[bytes]:
-    """Compressed content (zstd or lz4 frames, one after the other) unpacked piece by piece."""
+    """Compressed content (zstd, lz4 or bz2 frames, one after the other) unpacked piece by piece."""
+    import bz2
+
     import lz4.frame  # type: ignore[import-untyped]
 
     if sys.version_info >= (3, 14):
@@ -210,12 +225,13 @@ def _pieces(name: str, form: str, content: bytes) -> Iterator[bytes]:
     else:
         from backports import zstd
 
+    makers = {"zstd": zstd.ZstdDecompressor, "lz4": lz4.frame.LZ4FrameDecompressor, "bz2": bz2.BZ2Decompressor}
     while content:
-        unpacker = zstd.ZstdDecompressor() if form == "zstd" else lz4.frame.LZ4FrameDecompressor()
+        unpacker = makers[form]()
         while not unpacker.eof:
             try:
                 piece = unpacker.decompress(content, max_length=PIECE_BYTES)
-            except (zstd.ZstdError, RuntimeError, EOFError) as error:
+            except (zstd.ZstdError, RuntimeError, EOFError, OSError) as error:
                 raise UserError(f"{name}: compressed data cannot be unpacked ({error})", legal=LEGAL_BAG) from error
             if not piece and not unpacker.eof:
                 raise UserError(f"{name}: compressed data end too early", legal=LEGAL_BAG)
@@ -263,22 +279,56 @@ def _refuse_bad_chunks(file: Path, size: int, changed_ns: int) -> None:
 
 
 def _refuse_bad_chunk(file: Path, start: int, record: bytes) -> None:
-    name = f"{file}: the chunk at byte {start}"
     try:
         _, _, promised, _, letters = struct.unpack_from("<QQQII", record)
         form = record[32 : 32 + letters].decode()
         (packed,) = struct.unpack_from("<Q", record, 32 + letters)
     except (struct.error, UnicodeDecodeError) as error:
         raise _damaged(file, f"the chunk at byte {start}") from error
+    content = record[40 + letters : 40 + letters + packed]
+    _refuse_bomb(f"{file}: the chunk at byte {start}", promised, form, content, ("", "zstd", "lz4"))
+
+
+@lru_cache(maxsize=1000)
+def _refuse_bad_ros1_chunks(file: Path, size: int, changed_ns: int) -> None:
+    """The same of a ROS 1 bag's records: a header of named fields, and data, each after its length."""
+    with file.open("rb") as stream, _readable(file):
+        if stream.read(len(ROS1_MAGIC)) != ROS1_MAGIC:
+            raise _damaged(file, "it does not begin as a bag of ROS 1 does" if size else "it is empty")
+        while (start := stream.tell()) < size:
+            (length,) = struct.unpack("<I", stream.read(4))
+            if length > ROS1_HEADER_BYTES:
+                raise _damaged(file, f"the record at byte {start} has a header of {length} bytes")
+            fields = _ros1_fields(stream.read(length))
+            (length,) = struct.unpack("<I", stream.read(4))
+            end = stream.tell() + length
+            if end > size or length > MAX_CHUNK_BYTES:
+                raise _damaged(file, f"the record at byte {start} is cut off, or states {length} bytes")
+            if fields.get(b"op") == ROS1_CHUNK:
+                (promised,) = struct.unpack("<I", fields[b"size"])
+                form = fields[b"compression"].decode().replace("none", "")
+                content = stream.read(length) if form else b""
+                _refuse_bomb(f"{file}: the chunk at byte {start}", promised, form, content, ("", "bz2", "lz4"))
+            stream.seek(end)
+
+
+def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
+    fields, at = {}, 0
+    while at < len(header):
+        (length,) = struct.unpack_from("<I", header, at)
+        name, _, value = header[at + 4 : at + 4 + length].partition(b"=")
+        fields[name] = value
+        at += 4 + length
+    return fields
+
+
+def _refuse_bomb(name: str, promised: int, form: str, content: bytes, known: tuple[str, ...]) -> None:
     if promised > MAX_CHUNK_BYTES:
         raise UserError(f"{name}: has {promised} bytes", legal=f"up to {MAX_CHUNK_BYTES >> 20} MiB, unpacked")
-    if form not in ("", "zstd", "lz4"):
-        raise UserError(f"{name}: is compressed by {form!r}", legal="zstd, lz4 or no compression")
-    if not form:
-        return
-    content = record[40 + letters : 40 + letters + packed]
+    if form not in known:
+        raise UserError(f"{name}: is compressed by {form!r}", legal=f"{' or '.join(known[1:])}, or no compression")
     unpacked = 0
-    for piece in _pieces(name, form, content):
+    for piece in _pieces(name, form, content) if form else ():
         unpacked += len(piece)
         if unpacked > promised:
             raise UserError(f"{name}: unpacks to more than the {promised} bytes that it states", legal=LEGAL_BAG)

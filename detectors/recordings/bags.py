@@ -1,11 +1,13 @@
-"""ROS 2 bags (folder, .db3, .mcap) with sensor_msgs/PointCloud2 as captures; the thesis recorded ``points2``.
+"""ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
 
-Where the bag holds a CameraInfo of the cloud's size whose rays pass through the cloud's points, z and that lens are
+A depth image needs the CameraInfo that its driver publishes beside it. Where a bag of clouds (the thesis recorded
+``points2``) holds a CameraInfo of the cloud's size whose rays pass through the cloud's points, z and that lens are
 used: then a pixel's ray is the same in all frames, as it was in the camera, and not rounded anew in each.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,18 +16,24 @@ from typing import Any
 import numpy as np
 
 from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag, messages, topics_of
-from detectors.recordings.distances import UNITS_M, rounding_step_m
-from detectors.recordings.intrinsics import KNOWN_MODELS, read_lens
+from detectors.recordings.distances import UNITS_M, default_metres, frame_from_depth, rounding_step_m
+from detectors.recordings.image_messages import DEPTH_NUMBERS, encoding_of, stored_depth
+from detectors.recordings.intrinsics import KNOWN_MODELS, no_lens, read_lens
 from detectors.recordings.point_messages import frame_from_message
 from detectors.recordings.recording import Recording, slopes_of
-from harness.vocabulary.capture import Frame
+from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
+NOT_DEPTH = re.compile(r"(^|[/_])(ir|infra\w*|confidence|amplitude|intensity|reflectivity)([/_]|\d|$)", re.IGNORECASE)
+"""Words in the topics of other pictures that a depth camera publishes in 16 bits or floating point."""
+TRANSPORTS = ("/compressedDepth", "/compressed")
 RAY_TOLERANCE_PX = 0.01
 """A lens counts where each point lies within this of its pixel's ray: 14 um at 0.7 m with the Azure Kinect's focal
 length, three hundred times what float32 leaves of it."""
@@ -46,20 +54,54 @@ class BagReader:
             yield replace(frame, xy_m=None) if self.has_lens else frame
 
 
+@dataclass(frozen=True)
+class BagImageReader:
+    """Streams the depth images of one topic, one frame a message."""
+
+    bag: Bag
+    topic: str
+    scale_m: float
+
+    def frames(self) -> Iterator[Frame]:
+        for name, message in messages(self.bag, self.topic):
+            frame = frame_from_depth(name, stored_depth(name, message), self.scale_m)
+            # NaN is this message's code for "no return" (REP 118), which other files write as 0
+            frame.reason[frame.reason == Reason.NOT_FINITE] = Reason.NO_RETURN
+            yield frame
+
+
 def open_bag(
     path: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None, topic: str | None
 ) -> Recording:
-    """Open a bag's clouds. ``topic``: which of several topics with clouds. A lens that is given must fit the points.
+    """Open a bag's depth images or clouds. ``topic``: which of several. A lens that is given must fit clouds' points.
 
     Raises UserError where the bag is broken or empty, has no such topic, or the topic holds something else.
     """
     bag = find_bag(path)
     topics = topics_of(bag)
-    chosen = _chosen_topic(path, topics, topic)
+    chosen, notes = _chosen_topic(path, bag, topics, topic, has_lens=bool(intrinsics or lens))
+    opened = _open_clouds if topics[chosen] == CLOUD_TYPE else _open_images
+    recording = opened(path, bag, topics, chosen, scale_m, intrinsics, lens)
+    return replace(
+        recording,
+        files=(*bag.files, *((bag.metadata,) if bag.metadata else ()), *((intrinsics,) if intrinsics else ())),
+        notes=(*notes, *recording.notes),
+    )
+
+
+def _open_clouds(
+    path: Path,
+    bag: Bag,
+    topics: dict[str, str],
+    topic: str,
+    scale_m: float | None,
+    intrinsics: Path | None,
+    lens: Lens | None,
+) -> Recording:
     scale_m = scale_m or UNITS_M["m"]
-    first = next(BagReader(bag, chosen, scale_m, has_lens=False).frames(), None)
+    first = next(BagReader(bag, topic, scale_m, has_lens=False).frames(), None)
     if first is None:
-        raise UserError(f"{path}: no message on {chosen}", legal="at least one cloud", fix="record again")
+        raise UserError(f"{path}: no message on {topic}", legal="at least one cloud", fix="record again")
     height, width = first.z_m.shape
     lens = read_lens(intrinsics, width, height) if intrinsics else lens
     notes: tuple[str, ...] = ()
@@ -67,66 +109,206 @@ def open_bag(
         _refuse_other_rays(path, lens, first)
     else:
         lens, notes = _lens_in_bag(bag, topics, first)
-    files = (*bag.files, *((bag.metadata,) if bag.metadata else ()), *((intrinsics,) if intrinsics else ()))
     return Recording(
         name=bag.name,
-        reader=BagReader(bag, chosen, scale_m, has_lens=lens is not None),
+        reader=BagReader(bag, topic, scale_m, has_lens=lens is not None),
         region=Region(0, height, 0, width),
         scale_m=scale_m,
         z_step_m=rounding_step_m(first.z_m),
-        files=files,
+        files=(),
         lens=lens,
         organised=height > 1,
         notes=notes,
     )
 
 
-def _chosen_topic(path: Path, topics: dict[str, str], asked: str | None) -> str:
+def _open_images(
+    path: Path,
+    bag: Bag,
+    topics: dict[str, str],
+    topic: str,
+    scale_m: float | None,
+    intrinsics: Path | None,
+    lens: Lens | None,
+) -> Recording:
+    name, message = next(messages(bag, topic), ("", None))
+    if message is None:
+        raise UserError(f"{path}: no message on {topic}", legal="at least one depth image", fix="record again")
+    stored = stored_depth(name, message)
+    height, width = stored.shape
+    notes: list[str] = []
+    if intrinsics is not None:
+        lens = read_lens(intrinsics, width, height)
+    if lens is None:
+        lens = _lens_of_images(path, bag, topics, topic, stored.shape)
+    if (lens.width, lens.height) != (width, height):
+        raise UserError(
+            f"{path}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
+            fix="leave --intrinsics out, or give the lens of these images",
+        )
+    if scale_m is None and stored.dtype.kind == "u":
+        scale_m, unit_topic = _stated_unit(bag, topics, topic)
+        notes += [f"depth unit {1e3 * scale_m:.4g} mm, from {unit_topic}"] if scale_m else []
+    scale_m = scale_m or default_metres(stored.dtype)
+    reader = BagImageReader(bag, topic, scale_m)
+    is_whole = stored.dtype.kind == "u"
+    return Recording(
+        name=bag.name,
+        reader=reader,
+        region=lens.whole,
+        scale_m=scale_m,
+        z_step_m=scale_m if is_whole else rounding_step_m(next(reader.frames()).z_m),
+        files=(),
+        lens=lens,
+        notes=tuple(notes),
+    )
+
+
+# ---- which topic -----------------------------------------------------------------------------------------------------
+
+
+def _chosen_topic(
+    path: Path, bag: Bag, topics: dict[str, str], asked: str | None, has_lens: bool
+) -> tuple[str, tuple[str, ...]]:
+    """The topic to read, and what the user should know of the others: the depth image with its lens, else the cloud."""
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
+    kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
     if asked is not None:
         name = asked if asked in topics else f"/{asked}"
         if name not in topics:
-            raise UserError(f"{path}: no topic {asked}; its topics: {held}", legal=", ".join(clouds) or LEGAL_BAG)
-        if topics[name] != CLOUD_TYPE:
-            raise UserError(f"{path}: {name} holds {topics[name]}", legal=f"a topic with {CLOUD_TYPE}")
-        return name
-    if not clouds:
+            legal = ", ".join([*clouds, *_depth_topics(bag, topics)])
+            raise UserError(f"{path}: no topic {asked}; its topics: {held}", legal=legal or LEGAL_BAG)
+        if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
+            raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
+        return name, ()
+    images = _depth_topics(bag, topics)
+    usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
+    if len(images) == 1 and (not clouds or has_lens or _infos_of(topics, images[0])):
+        others = ", ".join(clouds)
+        note = f"the depth images on {images[0]} are read, with their lens, not the clouds on {others}; --topic chooses"
+        return images[0], (note,) if clouds else ()
+    if len(usual) == 1:
+        note = f"the clouds on {usual[0]} are read; depth images: {', '.join(images)}; --topic chooses"
+        return usual[0], (note,) if images else ()
+    if not images and not clouds:
         raise UserError(
-            f"{path}: no topic with {CLOUD_TYPE}; its topics: {held}",
-            legal=f"a bag with clouds, usually on /{USUAL_TOPIC}",
-            fix=f"record it with the camera's clouds: ros2 bag record /{USUAL_TOPIC} /depth/camera_info",
+            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
+            legal=kinds,
+            fix="record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info",
         )
-    usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC]
-    if len(usual) == 1 or len(clouds) == 1:
-        return (usual or clouds)[0]
-    raise UserError(f"{path}: {len(clouds)} topics hold clouds", legal=", ".join(clouds), fix="choose one by --topic")
+    found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
+    raise UserError(
+        f"{path}: {found}",
+        legal=", ".join([*clouds, *images]),
+        fix=f"choose one, for instance --topic {(images or clouds)[0]}",
+    )
 
 
-# ---- the lens --------------------------------------------------------------------------------------------------------
+def _depth_topics(bag: Bag, topics: dict[str, str]) -> list[str]:
+    """Topics whose first picture may be depth. 16-bit grey counts as depth only under a name that says so, and a
+    compressed copy only where the pictures themselves are not in the bag."""
+    found = []
+    for topic, kind in topics.items():
+        if kind not in IMAGE_TYPES or NOT_DEPTH.search(topic):
+            continue
+        _, message = next(messages(bag, topic), ("", None))
+        encoding = encoding_of(message) if message is not None else ""
+        if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
+            found.append(topic)
+    return [topic for topic in found if _of_pictures(topic) == topic or _of_pictures(topic) not in found]
+
+
+def _of_pictures(topic: str) -> str:
+    """A topic without the name of its transport."""
+    transport = next((end for end in TRANSPORTS if topic.endswith(end)), "")
+    return topic.removesuffix(transport)
+
+
+# ---- the lens and the unit -------------------------------------------------------------------------------------------
+
+
+def _infos_of(topics: dict[str, str], topic: str) -> list[str]:
+    """The CameraInfo that belongs to a picture by its name: camera_info beside it; info/camera_info beside its folder
+    (RealSense)."""
+    folder = _of_pictures(topic).rpartition("/")[0]
+    names = (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info", f"{topic}/camera_info")
+    return [name for name in names if topics.get(name) == INFO_TYPE]
+
+
+def _lens_of_images(path: Path, bag: Bag, topics: dict[str, str], topic: str, shape: tuple[int, ...]) -> Lens:
+    """The lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
+    every = [name for name, kind in topics.items() if kind == INFO_TYPE]
+    why: list[str] = []
+    for info in _infos_of(topics, topic) or (every if len(every) == 1 else []):
+        _, message = next(messages(bag, info), ("", None))
+        if message is None:
+            continue
+        lens = lens_of_info(message, shape, is_rectified="rect" in _of_pictures(topic).rpartition("/")[2])
+        if isinstance(lens, Lens):
+            return lens
+        why.append(f"{info} {lens}")
+    told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+    lacking = no_lens(f"{path}: {told}")
+    fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
+    raise UserError(lacking.message, legal=lacking.legal, fix=fix)
+
+
+def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
+    """The lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs.
+
+    A rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and the region of
+    interest are taken off. ROS 1 writes the matrices in capitals.
+    """
+    d, k, p = (
+        np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in ("d", "k", "p")
+    )
+    d = np.zeros(0) if is_rectified or not d.any() else d
+    model = str(message.distortion_model)
+    across, down = max(1, int(message.binning_x)), max(1, int(message.binning_y))
+    roi = message.roi
+    width, height = (int(roi.width), int(roi.height)) if roi.width and roi.height else (message.width, message.height)
+    if (height // down, width // across) != tuple(shape):
+        return f"is for images of {width // across} x {height // down} pixels, not {shape[1]} x {shape[0]}"
+    if d.size and (model.lower() not in KNOWN_MODELS or d.size not in (4, 5, 8, 12, 14) or d[8:].any()):
+        return f"has the distortion model {model or '(none)'} with {d.size} numbers, which is not read"
+    fx, fy, cx, cy = p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
+    if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
+        return f"states the focal length {fx:g}, {fy:g}, as of a camera that is not calibrated"
+    return Lens(
+        width=shape[1],
+        height=shape[0],
+        fx=float(fx / across),
+        fy=float(fy / down),
+        # pixel positions count from the first pixel's centre, which lies half a pixel inside
+        cx=float((cx - roi.x_offset + 0.5) / across - 0.5),
+        cy=float((cy - roi.y_offset + 0.5) / down - 0.5),
+        distortion=tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8)))),
+    )
+
+
+def _stated_unit(bag: Bag, topics: dict[str, str], topic: str) -> tuple[float | None, str]:
+    """Metres in one stored unit as RealSense's viewer states them beside a sensor's streams, and the topic."""
+    for name, kind in topics.items():
+        sensor, _, option = name.partition("/option/")
+        if kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/"):
+            _, message = next(messages(bag, name), ("", None))
+            if message is not None and 1e-6 <= message.data <= 1:
+                # the option is a float32: 0.00025 is stored as 0.00025000001
+                return float(f"{message.data:.6g}"), name
+    return None, ""
 
 
 def _lens_in_bag(bag: Bag, topics: dict[str, str], frame: Frame) -> tuple[Lens | None, tuple[str, ...]]:
-    """The first CameraInfo's lens that fits the points, and what the user should know."""
+    """The first CameraInfo's lens that fits the points of a cloud, and what the user should know."""
     if frame.z_m.shape[0] == 1:
         return None, ("the cloud has no pixel grid; it is treated as single points",)
     for topic in (topic for topic, kind in topics.items() if kind == INFO_TYPE):
         _, message = next(messages(bag, topic), ("", None))
-        lens = _lens_of(message, frame.z_m.shape) if message is not None else None
-        if lens is not None and _off_ray_px(lens, frame) <= RAY_TOLERANCE_PX:
+        lens = lens_of_info(message, frame.z_m.shape) if message is not None else ""
+        if isinstance(lens, Lens) and _off_ray_px(lens, frame) <= RAY_TOLERANCE_PX:
             return lens, ()
     return None, ("no CameraInfo in the bag fits the points; each frame's own x and y are averaged",)
-
-
-def _lens_of(message: Any, shape: tuple[int, ...]) -> Lens | None:
-    """The lens of a CameraInfo for images of a shape; None where it is of another size or model."""
-    if (message.height, message.width) != shape or message.distortion_model not in KNOWN_MODELS:
-        return None
-    d = tuple(float(value) for value in message.d)
-    if len(d) not in (0, 4, 5, 8) or not np.isfinite([*d, *message.k]).all() or message.k[0] <= 0 or message.k[4] <= 0:
-        return None
-    fx, fy, cx, cy = (float(message.k[i]) for i in (0, 4, 2, 5))
-    return Lens(message.width, message.height, fx, fy, cx, cy, (d + (0.0,) * 8)[:8])
 
 
 def _off_ray_px(lens: Lens, frame: Frame) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, frame_from_depth, rounding_step_m
 from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
-from detectors.recordings.pictures import PNG_SIGNATURE, decoded, read_picture
+from detectors.recordings.pictures import PNG_SIGNATURE, decoded, read_picture, refuse_broken_png
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
@@ -145,7 +144,7 @@ def read_depth_png(path: Path) -> np.ndarray:
     """The stored numbers (h, w) uint16. Raises UserError where the file is broken or not 16-bit grey."""
     _refuse_wrong_bits(path)
     content = bounded_bytes(path, PICTURE_BYTES)
-    _refuse_broken(path, content)
+    refuse_broken_png(str(path), content)
     return decoded(str(path), content, cv2.IMREAD_UNCHANGED)
 
 
@@ -158,22 +157,6 @@ def _refuse_wrong_bits(path: Path) -> None:
             legal=LEGAL_PNG,
             fix="export the depth itself; a preview scaled to 0..255 has lost it",
         )
-
-
-def _refuse_broken(path: Path, content: bytes) -> None:
-    """Walk the chunks to the end and compare their checksums: the decoder may fill a cut picture up with zeros."""
-    at = len(PNG_SIGNATURE)
-    while at + 12 <= len(content):
-        length, kind = struct.unpack(">I4s", content[at : at + 8])
-        end = at + 12 + length
-        if end > len(content):
-            break
-        if zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
-            raise UserError(f"{path}: is damaged (checksum of {kind.decode('latin1')})", fix="copy or export it again")
-        if kind == b"IEND":
-            return
-        at = end
-    raise UserError(f"{path}: is truncated ({len(content)} bytes)", legal="a whole PNG", fix="copy or export it again")
 
 
 def _common_size(depths: tuple[Path, ...]) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from detectors.recordings.arrays import load_npy, load_npz, open_stack
 from detectors.recordings.azure_mkv import open_mkv
-from detectors.recordings.bag_files import BAG_SUFFIXES, is_bag_folder
+from detectors.recordings.bag_files import BAG_SUFFIXES, ROS1_SUFFIX, is_bag_folder
 from detectors.recordings.bags import open_bag
 from detectors.recordings.depth_images import open_depth_folder, open_depth_list
 from detectors.recordings.distances import metres_per_unit
@@ -23,8 +23,8 @@ CLOUDS = (".ply", ".pcd")
 HELD = 6
 """Names of a folder's contents that a message lists."""
 LEGAL_FORMATS = (
-    "a folder or list of 16-bit depth .png, a folder or list of .ply or .pcd, a ROS 2 bag (folder, .mcap, .db3), "
-    "or one .npy, .npz, .mat or .mkv file"
+    "a folder or list of 16-bit depth .png, a folder or list of .ply or .pcd, a ROS bag (folder, .mcap, .db3, "
+    ".bag), or one .npy, .npz, .mat or .mkv file"
 )
 
 
@@ -41,8 +41,8 @@ def open_capture(
 
     ``unit`` of the stored distances (mm, m, cm, um, tum, N/m) where the format's usual one is wrong. ``intrinsics``: a
     file with the depth pixels' lens, which counts before one found beside the frames or attached to them; ``lens`` the
-    same as a value. ``frames`` selects frames by number. ``topic``: of a ROS 2 bag the topic with the clouds, where it
-    is not points2 or the only one. Raises UserError for every fault of the files.
+    same as a value. ``frames`` selects frames by number. ``topic``: of a ROS bag the topic with the depth images or
+    clouds, where several have some. Raises UserError for every fault of the files.
     """
     paths = [Path(path) for path in paths]
     if not paths:
@@ -57,7 +57,7 @@ def open_capture(
     if len(paths) == 1 and _is_bag(paths[0]):
         recording = open_bag(paths[0], scale_m, intrinsics, lens, topic)
     elif topic is not None:
-        raise UserError(f"{paths[0]}: is no ROS 2 bag, so it has no topic {topic}", fix="leave out --topic")
+        raise UserError(f"{paths[0]}: is no ROS bag, so it has no topic {topic}", fix="leave out --topic")
     else:
         recording = _open_files(paths, scale_m, intrinsics, lens)
     recording = replace(recording, selection=frames)
@@ -67,7 +67,7 @@ def open_capture(
 
 def _is_bag(path: Path) -> bool:
     if path.is_file():
-        return path.suffix.lower() in BAG_SUFFIXES
+        return path.suffix.lower() in (*BAG_SUFFIXES, ROS1_SUFFIX)
     try:
         return is_bag_folder(path)
     except OSError:
@@ -91,8 +91,7 @@ def _open_files(paths: list[Path], scale_m: float | None, intrinsics: Path | Non
         return open_stack(paths[0], scale_m, intrinsics, lens, STACKS[suffix])
     if suffix == ".mkv":
         return open_mkv(paths[0], scale_m, intrinsics, lens)
-    fix = f"convert it: rosbags-convert --src {paths[0]} --dst FOLDER" if suffix == ".bag" else None
-    raise UserError(f"{paths[0]}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
+    raise UserError(f"{paths[0]}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS)
 
 
 def _open_folder(folder: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:

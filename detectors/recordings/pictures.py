@@ -7,6 +7,7 @@ decode a header of 30,000 x 30,000 pixels into gigabytes.
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -62,6 +63,22 @@ def picture_size(name: str, content: bytes) -> tuple[int, int]:
         legal=LEGAL_PICTURE,
         fix="copy or export it again",
     )
+
+
+def refuse_broken_png(name: str, content: bytes) -> None:
+    """Walk the chunks to the end and compare their checksums: the decoder may fill a cut picture up with zeros."""
+    at = len(PNG_SIGNATURE)
+    while at + 12 <= len(content):
+        length, kind = struct.unpack(">I4s", content[at : at + 8])
+        end = at + 12 + length
+        if end > len(content):
+            break
+        if zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
+            raise UserError(f"{name}: is damaged (checksum of {kind.decode('latin1')})", fix="copy or export it again")
+        if kind == b"IEND":
+            return
+        at = end
+    raise UserError(f"{name}: is truncated ({len(content)} bytes)", legal="a whole PNG", fix="copy or export it again")
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
