@@ -11,18 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from strangers.kinds import KINDS
-from strangers.recording import Stranger, recorded, written
+from strangers.recording import recorded, written
 from strangers.score import Score, answered, scored
 
 
-def made(kind: str, seed: int, folder: Path) -> tuple[Stranger, Score]:
-    """Make one recording in ``folder``, answer it and score the answer."""
+def made(kind: str, seed: int, folder: Path) -> Score:
+    """Make one recording in ``folder``, answer it and score the answer; what was printed goes to answer.txt there."""
     rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
     stranger = KINDS[kind](rng)
     stack, view, truths = recorded(stranger, rng)
     path = written(stranger, stack, folder / "in")
     code, said, rows = answered(path, folder / "out", stranger.format.arguments)
-    return stranger, scored(stranger, view, truths, code, said, rows)
+    score = scored(stranger, view, truths, code, said, rows)
+    (folder / "answer.txt").write_text(f"{score.verdict}: {'; '.join(score.why)}\n{said}")
+    return score
 
 
 def main() -> int:
@@ -47,7 +49,7 @@ def _report(arguments: argparse.Namespace, root: Path) -> int:
     for kind in arguments.kinds or KINDS:
         counts = np.zeros(7, int)
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            _, score = made(kind, seed, root / kind / str(seed))
+            score = made(kind, seed, root / kind / str(seed))
             verdicts = [score.verdict == verdict for verdict in ("right", "warned", "wrong")]
             counts += [*verdicts, score.needless, score.clear, score.found, score.false]
             if score.verdict == "wrong":

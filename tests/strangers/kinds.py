@@ -329,6 +329,19 @@ def white_millimetre(rng: Rng) -> Stranger:
     return replace(made, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=Noise(1e-3))
 
 
+@kind
+def camera_model(rng: Rng) -> Stranger:
+    """Another kind's scene before the project's own model of an Azure Kinect or a Kinect v2."""
+    named = "before_wall tilted fills_view pipe_outside dome drilled object_on_plate on_floor"
+    made = KINDS[str(rng.choice(named.split()))](rng)
+    model, cam, noise_m = (
+        ("azure_kinect_nfov", Camera(640, 576, 504.6, 321.7, 333.3), 0.8e-3),
+        ("kinect_v2", Camera(512, 424, 365.0, 256.0, 208.0), 1.5e-3),
+    )[int(rng.integers(2))]
+    noise = Noise(noise_m, blur_px=1.0, fixed_m=0.6e-3, fixed_px=1.5)
+    return replace(made, camera=cam, noise=noise, model=model, frames=int(rng.integers(1, 9)))
+
+
 # ---- damage ----------------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -68,7 +68,9 @@ class Truth:
 class Stranger:
     """A scene and how it was recorded. ``ignored`` (h, w): pixels where a finding is neither right nor false, because
     something real is there; ``doubtful``: no answer is right without a warning; ``per_frame(k, depth)`` changes the
-    noise-free depth of frame k; ``louder`` (h, w) multiplies the noise."""
+    noise-free depth of frame k; ``louder`` (h, w) multiplies the noise; from ``gone`` (h, w) nothing returns;
+    ``offset_m`` (h, w) is added to the depth. ``model``: the project's own camera that takes the frames, from phasors
+    without interreflection; ``noise`` then says only what is clearly visible in them."""
 
     surfaces: list[Surface]
     camera: Camera
@@ -81,12 +83,14 @@ class Stranger:
     gone: np.ndarray | None = None
     offset_m: np.ndarray | None = None
     per_frame: Callable[[int, np.ndarray], np.ndarray] | None = None
-    told: dict[str, object] = field(default_factory=dict)
+    model: str = ""
 
 
 def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
     """(frames (n, h, w) in metres with NaN for no return, the noise-free view, the truth)."""
     view = cast(stranger.surfaces, stranger.camera)
+    if stranger.model:
+        return _simulated(stranger, int(rng.integers(1000))), view, _truths(stranger, view)
     noise, shape = stranger.noise, view.depth_m.shape
     clean = view.depth_m if stranger.offset_m is None else view.depth_m + stranger.offset_m
     if noise.mixing_px:
@@ -102,6 +106,45 @@ def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, 
         one[gone | (rng.random(shape) < noise.dropout)] = np.nan
         stack[k] = one
     return stack, view, _truths(stranger, view)
+
+
+def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
+    """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel, light falling as r^-2."""
+    from harness.vocabulary.geometry import Region
+    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.source import SimulatedUnit
+    from scenes.view import NoiseFreeView
+
+    camera, (h, w) = stranger.camera, (stranger.camera.height, stranger.camera.width)
+    model = load_camera(stranger.model)
+    slopes = camera.slopes(finer)
+    range_m = cast(stranger.surfaces, camera, finer).depth_m * np.sqrt(1 + (slopes**2).sum(axis=-1))
+    light = np.where(np.isfinite(range_m), 0.7 / range_m**2, 0.0)
+    turn = 4j * np.pi / 299_792_458.0 * np.nan_to_num(range_m)
+
+    def pixels(fine: np.ndarray) -> np.ndarray:
+        return fine.reshape(h, finer, w, finer).mean(axis=(1, 3))
+
+    phasor = np.stack([pixels(light * np.exp(turn * f)) for f in model.frequencies_hz]).astype(np.complex64)
+    middle = range_m[finer // 2 :: finer, finer // 2 :: finer]
+    view = NoiseFreeView(
+        region=Region(0, h, 0, w),
+        frequencies_hz=model.frequencies_hz,
+        phasor=phasor,
+        phasor_direct=phasor,
+        intensity=pixels(light).astype(np.float32),
+        indirect_noise_m=np.zeros((h, w), np.float32),
+        range_m=middle.astype(np.float32),
+        surface=np.where(np.isfinite(middle), 0, -1).astype(np.int16),
+        surface_names=("scene",),
+        coverage=np.ones((h, w), np.float32),
+        rgb=np.full((h, w, 3), 0.7, np.float32),
+        slopes=camera.slopes(),
+        seconds=0.0,
+        variant="",
+    )
+    unit_of = SimulatedUnit(model, CameraConfig(name=stranger.model, unit_seed=unit), view)
+    return np.stack([frame.z_m for frame in unit_of.capture(stranger.frames, unit).frames()])
 
 
 def _field(rng: np.random.Generator, shape: tuple[int, ...], blur_px: float, tail: bool = False) -> np.ndarray:

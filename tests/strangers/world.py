@@ -166,9 +166,9 @@ class View:
     hidden: tuple[float, ...]
 
 
-def cast(surfaces: list[Surface], camera: Camera) -> View:
-    """Cast one ray a pixel; the nearest surface wins, and damage of the target is cut where the target is seen."""
-    slopes = camera.slopes()
+def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
+    """Cast ``finer`` x ``finer`` rays a pixel; the nearest surface wins, and its damage is cut where it is seen."""
+    slopes = camera.slopes(finer)
     hits = [meet(surface, slopes) for surface in surfaces]
     z = np.stack([hit.z_m for hit in hits])
     nearest = z.argmin(axis=0)
