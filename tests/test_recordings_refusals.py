@@ -132,13 +132,13 @@ def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stored", "unit", "advice"),
     (
-        (STORED.astype(np.float32), None, "--unit mm (then 0.5"),
+        (STORED.astype(np.float32), "m", "--unit mm (then 0.5"),
         (STORED.astype(np.float32) / 1000, "mm", "--unit m (then 0.5"),
         (STORED, "m", "--unit mm (then 0.5"),
     ),
 )
 def test_a_wrong_unit_is_noticed_and_the_right_one_offered(
-    tmp_path: Path, stored: np.ndarray, unit: str | None, advice: str
+    tmp_path: Path, stored: np.ndarray, unit: str, advice: str
 ) -> None:
     np.save(tmp_path / "d.npy", stored)
     message = refusal(tmp_path / "d.npy", lens=plane.LENS, unit=unit)
@@ -228,8 +228,10 @@ def test_a_truncated_cloud_is_named(
     assert capfd.readouterr().out == ""
 
 
-def test_a_cloud_behind_the_camera_is_refused(tmp_path: Path) -> None:
-    message = refusal(plane.write_pcd(tmp_path / "c.pcd", plane.points_m(STORED) * [1, -1, -1]))
+def test_a_cloud_on_both_sides_of_the_camera_is_refused(tmp_path: Path) -> None:
+    points = plane.points_m(STORED) * [1, -1, -1]
+    points[:20] *= [1, -1, -1]
+    message = refusal(plane.write_pcd(tmp_path / "c.pcd", points))
     assert "behind the camera" in message and "negate" in message
 
 

@@ -94,7 +94,15 @@ def open_mkv(path: Path, scale_m: float | None, intrinsics: Path | None, lens: L
     files = (path,) if intrinsics is None else (path, intrinsics)
     reader = MkvReader(path, scale_m, lens, colour)
     return Recording(
-        path.name, reader, lens.whole, scale_m, z_step_m=scale_m, files=files, lens=lens, notes=tuple(notes)
+        path.name,
+        reader,
+        lens.whole,
+        scale_m,
+        z_step_m=scale_m,
+        files=files,
+        lens=lens,
+        notes=tuple(notes),
+        unit_from="k4arecorder, which writes millimetres",
     )
 
 

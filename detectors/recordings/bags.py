@@ -118,6 +118,7 @@ def _open_clouds(
         files=(),
         lens=lens,
         organised=height > 1,
+        unit_from="ROS, whose clouds are in metres",
         notes=notes,
     )
 
@@ -136,7 +137,6 @@ def _open_images(
         raise UserError(f"{path}: no message on {topic}", legal="at least one depth image", fix="record again")
     stored = stored_depth(name, message)
     height, width = stored.shape
-    notes: list[str] = []
     if intrinsics is not None:
         lens = read_lens(intrinsics, width, height)
     if lens is None:
@@ -146,9 +146,10 @@ def _open_images(
             f"{path}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
             fix="leave --intrinsics out, or give the lens of these images",
         )
+    unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     if scale_m is None and stored.dtype.kind == "u":
         scale_m, unit_topic = _stated_unit(bag, topics, topic)
-        notes += [f"depth unit {1e3 * scale_m:.4g} mm, from {unit_topic}"] if scale_m else []
+        unit_from = unit_topic or unit_from
     scale_m = scale_m or default_metres(stored.dtype)
     reader = BagImageReader(bag, topic, scale_m)
     is_whole = stored.dtype.kind == "u"
@@ -160,7 +161,7 @@ def _open_images(
         z_step_m=scale_m if is_whole else rounding_step_m(next(reader.frames()).z_m),
         files=(),
         lens=lens,
-        notes=tuple(notes),
+        unit_from=unit_from,
     )
 
 

@@ -59,6 +59,7 @@ def open_depth_folder(folder: Path, scale_m: float | None, intrinsics: Path | No
     pictures = _colour_pictures(root, depths)
     colours = _matched_colours(pictures, depths, TUM_MATCH_S if tum else 0.0)
     recording = _open(folder.name, depths, colours, scale_m, intrinsics, lens, root)
+    recording = replace(recording, unit_from="depth.txt, which marks TUM RGB-D" if tum else "")
     if pictures and not any(colours):
         what = "time stamp" if tum else "number"
         note = f"none of {len(pictures)} colour pictures has the {what} of a depth picture in its name: no colour"

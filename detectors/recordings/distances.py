@@ -1,8 +1,13 @@
-"""From stored numbers to distances: units, reasons for invalid pixels, and the check that catches a wrong unit."""
+"""From stored numbers to distances: which of them mean "no return", what one of them is in metres, and who says so.
+
+Codes for no return are decided frame by frame (`no_return_codes`), the unit once for a capture (`decided_unit`).
+"""
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +21,44 @@ NEAREST_M, FARTHEST_M = 0.05, 20.0
 """Bounds of a plausible median distance: nearer than any time-of-flight camera works, farther than any of them sees."""
 
 LEGAL_UNITS = "mm, cm, m, um, tum (5000 to the metre), or N/m for N to the metre (4000/m)"
+
+TURNED_SHARE = 0.99
+"""Part of the points that must have z below 0 before they are turned: no camera measures behind itself."""
+
+SHARED_CODE = 20
+"""Pixels that must share a number before it can be a full scale."""
+ISOLATED = 4.0
+"""Times that codes lie beyond all distances: a wall four times as far as all else has more than a few distances."""
+FEW_CODES = 8
+
+READINGS = {
+    "mm": (0.89, 0.15),
+    "4000/m": (0.05, 0.0),
+    "tum": (0.03, 0.0),
+    "10000/m": (0.015, 0.0),
+    "cm": (0.01, 0.04),
+    "um": (0.005, 0.01),
+    "m": (0.0, 0.8),
+}
+"""Units and how common each is among integers and floating-point numbers: guesses, in which a factor of 2 moves no
+decision by more than a fifth of the distance. 0.25 mm: RealSense L515, Helios; 0.1 mm: structured light, Orbbec."""
+NEAR_M = (0.8, 1.8)
+"""Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
+NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
+"""Beyond the first, any distance keeps so much of the weight of the commonest."""
+SURE, LIKELY, SHOWN = 0.97, 0.75, 0.003
+"""Probabilities: above the first nothing is said but the unit, below the second the user is asked, below the third a
+reading is not offered."""
+MILLIMETRE_SIZES = {
+    (640, 576): 4.5,
+    (320, 288): 6.0,
+    (512, 512): 3.5,
+    (1024, 1024): 3.0,
+    (512, 424): 8.0,
+    (256, 192): 8.0,
+}
+"""Image sizes of cameras that all store 1 mm (Azure Kinect and Femto, Kinect v2, iPhone) and the median distance in
+metres that they can reach: the data sheets' range and what bright walls add to it."""
 
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
@@ -51,44 +94,197 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
 def frame_from_depth(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
-    """A frame from stored depth (h, w) in units of ``scale_m`` metres; 0 means no return.
+    """A frame from stored depth (h, w) in units of ``scale_m`` metres; 0 and `no_return_codes` mean no return.
 
-    Raises UserError where most of the points lie behind the camera.
+    Depth that is negative throughout is turned. Raises UserError where points lie both before and behind the camera.
     """
-    z_m, reason = _judged(name, stored, scale_m)
-    return Frame(name=name, z_m=z_m, reason=reason, rgb=rgb, amplitude=amplitude)
+    z_m, reason, notes, _ = _judged(name, stored, scale_m)
+    return Frame(name=name, z_m=z_m, reason=reason, rgb=rgb, amplitude=amplitude, notes=notes)
 
 
 def frame_from_points(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
     """A frame from stored points (h, w, 3) in units of ``scale_m`` metres; a pixel with z = 0 means no return."""
-    z_m, reason = _judged(name, stored[..., 2], scale_m)
+    z_m, reason, notes, turned = _judged(name, stored[..., 2], scale_m)
     sideways = ~np.isfinite(stored[..., :2]).all(axis=-1) & (reason == Reason.VALID)
     reason[sideways] = Reason.NOT_FINITE
     z_m[sideways] = np.nan
-    xy_m = stored[..., :2].astype(np.float64) * scale_m
+    xy_m = stored[..., :2].astype(np.float64) * (scale_m, -scale_m if turned else scale_m)
     xy_m[reason != Reason.VALID] = np.nan
-    return Frame(name=name, z_m=z_m, reason=reason, xy_m=xy_m, rgb=rgb, amplitude=amplitude)
+    return Frame(name=name, z_m=z_m, reason=reason, xy_m=xy_m, rgb=rgb, amplitude=amplitude, notes=notes)
 
 
-def _judged(name: str, stored_z: np.ndarray, scale_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (h, w) float32 with NaN where invalid, and the reason of each pixel."""
+def _judged(name: str, stored_z: np.ndarray, scale_m: float) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], bool]:
+    """Distances (h, w) float32 with NaN where invalid, each pixel's reason, what to say, and whether z was turned."""
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
     if stored_z.dtype.kind == "f":
         reason[~np.isfinite(stored_z)] = Reason.NOT_FINITE
-    behind = (stored_z < 0) & (reason == Reason.VALID)
-    if behind.sum() > 0.5 * (reason == Reason.VALID).sum():
+    notes = []
+    for code in no_return_codes(stored_z[reason == Reason.VALID]):
+        coded = stored_z == code
+        reason[coded] = Reason.NO_RETURN
+        notes.append(f"{code:.10g} taken as no return, {100 * coded.mean():.2g} % of pixels")
+    valid = reason == Reason.VALID
+    behind = (stored_z < 0) & valid
+    turned = valid.any() and behind.sum() > TURNED_SHARE * valid.sum()
+    if turned:
+        notes.append(
+            f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points: turned by half a turn about x"
+            " (y up and z back became y down and z forward)"
+        )
+        behind = ~behind & valid
+    elif behind.sum() > 0.5 * valid.sum():
         raise UserError(
-            f"{name}: most points lie behind the camera (z below 0)",
+            f"{name}: most points lie behind the camera (z below 0), but not all",
             legal="the camera's frame: x right, y down, z forward from the lens",
             fix="turn the cloud before saving it (a cloud with y up and z back: negate y and z)",
         )
     reason[behind] = Reason.OUT_OF_RANGE
-    z_m = (stored_z * np.float64(scale_m)).astype(np.float32)
+    z_m = (stored_z * np.float64(-scale_m if turned else scale_m)).astype(np.float32)
     z_m[reason != Reason.VALID] = np.nan
-    return z_m, reason
+    return z_m, reason, tuple(notes), bool(turned)
+
+
+# ---- numbers that mean no return -------------------------------------------------------------------------------------
+
+
+def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
+    """The numbers among ``stored`` (n,), finite and not 0, that no surface explains: they stand for "no return".
+
+    Four kinds: the largest number that the type can hold; a full scale of fewer bits (4095, 65534 ..) that many pixels
+    share, well beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than all
+    others, or of integers as much nearer; at most three different negative ones. Not found: a code amid the distances.
+    """
+    codes: list[float] = []
+    negative = stored[stored < 0]
+    if SHARED_CODE <= negative.size < stored.size:
+        # A surface's distances differ from pixel to pixel; codes do not.
+        few = _fewest(negative, 3)
+        codes += few if few is not None else []
+    rest = stored[stored > 0]
+    while rest.size:
+        top = rest.max().item()
+        below = rest[rest < top]
+        if not (_is_largest(stored.dtype, top) or _is_full_scale(top, rest.size - below.size, below)):
+            break
+        codes.append(float(top))
+        rest = below
+    # An octave without a number lies between any two neighbours that differ four times: most frames need no sorting.
+    if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
+        codes += _isolated(np.unique(rest))
+    return tuple(codes)
+
+
+def _fewest(values: np.ndarray, most: int) -> list[float] | None:
+    """The different numbers among the values; None where there are more than ``most``."""
+    found: list[float] = []
+    while values.size and len(found) <= most:
+        found.append(float(values[0]))
+        values = values[values != values[0]]
+    return None if len(found) > most else found
+
+
+def _is_largest(dtype: np.dtype, top: float) -> bool:
+    return dtype.kind in "iu" and top == np.iinfo(dtype).max
+
+
+def _is_full_scale(top: float, count: int, below: np.ndarray) -> bool:
+    """Whether many pixels share a number just below a power of two that is a quarter beyond all others."""
+    bits = math.log2(top + 3) if top < 2**32 else 0
+    near = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
+    return near and count >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+
+
+def _isolated(different: np.ndarray) -> list[float]:
+    """Of sorted positive numbers those few beyond an empty gap, where the others are too many to be codes."""
+    ratios = different[1:] / different[:-1].astype(np.float64)
+    far = np.flatnonzero(ratios >= ISOLATED)
+    far = far[(far >= FEW_CODES) & (far >= len(different) - 1 - FEW_CODES)]
+    codes = different[far[0] + 1 :] if far.size else different[:0]
+    near = np.flatnonzero(ratios[:FEW_CODES] >= ISOLATED)
+    if different.dtype.kind in "iu" and near.size and len(different) - near[-1] - 1 > FEW_CODES:
+        codes = np.concatenate([different[: near[-1] + 1], codes])
+    return [float(code) for code in codes]
+
+
+# ---- the unit --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Metres in one stored number, and who says so. ``warning``: why to doubt it, "" for no doubt."""
+
+    scale_m: float
+    origin: str
+    warning: str = ""
+
+
+def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
+    """The unit of numbers (n,), without those that mean no return, that nothing states.
+
+    Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
+    where targets are: 0.8 m within a factor of 1.8 (`NEAR_M`). A common divisor of all numbers speaks for the unit in
+    which they are whole millimetres. ``size``: width and height of the image; sizes that only cameras with 1 mm have
+    speak for it (`MILLIMETRE_SIZES`), and against distances beyond their reach. Noise is not used: read in a unit
+    four times coarser it grows as the distance does, as it would in a camera.
+
+    Raises UserError where no reading is clearly the likeliest, with the distance that each gives.
+    """
+    near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
+    integers = usual_m == UNITS_M["mm"]
+    weights = _weights(near, median, integers, _divisor(stored) if integers else 1, size)
+    best = max(weights, key=lambda unit: weights[unit], default=None)
+    shown = [
+        f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)"
+        for unit in sorted(weights, key=lambda unit: -weights[unit])
+        if weights[unit] > SHOWN
+    ]
+    if best is None or weights[best] < LIKELY:
+        what = "several units are plausible" if best else "no usual unit is plausible"
+        raise UserError(
+            f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})",
+            fix=f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}",
+        )
+    scale_m = metres_per_unit(best)
+    usual = math.isclose(scale_m, usual_m)
+    kind = "integers" if integers else "floating-point numbers"
+    origin = f"what is usual for {kind}" if usual else f"the data: in the usual unit of {kind}, {1e3 * usual_m:g} mm,"
+    origin += "" if usual else f" the median distance would be {median * usual_m:.4g} m"
+    if usual and weights[best] >= SURE:
+        return Unit(scale_m, origin)
+    others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
+    return Unit(
+        scale_m,
+        origin,
+        f"nothing states the depth unit; {1e3 * scale_m:.4g} mm is taken, which puts the median at"
+        f" {median * scale_m:.3g} m{others}; state it with --unit {best}",
+    )
+
+
+def _weights(near: float, median: float, integers: bool, divisor: int, size: tuple[int, int]) -> dict[str, float]:
+    """Probability of each reading that is possible."""
+    reach_m = MILLIMETRE_SIZES.get(size) if integers else None
+    weights = {}
+    for unit, (for_integers, for_floats) in READINGS.items():
+        metres = metres_per_unit(unit)
+        weight = for_integers if integers else for_floats
+        if reach_m is not None and unit == "mm":
+            weight = 0.0 if median * metres > reach_m else 10 * weight
+        if divisor > 1 and round(1e-3 / metres) == divisor:
+            weight *= 100.0
+        if not NEAREST_M <= median * metres <= FARTHEST_M:
+            weight = 0.0
+        off = math.log(max(near * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
+        weights[unit] = weight * (math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M))
+    total = sum(weights.values())
+    return {unit: weight / total for unit, weight in weights.items()} if total > 0 else {}
+
+
+def _divisor(stored: np.ndarray) -> int:
+    """The greatest common divisor of all numbers."""
+    return int(np.gcd.reduce(stored.astype(np.int64)))
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:

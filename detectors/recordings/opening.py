@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
+
+import numpy as np
 
 from detectors.recordings.arrays import load_npy, load_npz, open_stack
 from detectors.recordings.azure_mkv import open_mkv
 from detectors.recordings.bag_files import BAG_SUFFIXES, ROS1_SUFFIX, is_bag_folder
 from detectors.recordings.bags import open_bag
 from detectors.recordings.depth_images import open_depth_folder, open_depth_list
-from detectors.recordings.distances import metres_per_unit
+from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit
 from detectors.recordings.matlab import load_mat
 from detectors.recordings.pointclouds import open_clouds
 from detectors.recordings.recording import Recording
@@ -53,16 +56,43 @@ def open_capture(
     odd = next((path for path in paths if not path.is_file() and not path.is_dir()), None)
     if odd is not None:
         raise UserError(f"{odd}: is neither a file nor a folder, but a device or a pipe", legal=LEGAL_FORMATS)
-    scale_m = metres_per_unit(unit) if unit else None
-    if len(paths) == 1 and _is_bag(paths[0]):
-        recording = open_bag(paths[0], scale_m, intrinsics, lens, topic)
-    elif topic is not None:
-        raise UserError(f"{paths[0]}: is no ROS bag, so it has no topic {topic}", fix="leave out --topic")
-    else:
-        recording = _open_files(paths, scale_m, intrinsics, lens)
-    recording = replace(recording, selection=frames)
-    recording.first_frame()
-    return recording
+
+    def opened(scale_m: float | None) -> Recording:
+        if len(paths) == 1 and _is_bag(paths[0]):
+            recording = open_bag(paths[0], scale_m, intrinsics, lens, topic)
+        elif topic is not None:
+            raise UserError(f"{paths[0]}: is no ROS bag, so it has no topic {topic}", fix="leave out --topic")
+        else:
+            recording = _open_files(paths, scale_m, intrinsics, lens)
+        return replace(recording, selection=frames)
+
+    recording = opened(metres_per_unit(unit) if unit else None)
+    said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
+    if not said.origin:
+        said = _unit_by_data(recording)
+        if said.scale_m != recording.scale_m:
+            recording = opened(said.scale_m)
+    first = recording.first_frame()
+    return replace(
+        recording,
+        unit_from=said.origin,
+        notes=(*recording.notes, *first.notes),
+        warnings=(*recording.warnings, *((said.warning,) if said.warning else ())),
+    )
+
+
+def _unit_by_data(recording: Recording) -> Unit:
+    """The unit of a capture whose files do not state it, by the first selected frame that has a distance."""
+    chosen = recording.selection or slice(None)
+    for frame in islice(recording.reader.frames(), chosen.start, chosen.stop, chosen.step):
+        z_m = frame.z_m[np.isfinite(frame.z_m)].astype(np.float64)
+        if z_m.size:
+            stored = z_m / recording.scale_m
+            # Back to whole numbers what float32 metres hold to 1e-7.
+            stored = np.rint(stored) if recording.scale_m == UNITS_M["mm"] else stored
+            height, width = recording.region.shape
+            return decided_unit(recording.name, stored, recording.scale_m, (width, height))
+    return Unit(recording.scale_m, "what is usual")
 
 
 def _is_bag(path: Path) -> bool:

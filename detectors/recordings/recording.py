@@ -32,9 +32,10 @@ class Recording:
     """A real capture as a `harness.vocabulary.capture.FrameSource`.
 
     ``files``: all files whose content can change a number (frames, colour, intrinsics). ``scale_m``: metres in one
-    stored unit. ``notes``: what the user should know about how the files were understood. ``warnings``: full
-    sentences on what makes the distances doubtful; every program shows them before anything else. ``selection`` picks
-    frames.
+    stored unit, and ``unit_from`` who says so: "" where a reader only takes what is usual for its format, so that
+    `detectors.recordings.opening` decides by the data. ``notes``: what the user should know about how the files were
+    understood. ``warnings``: full sentences on what makes the distances doubtful; every program shows them before
+    anything else. ``selection`` picks frames.
     """
 
     name: str
@@ -48,6 +49,12 @@ class Recording:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     selection: slice | None = None
+    unit_from: str = ""
+
+    @property
+    def unit_text(self) -> str:
+        """The depth unit and who says so, as programs print it."""
+        return f"depth unit {1e3 * self.scale_m:.4g} mm, from {self.unit_from}"
 
     @cached_property
     def slopes(self) -> np.ndarray | None:

@@ -104,6 +104,7 @@ def _print_frames_used(recording: Recording, cloud: Cloud, name: str) -> None:
     height, width = cloud.valid.shape
     size = f"{width} x {height} pixels" if cloud.organised else f"{width} points"
     print(f"{name}: {cloud.n_frames} frames averaged, {size}")
+    print(recording.unit_text)
     for note in recording.notes:
         print(f"note: {note}")
     for left in cloud.left_out:

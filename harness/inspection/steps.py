@@ -140,6 +140,7 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
         "frames_used": cloud.n_frames,
         "frames_left_out": [dataclasses.asdict(left) for left in cloud.left_out],
         "lens": dataclasses.asdict(cloud.lens) if cloud.lens else None,
+        "depth_unit": {"mm": 1e3 * recording.scale_m, "from": recording.unit_from},
         "rounding_step_mm": 1e3 * cloud.z_step_m,
         "notes": recording.notes,
         "warnings": recording.warnings,

@@ -45,7 +45,8 @@ class Frame:
 
     ``z_m`` (h, w) float32: distance along the optical axis, NaN where invalid. ``reason`` (h, w) uint8 of `Reason`.
     ``xy_m`` (h, w, 2) only where the source has no lens (a stored point cloud). ``rgb`` (h, w, 3) uint8 and
-    ``amplitude`` (h, w) float32 where known. ``name`` says in messages which frame it is.
+    ``amplitude`` (h, w) float32 where known. ``name`` says in messages which frame it is. ``notes``: how its stored
+    numbers were understood, where that was not plain.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Frame:
     xy_m: np.ndarray | None = None
     rgb: np.ndarray | None = None
     amplitude: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 class FrameSource(Protocol):
