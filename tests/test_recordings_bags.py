@@ -272,7 +272,7 @@ def test_realsense_names_and_its_unit(tmp_path: Path) -> None:
     recording = open_capture([bags.write_ros1(tmp_path / "a.bag", messages)])
     assert recording.lens == plane.LENS and recording.scale_m == 0.00025
     np.testing.assert_allclose(np.nan_to_num(recording.first_frame().z_m), STORED / 1e3, rtol=1e-6)
-    assert any("depth unit 0.25 mm, from /device_0" in note for note in recording.notes)
+    assert recording.unit_text.startswith("depth unit 0.25 mm, from /device_0")
 
 
 def test_the_lens_of_a_camera_info() -> None:
