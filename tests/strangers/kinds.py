@@ -321,12 +321,13 @@ def foreground(rng: Rng) -> Stranger:
 
 @kind
 def white_millimetre(rng: Rng) -> Stranger:
-    """Another kind's scene under a megapixel camera of the simplest sort: 1 mm of white noise, nothing mixed."""
-    named = (
-        "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome bent_sheet drilled dents"
-    )
-    made = KINDS[str(rng.choice([*named.split(), "no_return", "object_on_plate"]))](rng)
-    return replace(made, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=Noise(1e-3))
+    """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at edges, some pixels lost;
+    stored in millimetres or finer, with 0 or 65535 for no return."""
+    named = "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome bent_sheet drilled"
+    made = KINDS[str(rng.choice([*named.split(), "dents", "no_return", "object_on_plate"]))](rng)
+    form = Format(unit_m=float(rng.choice([1e-3, 1e-3, 1e-3, 0.25e-3])), invalid=float(rng.choice([0, 0, 65535])))
+    noise = Noise(1e-3, dropout=float(rng.choice([0, 0, 0.1])))
+    return replace(made, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=noise, format=form)
 
 
 @kind
