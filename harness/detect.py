@@ -39,7 +39,8 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         type=Path,
         metavar="PATH",
-        help="folder or list of depth .png, .ply, .pcd; .npy .npz .mat .mkv; a ROS bag (folder, .mcap, .db3, .bag)",
+        help="folder or list of depth .png, .ply, .pcd, .xyz; .npy .npz .mat .mkv .r3d .bin; a ROS bag (folder, .mcap,"
+        " .db3, .bag); a Stray Scanner folder; with --pitch a height map",
     )
     add(
         "--out",
@@ -87,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
         help="calibrate the threshold on this capture of an undamaged target",
     )
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
+    add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
+    add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
+    add("--raw", metavar="WxH[:TYPE[:BYTES]]", help="layout of a file of bare numbers: 640x480:u2, after so many bytes")
     add("--frames-report", action="store_true", help="list every frame with its valid part and median distance")
     several_arguments.add_to(parser)
     return parser

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -95,6 +96,54 @@ def write_ply(path: Path, points: np.ndarray, grid: bool = True, cut: int = 0) -
     rows["rgb"] = (16, 32, 48)
     content = header.encode() + rows.tobytes()
     path.write_bytes(content[: len(content) - cut])
+    return path
+
+
+def write_points(
+    path: Path,
+    points: np.ndarray,
+    head: str = "",
+    apart: str = " ",
+    rest: str = "",
+    decimal: str = ".",
+    before: str = "",
+) -> Path:
+    """A point a line, with something ``before`` and after its three numbers."""
+    rows = (apart.join(f"{x:.9f}".replace(".", decimal) for x in point) for point in points.reshape(-1, 3).tolist())
+    path.write_text(head + "".join(f"{before}{apart if before else ''}{row}{rest}\n" for row in rows))
+    return path
+
+
+def write_stray(folder: Path, frames: int, step_m: float = 0.0) -> Path:
+    """Stray Scanner's folder: the lens of 1920 x 1440 pixels, poses ``step_m`` apart."""
+    for name in ("depth", "confidence"):
+        (folder / name).mkdir(parents=True)
+    across, down = 1920 / LENS.width, 1440 / LENS.height
+    cx, cy = (LENS.cx + 0.5) * across - 0.5, (LENS.cy + 0.5) * down - 0.5
+    matrix = f"{LENS.fx * across}, 0, {cx}\n0, {LENS.fy * down}, {cy}\n0, 0, 1\n"
+    (folder / "camera_matrix.csv").write_text(matrix)
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for i in range(frames):
+        cv2.imwrite(str(folder / "depth" / f"{i:06d}.png"), depth_mm(i))
+        cv2.imwrite(str(folder / "confidence" / f"{i:06d}.png"), np.full((LENS.height, LENS.width), 2, np.uint8))
+        lines.append(f"{i / 60}, {i:06d}, {i * step_m}, 0, 0, 0, 0, 0, 1")
+    (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def write_r3d(path: Path, frames: int, step_m: float = 0.0) -> Path:
+    """Record3D's archive, its depth packed by the LZFSE package."""
+    import liblzfse
+
+    k = [2 * LENS.fx, 0, 0, 0, 2 * LENS.fy, 0, 2 * LENS.cx + 0.5, 2 * LENS.cy + 0.5, 1]
+    poses = [[0, 0, 0, 1, i * step_m, 0, 0] for i in range(frames)]
+    size = {"w": 2 * LENS.width, "h": 2 * LENS.height, "dw": LENS.width, "dh": LENS.height}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("metadata", json.dumps({"K": k, **size, "fps": 30, "poses": poses}))
+        for i in range(frames):
+            depth = np.where(depth_mm(i) == 0, np.nan, depth_mm(i) / 1e3).astype("<f4")
+            archive.writestr(f"rgbd/{i}.depth", liblzfse.compress(depth.tobytes()))
+            archive.writestr(f"rgbd/{i}.conf", liblzfse.compress(np.full(depth.shape, 2, np.uint8).tobytes()))
     return path
 
 

@@ -99,9 +99,35 @@ def ply(tmp: Path) -> Recording:
     return open_capture([plane.write_ply(tmp / "c.ply", TRUE_M)])
 
 
+def xyz_with_a_stated_grid(tmp: Path) -> Recording:
+    return open_capture([plane.write_points(tmp / "c.xyz", TRUE_M, head="# width: 96 height: 72\n")])
+
+
+def csv_with_names_and_commas(tmp: Path) -> Recording:
+    head = "intensity;X (m);Y (m);Z (m)\n"
+    return open_capture(
+        [plane.write_points(tmp / "c.csv", TRUE_M, head, ";", decimal=",", before="7")], lens=plane.LENS
+    )
+
+
+def raw_numbers(tmp: Path) -> Recording:
+    (tmp / "d.bin").write_bytes(b"head" + STORED.astype(">u2").tobytes() * 2)
+    return open_capture([tmp / "d.bin"], lens=plane.LENS, raw="96x72:>u2:4")
+
+
+def chosen_array(tmp: Path) -> Recording:
+    np.savez(tmp / "d.npz", first=STORED * 0 + 9, second=np.stack([STORED * 0, STORED]))
+    return open_capture([tmp / "d.npz"], lens=plane.LENS, array="second:1")
+
+
+def stray_scanner(tmp: Path) -> Recording:
+    return open_capture([plane.write_stray(tmp / "stray", 1)])
+
+
 FORMATS = (
     open3d, tum, sdk_names, file_list, npy_depth, npz_metres, npy_points, mat_grid, mat_frames_last,
-    mat_lists_on_a_lens, pcd, ply,
+    mat_lists_on_a_lens, pcd, ply, xyz_with_a_stated_grid, csv_with_names_and_commas, raw_numbers, chosen_array,
+    stray_scanner,
 )  # fmt: skip
 
 
@@ -305,3 +331,99 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
     cv2.imwrite(str(tmp_path / "depth0.png"), np.full((576, 640), 900, np.uint16))
     lens = open_capture([tmp_path]).lens
     assert lens is not None and (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))
+
+
+# ---- lists of points -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("head", "apart", "rest"),
+    (
+        ("", " ", ""),
+        ("//X,Y,Z,R,G,B\n", ",", ",16,32,48"),
+        ("x\ty\tz\tscalar\n", "\t", "\t7"),
+        ("# a scan\n\n", ", ", ""),
+        ("6912\n", " ", " 7 16 32 48"),
+        ("", " ", " 0.5 -0.5 0.7"),
+    ),
+)
+def test_lists_of_points_in_every_dialect(tmp_path: Path, head: str, apart: str, rest: str) -> None:
+    path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, apart, rest)
+    recording = open_capture([path])
+    frame = recording.first_frame()
+    assert not recording.organised and "single points" in recording.notes[0]
+    np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
+    assert (frame.rgb is not None) == ("16" in rest) and (frame.amplitude is not None) == ("7" in rest.split("0.7")[0])
+    if frame.rgb is not None:
+        assert (frame.rgb == (16, 32, 48)).all()
+
+
+def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do(tmp_path: Path) -> None:
+    v, u = np.mgrid[:192, :256]
+    points = np.stack([(u - 127) / 210, (v - 95) / 210, np.ones(u.shape)], axis=-1) * 0.8
+    grid = open_capture([plane.write_points(tmp_path / "a.xyz", points)])
+    assert grid.organised and grid.region.shape == (192, 256)
+    shuffled = np.random.default_rng(5).permutation(points.reshape(-1, 3)).reshape(192, 256, 3)
+    assert not open_capture([plane.write_points(tmp_path / "b.xyz", shuffled)]).organised
+
+
+# ---- height maps -----------------------------------------------------------------------------------------------------
+
+
+def height_map(relief: float = 1.0) -> np.ndarray:
+    """(72, 96) millimetres: a slope, with a pit 3 mm deep of radius 6 pixels at column 60, row 30."""
+    v, u = np.mgrid[:72, :96]
+    return relief * (100 + 0.02 * u - 3.0 * (np.hypot(u - 60, v - 30) < 6))
+
+
+def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
+    heights = height_map()
+    heights[3, 5] = np.nan
+    np.savez(tmp_path / "a.npz", height=heights, other=np.zeros((3, 3)))
+    recording = open_capture([tmp_path / "a.npz"], pitch="0.5mm")
+    frame = recording.first_frame()
+    assert recording.projection == "parallel" and recording.organised and recording.scale_m == 1e-3
+    assert "towards the viewer" in recording.notes[0] and "relief" in recording.unit_from
+    assert frame.reason[3, 5] == Reason.NO_RETURN and np.isnan(frame.z_m[3, 5])
+    assert frame.xy_m is not None
+    np.testing.assert_allclose(frame.xy_m[0, 1] - frame.xy_m[0, 0], (0.5e-3, 0), atol=1e-12)
+    # a pit lies farther from the viewer
+    assert frame.z_m[30, 60] - frame.z_m[30, 70] == pytest.approx(3e-3 + 0.2e-3, abs=1e-6)
+    scipy.io.savemat(tmp_path / "a.mat", {"depth": -height_map(1e-3)})
+    down = open_capture([tmp_path / "a.mat"], pitch="500um")
+    assert down.scale_m == 1 and "away from the viewer" in down.notes[0]
+    np.testing.assert_allclose(down.first_frame().z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
+
+
+# ---- phones ----------------------------------------------------------------------------------------------------------
+
+
+def test_pixels_of_low_confidence_are_no_return_and_motion_is_warned_of(tmp_path: Path) -> None:
+    folder = plane.write_stray(tmp_path / "still", 3)
+    low = np.full((72, 96), 2, np.uint8)
+    low[10:20, 30:40] = 0
+    cv2.imwrite(str(folder / "confidence" / "000001.png"), low)
+    recording = open_capture([folder])
+    frames = list(recording.frames())
+    assert recording.warnings == () and (frames[1].reason[low == 0] == Reason.NO_RETURN).all()
+    assert np.isfinite(frames[0].z_m[10, 30]) and np.isfinite(frames[1].z_m[9, 30])
+    moved = plane.write_stray(tmp_path / "moved", 3, step_m=0.02)
+    warning = open_capture([moved]).warnings[0]
+    assert "moved by 40 mm" in warning and "--max-frames 1" in warning
+    assert open_capture([moved], frames=slice(1)).warnings == ()
+
+
+def test_record3d_keeps_its_depth_compressed(tmp_path: Path) -> None:
+    pytest.importorskip("liblzfse")
+    recording = open_capture([plane.write_r3d(tmp_path / "a.r3d", 2)])
+    frame = next(recording.frames())
+    np.testing.assert_allclose(points_of(recording, frame), TRUE_M, atol=1e-6)
+    assert recording.warnings == () and len(list(recording.frames())) == 2
+    assert "moved by 50 mm" in open_capture([plane.write_r3d(tmp_path / "b.r3d", 2, step_m=0.05)]).warnings[0]
+
+
+def test_the_raw_frame_of_a_plane(shared_data: Path) -> None:
+    recording = open_capture(
+        [shared_data / "vzense_plane" / "bg.bin"], lens=Lens(640, 480, 465.0, 465.0, 320.0, 240.0), raw="640x480"
+    )
+    assert float(np.nanmedian(recording.first_frame().z_m)) == pytest.approx(0.918, abs=0.02)

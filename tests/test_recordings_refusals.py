@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -200,6 +203,98 @@ def test_a_truncated_file_of_arrays_is_named(tmp_path: Path, suffix: str) -> Non
     else:
         scipy.io.savemat(path, {"Location": plane.points_m(STORED)})
     assert f"a{suffix}" in refusal(cut(path, 0.6), lens=plane.LENS)
+
+
+def test_an_array_is_chosen_by_its_name_and_number(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", first=STORED, second=np.stack([STORED] * 2))
+    path = tmp_path / "a.npz"
+    assert "--array first" in refusal(path, lens=plane.LENS)
+    assert "holds no array third" in refusal(path, lens=plane.LENS, array="third")
+    assert "no such part" in refusal(path, lens=plane.LENS, array="second:2")
+    assert "--array is for files of arrays" in refusal(png(tmp_path / "1.png"), lens=plane.LENS, array="first")
+
+
+def test_a_folder_whose_depth_lies_in_arrays_beside_pictures_names_them(tmp_path: Path) -> None:
+    png(tmp_path / "1.png", np.zeros((72, 96, 3), np.uint8))
+    scipy.io.savemat(tmp_path / "depth.mat", {"depth": STORED})
+    assert f"to do: name {tmp_path / 'depth.mat'}" in refusal(tmp_path, lens=plane.LENS)
+    (tmp_path / "1.png").rename(tmp_path / "1.jpg")
+    np.save(tmp_path / "depth.npy", STORED)
+    assert f"name one of {tmp_path / 'depth.mat'}, {tmp_path / 'depth.npy'}" in refusal(tmp_path, lens=plane.LENS)
+
+
+def test_files_that_are_not_read_are_told_how_to_be_converted(tmp_path: Path) -> None:
+    for name, told in (("a.tiff", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
+        (tmp_path / name).write_bytes(b"abc")
+        assert told in refusal(tmp_path / name)
+
+
+def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(bytes(2 * 640 * 480))
+    assert "--raw 640x480" in refusal(path)
+    assert "no such layout" in refusal(path, raw="640,480")
+    assert "needs 614402" not in refusal(path, raw="640x481") and "needs 615680" in refusal(path, raw="640x481")
+    # depth, brightness, confidence
+    path.write_bytes(STORED.tobytes() + (STORED // 9).tobytes() + np.full(STORED.shape, 200, np.uint8).tobytes())
+    assert "--array :0" in refusal(path, raw="96x72", lens=plane.LENS)
+    recording = open_capture([path], raw="96x72", lens=plane.LENS, array=":0")
+    assert len(list(recording.frames())) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    (
+        ("", "no line of numbers"),
+        ("x y z\n", "no line of numbers"),
+        ("1 2\n3 4\n5 6\n", "2 numbers in a line are no point"),
+        ("1 2 3\n4 5 6 7\n", "cannot be read as points"),
+        ("1 2 3\nfour five six\n", "cannot be read as points"),
+        ("x y z i\n1 2 3\n", "names the columns"),
+        (" ".join(["1"] * 40) + "\n", "name depth.npy"),
+        ("9" * 400 + " 1 1\n", "wrong unit|not one valid|finite"),
+    ),
+)
+def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    assert re.search(told, refusal(tmp_path / "a.xyz"))
+
+
+def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.stack([STORED * 1.0] * 3))
+    path = tmp_path / "a.npy"
+    assert "choose one by its number: --array :0" in refusal(path, pitch="1mm")
+    assert "no such length" in refusal(path, pitch="wide", array=":0")
+    np.save(path, np.full((9, 9), np.nan))
+    assert "not one finite height" in refusal(path, pitch="1mm")
+    np.save(path, np.zeros((9, 9)))
+    assert "--unit mm" in refusal(path, pitch="1mm")
+    np.save(path, np.zeros((9, 9, 3, 2)))
+    assert "are no height map's" in refusal(path, pitch="1mm")
+    assert "--pitch is for files of arrays" in refusal(png(tmp_path / "1.png"), pitch="1mm")
+
+
+def test_a_faulty_capture_of_a_phone_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = plane.write_stray(tmp_path / "stray", 1)
+    matrix = folder / "camera_matrix.csv"
+    matrix.write_text("1500,0,400\n0,1500,720\n0,0,1\n")
+    assert "centre of no picture of ARKit" in refusal(folder)
+    matrix.write_text("1,2\n3\n")
+    assert "camera_matrix.csv: cannot be read" in refusal(folder)
+    (tmp_path / "a.r3d").write_bytes(b"PK")
+    assert "no archive of Record3D" in refusal(tmp_path / "a.r3d")
+    with zipfile.ZipFile(tmp_path / "b.r3d", "w") as archive:
+        archive.writestr("metadata", '{"K": [1]}')
+        archive.writestr("rgbd/0.depth", b"bvx$")
+    assert "metadata cannot be read" in refusal(tmp_path / "b.r3d")
+    k = [300, 0, 0, 0, 300, 0, 96, 72, 1]
+    with zipfile.ZipFile(tmp_path / "c.r3d", "w") as archive:
+        archive.writestr("metadata", json.dumps({"K": k, "w": 192, "h": 144, "dw": 96, "dh": 72}))
+        archive.writestr("rgbd/0.depth", b"bvx-\xff\xff\xff\xffabc")
+    monkeypatch.setitem(sys.modules, "liblzfse", None)
+    assert "pip install pyliblzfse" in refusal(tmp_path / "c.r3d")
+    monkeypatch.setitem(sys.modules, "liblzfse", object())
+    assert "is damaged: -1 bytes" in refusal(tmp_path / "c.r3d")
 
 
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"

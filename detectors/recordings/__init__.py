@@ -1,4 +1,4 @@
-"""Real captures as sources of frames: depth pictures, arrays, MATLAB files, point clouds, Azure Kinect recordings."""
+"""Real captures as sources of frames: depth pictures, arrays, height maps, clouds, bags, recordings of cameras."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Arrays: ``.npy`` and ``.npz`` stacks, and the meaning of an array's axes that MATLAB files share."""
+"""Arrays: ``.npy``, ``.npz`` and raw files, and the meaning of an array's axes that MATLAB files share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from detectors.recordings.distances import (
 )
 from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
 from detectors.recordings.recording import Recording
-from harness.vocabulary.archives import read_npy, read_npz
+from harness.vocabulary.archives import read_npy
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
@@ -29,6 +29,12 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
+LEGAL_RAW = "--raw WIDTHxHEIGHT[:TYPE[:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; BYTES before the first frame"
+SENSOR_SIZES = (
+    *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
+    *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
+)
+"""(width, height) of the depth images of usual cameras."""
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
@@ -47,23 +53,23 @@ class Stack:
         return self.distances.ndim == 4
 
 
-class StackLoader(Protocol):
-    """Loads a file's arrays. ``lens`` tells apart a grid from a list of points where both fit."""
-
-    def __call__(self, path: Path, lens: Lens | None) -> Stack: ...
+ArraysLoader = Callable[[Path], Mapping[str, np.ndarray]]
+"""Loads a file's arrays by name; the only array of a file without names is called ""."""
 
 
 @dataclass(frozen=True)
 class StackReader:
-    """Yields the frames of one file. ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole."""
+    """Yields the frames of one file. ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole. ``lens``
+    tells apart a grid from a list of points where both fit."""
 
     path: Path
     scale_m: float
-    load: StackLoader
+    load: ArraysLoader
     lens: Lens | None
+    array: str | None = None
 
     def frames(self) -> Iterator[Frame]:
-        stack = self.load(self.path, self.lens)
+        stack = named_stack(str(self.path), self.load(self.path), self.lens, self.array)
         make = frame_from_points if stack.has_points else frame_from_depth
         for i, stored in enumerate(stack.distances):
             rgb = stack.rgb[i] if stack.rgb is not None else None
@@ -72,10 +78,18 @@ class StackReader:
 
 
 def open_stack(
-    path: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None, load: StackLoader
+    path: Path,
+    scale_m: float | None,
+    intrinsics: Path | None,
+    lens: Lens | None,
+    load: ArraysLoader,
+    array: str | None = None,
 ) -> Recording:
-    """Open a file of arrays. Raises UserError where the axes are no capture's or a depth array has no lens."""
-    stack = load(path, lens)
+    """Open a file of arrays; ``array`` NAME or NAME:NUMBER chooses. Raises UserError where the axes are no capture's or
+    a depth array has no lens."""
+    stack = named_stack(str(path), load(path), lens, array)
+    if isinstance(load, RawLoader) and array is None:
+        _refuse_other_planes(path, stack.distances)
     height, width = stack.distances.shape[1:3]
     lens_file = None
     if not stack.has_points:
@@ -86,7 +100,7 @@ def open_stack(
         if (lens.width, lens.height) != (width, height):
             raise UserError(f"{path}: {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}")
     given = scale_m or default_metres(stack.distances.dtype)
-    reader = StackReader(path, given, load, lens)
+    reader = StackReader(path, given, load, lens, array)
     first = next(reader.frames())
     return Recording(
         name=path.name,
@@ -100,32 +114,106 @@ def open_stack(
     )
 
 
-def load_npy(path: Path, lens: Lens | None) -> Stack:
+def load_npy(path: Path) -> dict[str, np.ndarray]:
     """An ``.npy`` file, mapped. Raises UserError where it is broken, or holds objects (they would need pickle)."""
-    return stack_of(str(path), read_npy(path), None, None, lens)
+    return {"": read_npy(path)}
 
 
-def load_npz(path: Path, lens: Lens | None) -> Stack:
-    """An ``.npz`` file: its only array, or the one named depth, z, xyz or points; colour and amplitude."""
-    return named_stack(str(path), read_npz(path), lens)
+@dataclass(frozen=True)
+class RawLoader:
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on; what is left over at its
+    end is not read."""
+
+    width: int
+    height: int
+    kind: str
+    offset: int
+
+    @classmethod
+    def stated(cls, text: str) -> RawLoader:
+        """From WIDTHxHEIGHT[:TYPE[:BYTES]]. Raises UserError for anything else."""
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248]))?(?::(\d{1,12}))?", text)
+        if match is None:
+            raise UserError(f"--raw {text}: no such layout", legal=LEGAL_RAW)
+        width, height, kind, offset = match.groups()
+        refuse_pixels(f"--raw {text}", int(width), int(height))
+        kind = kind or "u2"
+        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(offset or 0))
+
+    def __call__(self, path: Path) -> dict[str, np.ndarray]:
+        """The frames (n, h, w), mapped. Raises UserError where there is none."""
+        kind = np.dtype(self.kind)
+        size = path.stat().st_size - self.offset
+        count = size // (self.width * self.height * kind.itemsize)
+        if count < 1:
+            raise UserError(
+                f"{path}: has {size} bytes from byte {self.offset} on, but a frame of {self.width} x {self.height}"
+                f" numbers of {kind.itemsize} bytes needs {self.width * self.height * kind.itemsize}",
+                legal=LEGAL_RAW,
+            )
+        return {"": np.memmap(path, kind, "r", self.offset, (count, self.height, self.width))}
 
 
-def named_stack(name: str, arrays: dict[str, np.ndarray], lens: Lens | None) -> Stack:
-    """The stack among named arrays. Raises UserError where none or several could be it."""
-    found = [key for key in arrays if key.lower() in DISTANCE_NAMES]
-    if not found and len(arrays) == 1:
-        found = list(arrays)
-    if len(found) != 1:
-        held = ", ".join(f"{key} {value.shape}" for key, value in arrays.items()) or "nothing"
-        what = "several arrays that could be the depth" if found else "no array that could be the depth"
+def _refuse_other_planes(path: Path, frames: np.ndarray) -> None:
+    """Raise UserError where the file's second plane is no second frame: brightness or confidence follow the depth."""
+    first, second = (np.median(plane[plane > 0]) if (plane > 0).any() else 0.0 for plane in (frames[0], frames[-1]))
+    if not abs(first - second) <= 0.2 * max(first, second):
         raise UserError(
-            f"{name}: {what} (it holds {held})",
-            legal="one array named " + ", ".join(DISTANCE_NAMES) + "; " + LEGAL_AXES,
+            f"{path}: {len(frames)} planes of which the first has the median {first:g} and the last {second:g}: frames"
+            " of one scene, or depth beside brightness and confidence?",
+            fix="choose the plane with the depth: --array :0",
         )
+
+
+def raw_layout_of(path: Path) -> UserError:
+    """The message for a file of bare numbers: the layouts of usual cameras that its size fits."""
+    size = path.stat().st_size
+    whole = [wh for wh in SENSOR_SIZES if size == 2 * wh[0] * wh[1]]
+    parts = [wh for wh in SENSOR_SIZES if size % (wh[0] * wh[1]) == 0]
+    fitting = ", ".join(f"--raw {width}x{height}" for width, height in (whole or parts)[:4])
+    return UserError(
+        f"{path}: nothing says how its {size} bytes are laid out",
+        legal=LEGAL_RAW,
+        fix=f"state the layout, by its size {fitting}" if fitting and size else "state the layout",
+    )
+
+
+def named_array(
+    name: str, arrays: Mapping[str, np.ndarray], usual: Sequence[str], asked: str | None
+) -> tuple[str, np.ndarray]:
+    """(what to call it, array): the one asked for as NAME[:NUMBER], else the only one with a usual name, else the only
+    one. Raises UserError where none or several could be meant."""
+    held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
+    key, _, number = (asked or "").partition(":")
+    if asked is None or not key:
+        found = [key for key in arrays if key.lower() in usual]
+        if not found and len(arrays) == 1:
+            found = list(arrays)
+        if len(found) != 1:
+            what = "several arrays that could be the depth" if found else "no array that could be the depth"
+            raise UserError(
+                f"{name}: {what} (it holds {held})",
+                legal="one array named " + ", ".join(usual) + "; " + LEGAL_AXES,
+                fix=f"choose by --array NAME, for instance --array {(found or list(arrays))[0]}" if arrays else None,
+            )
+        (key,) = found
+    if key not in arrays:
+        raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
+    array = arrays[key]
+    if not number:
+        return f"{name}: {key}" if key else name, array
+    if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
+        raise UserError(f"--array {asked}: no such part of {key or name} {array.shape}", legal="NAME, or NAME:0 and up")
+    return f"{name}: {key}:{number}", array[int(number)]
+
+
+def named_stack(name: str, arrays: Mapping[str, np.ndarray], lens: Lens | None, asked: str | None = None) -> Stack:
+    """The stack among named arrays, with colour and amplitude. Raises UserError where none or several could be it."""
+    found, array = named_array(name, arrays, DISTANCE_NAMES, asked)
     beside = {key.lower(): value for key, value in arrays.items()}
     rgb = next((beside[key] for key in COLOUR_NAMES if key in beside), None)
     amplitude = next((beside[key] for key in AMPLITUDE_NAMES if key in beside), None)
-    return stack_of(f"{name}: {found[0]}", arrays[found[0]], rgb, amplitude, lens)
+    return stack_of(found, array, rgb, amplitude, lens)
 
 
 def stack_of(

@@ -16,7 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from detectors.recordings.azure_calibration import ColourCamera, colour_camera, depth_lens, parse_calibration
+from detectors.recordings.azure_calibration import (
+    ColourCamera,
+    colour_camera,
+    depth_lens,
+    depth_mode_of_size,
+    parse_calibration,
+)
 from detectors.recordings.distances import UNITS_M, frame_from_depth
 from detectors.recordings.intrinsics import no_lens, read_lens
 from detectors.recordings.recording import Recording
@@ -156,9 +162,12 @@ def _header(path: Path) -> _Header:
         attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
         for track in filter(None, (depth, colour)):
             refuse_pixels(f"{path}: its track", track.codec_context.width, track.codec_context.height)
+        size = (depth.codec_context.width, depth.codec_context.height)
+        # recorders of other makers (Orbbec's Femto) may leave the tag out; each mode has its own size
+        stated = depth.metadata.get("K4A_DEPTH_MODE") or container.metadata.get("K4A_DEPTH_MODE")
         return _Header(
-            depth_size=(depth.codec_context.width, depth.codec_context.height),
-            depth_mode=depth.metadata.get("K4A_DEPTH_MODE", "(not stated)"),
+            depth_size=size,
+            depth_mode=stated or depth_mode_of_size(*size) or "(not stated)",
             colour_size=(colour.codec_context.width, colour.codec_context.height) if colour else None,
             calibration=bytes(attached[0].data) if attached else None,
         )

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from detectors.recordings.arrays import Stack, named_stack
 from detectors.recordings.matlab_elements import LEGAL_MAT, Variable, broken, variables_of
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
 
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
@@ -18,8 +16,8 @@ EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location',
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
-def load_mat(path: Path, lens: Lens | None) -> Stack:
-    """The arrays of a ``.mat`` file as `named_stack` takes them; (h, w, 3, k) has its frames moved first.
+def load_mat(path: Path) -> dict[str, np.ndarray]:
+    """The numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved first.
 
     Raises UserError for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file.
     """
@@ -31,7 +29,7 @@ def load_mat(path: Path, lens: Lens | None) -> Stack:
     if not arrays:
         _refuse_objects(path, variables)
         raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=f"in MATLAB: {EXPORT}")
-    return named_stack(str(path), arrays, lens)
+    return arrays
 
 
 def _refuse_hdf5(path: Path) -> None:

@@ -3,32 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from detectors.recordings.arrays import load_npy, load_npz, open_stack
+from detectors.recordings.arrays import RawLoader, load_npy, open_stack, raw_layout_of
 from detectors.recordings.azure_mkv import open_mkv
 from detectors.recordings.bag_files import BAG_SUFFIXES, ROS1_SUFFIX, is_bag_folder
 from detectors.recordings.bags import open_bag
-from detectors.recordings.depth_images import open_depth_folder, open_depth_list
+from detectors.recordings.depth_images import open_depth_folder, open_depth_list, png_kind
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit
+from detectors.recordings.height_maps import open_height_map
 from detectors.recordings.matlab import load_mat
+from detectors.recordings.phones import is_stray, open_r3d, open_stray
+from detectors.recordings.point_lists import POINT_LISTS, open_point_lists
 from detectors.recordings.pointclouds import open_clouds
 from detectors.recordings.recording import Recording
+from harness.vocabulary.archives import read_npz
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 
-STACKS = {".npy": load_npy, ".npz": load_npz, ".mat": load_mat}
+STACKS = {".npy": load_npy, ".npz": read_npz, ".mat": load_mat}
 CLOUDS = (".ply", ".pcd")
 HELD = 6
 """Names of a folder's contents that a message lists."""
 LEGAL_FORMATS = (
-    "a folder or list of 16-bit depth .png, a folder or list of .ply or .pcd, a ROS bag (folder, .mcap, .db3, "
-    ".bag), or one .npy, .npz, .mat or .mkv file"
+    "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; a ROS bag (folder, .mcap, "
+    ".db3, .bag); one .npy, .npz, .mat, .mkv or .r3d file; a Stray Scanner folder; with --pitch a height map; with "
+    "--raw a file of bare numbers"
 )
+BARE = (".bin", ".raw", ".dat")
+CONVERT = {
+    **dict.fromkeys(
+        (".tif", ".tiff", ".exr"),
+        "OPENCV_IO_ENABLE_OPENEXR=1 python -c \"import cv2, numpy; numpy.save('depth.npy', cv2.imread('{}', -1))\""
+        ", then name depth.npy",
+    ),
+    **dict.fromkeys(
+        (".h5", ".hdf5"),
+        "python -c \"import h5py, numpy; numpy.save('depth.npy', h5py.File('{}')['NAME'][:])\", then name depth.npy",
+    ),
+    **dict.fromkeys(
+        (".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"),
+        "export its points as PLY, for instance by CloudCompare",
+    ),
+}
+"""What turns files that are not read into files that are."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the user said of a capture, as `open_capture` takes it."""
+
+    intrinsics: Path | None = None
+    lens: Lens | None = None
+    frames: slice | None = None
+    topic: str | None = None
+    array: str | None = None
+    pitch: str | None = None
+    raw: str | None = None
 
 
 def open_capture(
@@ -39,13 +74,18 @@ def open_capture(
     lens: Lens | None = None,
     frames: slice | None = None,
     topic: str | None = None,
+    array: str | None = None,
+    pitch: str | None = None,
+    raw: str | None = None,
 ) -> Recording:
     """Open a real capture as a source of frames; its first frame is read and checked.
 
     ``unit`` of the stored distances (mm, m, cm, um, tum, N/m) where the format's usual one is wrong. ``intrinsics``: a
     file with the depth pixels' lens, which counts before one found beside the frames or attached to them; ``lens`` the
     same as a value. ``frames`` selects frames by number. ``topic``: of a ROS bag the topic with the depth images or
-    clouds, where several have some. Raises UserError for every fault of the files.
+    clouds, where several have some. ``array``: NAME or NAME:NUMBER in a file of arrays. ``pitch``: the distance between
+    the pixels of a height map (``0.5mm``). ``raw``: WIDTHxHEIGHT[:TYPE[:BYTES]], the layout of bare numbers. Raises
+    UserError for every fault of the files.
     """
     paths = [Path(path) for path in paths]
     if not paths:
@@ -56,14 +96,10 @@ def open_capture(
     odd = next((path for path in paths if not path.is_file() and not path.is_dir()), None)
     if odd is not None:
         raise UserError(f"{odd}: is neither a file nor a folder, but a device or a pipe", legal=LEGAL_FORMATS)
+    asked = Asked(intrinsics, lens, frames, topic, array, pitch, raw)
 
     def opened(scale_m: float | None) -> Recording:
-        if len(paths) == 1 and _is_bag(paths[0]):
-            recording = open_bag(paths[0], scale_m, intrinsics, lens, topic)
-        elif topic is not None:
-            raise UserError(f"{paths[0]}: is no ROS bag, so it has no topic {topic}", fix="leave out --topic")
-        else:
-            recording = _open_files(paths, scale_m, intrinsics, lens)
+        recording = _opened(paths, scale_m, asked)
         return replace(recording, selection=frames)
 
     recording = opened(metres_per_unit(unit) if unit else None)
@@ -104,38 +140,79 @@ def _is_bag(path: Path) -> bool:
         return False
 
 
-def _open_files(paths: list[Path], scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:
+def _opened(paths: list[Path], scale_m: float | None, asked: Asked) -> Recording:
     suffixes = {path.suffix.lower() for path in paths if path.is_file()}
+    if len(paths) == 1 and _is_bag(paths[0]) and asked.raw is None:
+        _refuse_unused(paths[0], asked, "ROS bag")
+        return open_bag(paths[0], scale_m, asked.intrinsics, asked.lens, asked.topic)
+    if asked.topic is not None:
+        raise UserError(f"{paths[0]}: is no ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
+    if len(paths) == 1 and (asked.raw is not None or suffixes <= set(STACKS)) and paths[0].is_file():
+        return _open_arrays(paths[0], scale_m, asked)
+    _refuse_unused(paths[0], asked, "file of arrays")
     if len(paths) == 1 and paths[0].is_dir():
-        return _open_folder(paths[0], scale_m, intrinsics, lens)
+        return _open_folder(paths[0], scale_m, asked)
     if any(path.is_dir() for path in paths):
         raise UserError(f"{len(paths)} paths with folders among them", legal=LEGAL_FORMATS, fix="name one folder alone")
     if suffixes == {".png"}:
-        return open_depth_list(paths, scale_m, intrinsics, lens)
+        return open_depth_list(paths, scale_m, asked.intrinsics, asked.lens)
     if len(suffixes) == 1 and suffixes <= set(CLOUDS):
         return open_clouds(paths, scale_m, _list_name(paths))
+    if len(suffixes) == 1 and suffixes <= set(POINT_LISTS):
+        return open_point_lists(paths, scale_m, asked.lens, _list_name(paths))
     if len(paths) > 1:
         raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted(suffixes))}", legal=LEGAL_FORMATS)
     (suffix,) = suffixes
-    if suffix in STACKS:
-        return open_stack(paths[0], scale_m, intrinsics, lens, STACKS[suffix])
     if suffix == ".mkv":
-        return open_mkv(paths[0], scale_m, intrinsics, lens)
-    raise UserError(f"{paths[0]}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS)
+        return open_mkv(paths[0], scale_m, asked.intrinsics, asked.lens)
+    if suffix == ".r3d":
+        return open_r3d(paths[0], scale_m, asked.intrinsics, asked.lens, asked.frames)
+    if suffix in BARE:
+        raise raw_layout_of(paths[0])
+    fix = CONVERT.get(suffix, "").format(paths[0]) or None
+    raise UserError(f"{paths[0]}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
 
 
-def _open_folder(folder: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:
+def _open_arrays(path: Path, scale_m: float | None, asked: Asked) -> Recording:
+    load = RawLoader.stated(asked.raw) if asked.raw is not None else STACKS[path.suffix.lower()]
+    if asked.pitch is not None:
+        return open_height_map(path, load, scale_m, asked.pitch, asked.array)
+    return open_stack(path, scale_m, asked.intrinsics, asked.lens, load, asked.array)
+
+
+def _refuse_unused(path: Path, asked: Asked, kind: str) -> None:
+    """Raise UserError for options that only files of arrays have."""
+    for name in ("array", "pitch", "raw"):
+        if getattr(asked, name) is not None:
+            raise UserError(
+                f"{path}: --{name} is for files of arrays",
+                legal=f"{', '.join(STACKS)}, or bare numbers with --raw",
+                fix=f"leave out --{name}" + ("" if kind == "file of arrays" else f": this is a {kind}"),
+            )
+
+
+def _open_folder(folder: Path, scale_m: float | None, asked: Asked) -> Recording:
     try:
         inside = sorted(folder.iterdir())
     except OSError as error:
         raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
-    for suffix in CLOUDS:
+    if is_stray(folder):
+        return open_stray(folder, scale_m, asked.intrinsics, asked.lens, asked.frames)
+    for suffix in (*CLOUDS, *POINT_LISTS[:3]):
         clouds = [path for path in inside if path.suffix.lower() == suffix]
-        if clouds:
+        if clouds and suffix in CLOUDS:
             return open_clouds(clouds, scale_m, folder.name)
-    if not (folder / "depth").is_dir() and not any(path.suffix.lower() == ".png" for path in inside):
+        if clouds:
+            return open_point_lists(clouds, scale_m, asked.lens, folder.name)
+    pictures = [path for path in inside if path.suffix.lower() == ".png"]
+    has_arrays = any(path.suffix.lower() in STACKS for path in inside)
+    if not (folder / "depth").is_dir() and (not pictures or (has_arrays and not any(map(_is_depth, pictures)))):
         raise _nothing_in(folder, inside)
-    return open_depth_folder(folder, scale_m, intrinsics, lens)
+    return open_depth_folder(folder, scale_m, asked.intrinsics, asked.lens)
+
+
+def _is_depth(picture: Path) -> bool:
+    return png_kind(picture)[2:] == (16, 0)
 
 
 def _nothing_in(folder: Path, inside: list[Path]) -> UserError:
@@ -150,7 +227,7 @@ def _nothing_in(folder: Path, inside: list[Path]) -> UserError:
 def _is_capture(path: Path) -> bool:
     """Whether what lies in a folder looks like a capture of its own."""
     if path.is_file():
-        return path.suffix.lower() in (*STACKS, ".mkv")
+        return path.suffix.lower() in (*STACKS, ".mkv", ".r3d", ROS1_SUFFIX)
     return _is_bag(path) or (path / "depth").is_dir()
 
 

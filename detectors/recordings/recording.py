@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class Recording:
     stored unit, and ``unit_from`` who says so: "" where a reader only takes what is usual for its format, so that
     `detectors.recordings.opening` decides by the data. ``notes``: what the user should know about how the files were
     understood. ``warnings``: full sentences on what makes the distances doubtful; every program shows them before
-    anything else. ``selection`` picks frames.
+    anything else. ``selection`` picks frames. ``projection``: see `harness.vocabulary.capture.Cloud`.
     """
 
     name: str
@@ -48,6 +48,7 @@ class Recording:
     organised: bool = True
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    projection: Literal["central", "parallel"] = "central"
     selection: slice | None = None
     unit_from: str = ""
 

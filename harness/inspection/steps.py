@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,14 +89,25 @@ def opened(arguments: argparse.Namespace, paths: list[Path]) -> Recording:
             legal = f"a file, or one of the cameras {', '.join(camera_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
     first = slice(arguments.max_frames) if arguments.max_frames else None
-    return open_capture(paths, unit=arguments.unit, intrinsics=file, lens=lens, frames=first, topic=arguments.topic)
+    return open_capture(
+        paths,
+        unit=arguments.unit,
+        intrinsics=file,
+        lens=lens,
+        frames=first,
+        topic=arguments.topic,
+        array=arguments.array,
+        pitch=arguments.pitch,
+        raw=arguments.raw,
+    )
 
 
 def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
     """The capture's average as --average says."""
     from detectors.average import AverageConfig, average
 
-    return average(recording, AverageConfig(method=arguments.average))
+    cloud = average(recording, AverageConfig(method=arguments.average))
+    return replace(cloud, projection=recording.projection)
 
 
 def threshold_of(

@@ -56,7 +56,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     Raises UserError where it is broken, holds objects, or would unpack to more than `limits.ARRAYS_BYTES`.
     """
     try:
-        _refuse_long_list(path)
+        refuse_long_list(path)
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             _refuse_entries(path, entries)
@@ -75,7 +75,7 @@ def _name(entry: zipfile.ZipInfo) -> str:
     return entry.filename.removesuffix(".npy")
 
 
-def _refuse_long_list(path: Path) -> None:
+def refuse_long_list(path: Path) -> None:
     """The list of contents is read whole when an archive is opened; its size stands at the file's end."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
