@@ -363,6 +363,14 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
     points = np.stack([(u - 127) / 210, (v - 95) / 210, np.ones(u.shape)], axis=-1) * 0.8
     grid = open_capture([plane.write_points(tmp_path / "a.xyz", points)])
     assert grid.organised and grid.region.shape == (192, 256)
+    # Arena and pylon leave a cloud's grid out, or state it in a comment; their points without return are 0 0 0
+    points[3, 5] = 0
+    bare = plane.write_ply(tmp_path / "a.ply", points, grid=False)
+    recording = open_capture([bare])
+    assert recording.organised and recording.first_frame().reason[3, 5] == Reason.NO_RETURN
+    stated = plane.write_ply(tmp_path / "b.ply", TRUE_M, grid=False)
+    stated.write_bytes(stated.read_bytes().replace(b"element", b"comment Width=96, Height=72\nelement", 1))
+    assert open_capture([stated]).region.shape == (72, 96)
     shuffled = np.random.default_rng(5).permutation(points.reshape(-1, 3)).reshape(192, 256, 3)
     assert not open_capture([plane.write_points(tmp_path / "b.xyz", shuffled)]).organised
 

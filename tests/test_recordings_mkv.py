@@ -188,3 +188,10 @@ def test_real_colour_falls_on_the_depth_pixels(shared_data: Path) -> None:
     shifts = np.arange(-12, 13)
     scores = [float(np.corrcoef(grey[12:-12], np.roll(infrared, s)[12:-12])[0, 1]) for s in shifts]
     assert abs(int(shifts[int(np.argmax(scores))])) <= 2
+
+
+def test_a_recording_without_the_tag_of_its_mode_has_the_mode_of_its_size(tmp_path: Path) -> None:
+    depth = np.full((576, 640), 900, np.uint16)
+    path = plane.write_mkv(tmp_path / "femto.mkv", [{"DEPTH": depth}], mode="", attached=plane.calibration())
+    lens = open_capture([path]).lens
+    assert lens is not None and (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))

@@ -6,8 +6,10 @@ Every file is opened in a process whose memory is limited to what its libraries 
 from __future__ import annotations
 
 import io
+import json
 import sqlite3
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -168,6 +170,48 @@ def test_cells_beside_numbers_are_left_unread(tmp_path):
     cells = np.array([[1, 2], ["a", {"b": 1}]], object)
     scipy.io.savemat(tmp_path / "a.mat", {"depth": STORED, "notes": cells}, do_compression=True)
     assert open_capture([tmp_path / "a.mat"], lens=plane.LENS).region.shape == STORED.shape
+
+
+# ---- phones and lists of points --------------------------------------------------------------------------------------
+
+
+def test_an_archive_of_a_phone_that_unpacks_to_much(tmp_path):
+    path = plane_archive(tmp_path / "a.r3d", bytes(64 << 20))
+    assert path.stat().st_size < 1 << 20
+    assert "metadata: has 64 MiB\n  legal: at most 16 MiB" in capture_refusal(path)
+
+
+def plane_archive(path: Path, metadata: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", metadata)
+        archive.writestr("rgbd/0.depth", b"bvx$")
+    return path
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        struct.pack("<4sI", b"bvxn", 96 * 72 * 4) + struct.pack("<I", 0xFFFFFFF0),
+        struct.pack("<4sI", b"bvx2", 0xFFFFFFF0) + bytes(24),
+        struct.pack("<4sI", b"bvx-", 0) * 100_000,
+        b"bvx1" + bytes(1000),
+        b"",
+    ],
+)
+def test_blocks_that_state_another_size_are_never_unpacked(tmp_path, packed, monkeypatch):
+    monkeypatch.setitem(sys.modules, "liblzfse", object())
+    told = {"K": [300, 0, 0, 0, 300, 0, 96, 72, 1], "w": 192, "h": 144, "dw": 96, "dh": 72}
+    with zipfile.ZipFile(tmp_path / "a.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", json.dumps(told))
+        archive.writestr("rgbd/0.depth", packed)
+    assert "is damaged" in capture_refusal(tmp_path / "a.r3d")
+
+
+def test_a_list_of_points_that_is_too_long(tmp_path):
+    with (tmp_path / "a.xyz").open("wb") as file:
+        file.write(b"1 2 3\n")
+        file.truncate(10 << 30)
+    assert "has more than 256 MiB" in capture_refusal(tmp_path / "a.xyz")
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------

@@ -35,6 +35,8 @@ SENSOR_SIZES = (
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
 )
 """(width, height) of the depth images of usual cameras."""
+SAME_SCENE = 0.05
+"""Part of its distance by which the median pixel of two frames of one scene differs at most."""
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
@@ -89,7 +91,7 @@ def open_stack(
     a depth array has no lens."""
     stack = named_stack(str(path), load(path), lens, array)
     if isinstance(load, RawLoader) and array is None:
-        _refuse_other_planes(path, stack.distances)
+        _refuse_other_planes(path, stack.distances, load.left_over(path))
     height, width = stack.distances.shape[1:3]
     lens_file = None
     if not stack.has_points:
@@ -140,6 +142,10 @@ class RawLoader:
         kind = kind or "u2"
         return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(offset or 0))
 
+    def left_over(self, path: Path) -> int:
+        """Bytes behind the last whole frame."""
+        return (path.stat().st_size - self.offset) % (self.width * self.height * np.dtype(self.kind).itemsize)
+
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """The frames (n, h, w), mapped. Raises UserError where there is none."""
         kind = np.dtype(self.kind)
@@ -154,13 +160,19 @@ class RawLoader:
         return {"": np.memmap(path, kind, "r", self.offset, (count, self.height, self.width))}
 
 
-def _refuse_other_planes(path: Path, frames: np.ndarray) -> None:
-    """Raise UserError where the file's second plane is no second frame: brightness or confidence follow the depth."""
-    first, second = (np.median(plane[plane > 0]) if (plane > 0).any() else 0.0 for plane in (frames[0], frames[-1]))
-    if not abs(first - second) <= 0.2 * max(first, second):
+def _refuse_other_planes(path: Path, frames: np.ndarray, left_over: int) -> None:
+    """Raise UserError where the file's further planes are no frames of the same scene: brightness or confidence follow
+    the depth, in other types (``left_over`` bytes at the end), or other numbers at most pixels."""
+    if len(frames) == 1:
+        return
+    first, last = (frames[i].astype(np.float64) for i in (0, -1))
+    both = (first > 0) & (last > 0)
+    apart = float(np.median(np.abs(first - last)[both] / first[both])) if both.any() else 1.0
+    if left_over or not apart < SAME_SCENE:
         raise UserError(
-            f"{path}: {len(frames)} planes of which the first has the median {first:g} and the last {second:g}: frames"
-            " of one scene, or depth beside brightness and confidence?",
+            f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by {100 * apart:.3g} %"
+            " between the first and the last plane: depth beside brightness and confidence?",
+            legal="frames of one scene, or one plane",
             fix="choose the plane with the depth: --array :0",
         )
 

@@ -94,8 +94,11 @@ def _read(path: Path, lens: Lens | None) -> tuple[dict[str, np.ndarray], tuple[i
         raise UserError(f"{path}: no line of numbers among its first {len(lines)}", legal=LEGAL_LIST)
     values = _table(path, content, skipped, lines[skipped])
     columns = _columns(path, values, lines[skipped - 1 - bool(size)] if skipped > bool(size) else "")
-    stated = size if len(size) == 2 else _stated(lines[:skipped])
-    return columns, _grid(columns, stated, lens)
+    width, height = size if len(size) == 2 else stated_size(lines[:skipped])
+    points = np.stack([columns[axis] for axis in "xyz"], axis=-1)
+    refuse_pixels(str(path), len(points), 1)
+    is_stated = width * height == len(points) and height > 1
+    return columns, (height, width) if is_stated else grid_of(points, lens)
 
 
 def _numbers(line: str) -> list[float] | None:
@@ -158,31 +161,34 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
     return found
 
 
-def _stated(lines: Sequence[str]) -> list[int]:
-    text = " ".join(lines).lower()
-    found = [re.search(rf"\b(?:{names})\b\s*[:=]?\s*(\d{{1,9}})\b", text) for names in ("width|cols", "height|rows")]
-    return [int(match.group(1)) for match in found if match]
+def stated_size(lines: Sequence[str]) -> tuple[int, int]:
+    """Width and height that lines of a header state, 0 where they do not."""
+    text = "\n".join(lines).lower()
+    names = (r"(?:num_)?(?:width|cols)", r"(?:num_)?(?:height|rows)")
+    found = (re.search(rf"\b{name}\b\s*[:=]?\s*(\d{{1,9}})\b", text) for name in names)
+    width, height = (int(match.group(1)) if match else 0 for match in found)
+    return width, height
 
 
-def _grid(columns: dict[str, np.ndarray], stated: Sequence[int], lens: Lens | None) -> tuple[int, int]:
-    count = len(columns["z"])
-    refuse_pixels("a list of points", count, 1)
-    if len(stated) == 2 and stated[0] * stated[1] == count and stated[1] > 1:
-        return stated[1], stated[0]
+def grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
+    """(h, w) of points (n, 3) whose grid nothing states: the lens', or a usual sensor's where they rise as its pixels
+    do; (1, n) else."""
+    count = len(points)
     if lens is not None and lens.width * lens.height == count:
         return lens.height, lens.width
     for width, height in SENSOR_SIZES:
-        if width * height == count and _is_raster(columns, height, width):
+        if width * height == count and _is_raster(points, height, width):
             return height, width
     return 1, count
 
 
-def _is_raster(columns: dict[str, np.ndarray], height: int, width: int) -> bool:
+def _is_raster(points: np.ndarray, height: int, width: int) -> bool:
     """Whether the points come row by row from a camera's pixels."""
     v, u = np.divmod(np.arange(height * width), width)
-    z = columns["z"]
-    valid = np.isfinite(z) & (np.abs(z) > 0)
+    z = points[:, 2]
+    valid = np.isfinite(points).all(axis=1) & (z != 0)
     if valid.sum() < 100:
         return False
-    turns = [np.corrcoef(columns[axis][valid] / z[valid], at[valid])[0, 1] for axis, at in (("x", u), ("y", v))]
+    slopes = points[valid, :2] / z[valid, None]
+    turns = [np.corrcoef(slopes[:, axis], at[valid])[0, 1] for axis, at in enumerate((u, v))]
     return min(map(abs, turns)) > RASTER_CORRELATION

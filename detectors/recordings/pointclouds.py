@@ -17,6 +17,7 @@ import numpy as np
 
 from detectors.open3d_library import load_open3d
 from detectors.recordings.distances import UNITS_M, frame_from_points, rounding_step_m
+from detectors.recordings.point_lists import grid_of, stated_size
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
@@ -63,18 +64,19 @@ class CloudReader:
 
 def open_clouds(paths: Sequence[Path], scale_m: float | None, name: str) -> Recording:
     """Open clouds in the order given, each a frame. Raises UserError on a broken file."""
-    header = cloud_header(paths[0])
     scale_m = scale_m or UNITS_M["m"]
     reader = CloudReader(tuple(paths), scale_m)
+    first = read_cloud(paths[0], scale_m)
+    height, width = first.z_m.shape
     return Recording(
         name=name,
         reader=reader,
-        region=Region(0, header.height, 0, header.width),
+        region=Region(0, height, 0, width),
         scale_m=scale_m,
-        z_step_m=rounding_step_m(read_cloud(paths[0], scale_m).z_m),
+        z_step_m=rounding_step_m(first.z_m),
         files=tuple(paths),
-        organised=header.height > 1,
-        notes=() if header.height > 1 else ("the cloud has no pixel grid; it is treated as single points",),
+        organised=height > 1,
+        notes=() if height > 1 else ("the cloud has no pixel grid; it is treated as single points",),
     )
 
 
@@ -92,8 +94,8 @@ def read_cloud(path: Path, scale_m: float) -> Frame:
             legal=LEGAL_CLOUD,
             fix="copy or export it again",
         )
-    grid = (header.height, header.width)
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
+    grid = (header.height, header.width) if header.height > 1 else grid_of(attributes["positions"])
     colours = attributes.get("colors")
     amplitude = next((attributes[k] for k in ("intensity", "intensities", "amplitude") if k in attributes), None)
     return frame_from_points(
@@ -152,17 +154,10 @@ def _ply_header(path: Path, content: bytes) -> CloudHeader:
     ascii_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     # Each number of an ASCII line takes at least a digit and a separator.
     least = points * (2 * fields if ascii_text else bytes_each)
-    columns, rows = _stated(lines, "num_cols|width"), _stated(lines, "num_rows|height")
+    columns, rows = stated_size([line for line in lines if line.startswith(("obj_info", "comment"))])
     gridded = columns * rows == points and rows > 1
     width, height = (columns, rows) if gridded else (points, 1)
     return CloudHeader(points, width, height, end.end(), least - 1 if ascii_text else least)
-
-
-def _stated(lines: list[str], names: str) -> int:
-    found = (
-        re.match(rf"(?:obj_info|comment)\s+(?:{names})\s*[:=]?\s*(\d{{1,15}})\s*$", line.strip()) for line in lines
-    )
-    return next((int(match.group(1)) for match in found if match), 0)
 
 
 def _pcd_header(path: Path, content: bytes) -> CloudHeader:
