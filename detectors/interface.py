@@ -44,6 +44,46 @@ class Detection:
 
 
 @dataclass(frozen=True)
+class MissingReturns:
+    """What a cloud lacks inside the target's outline.
+
+    ``outline`` (h, w) bool. ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing.
+    ``blind``: share of the outline's pixels that returned nothing in any frame. ``dropouts``: rate of scattered missing
+    pixels on the target. ``least_points``: connected pixels from which on a cluster is a finding, ``expected`` the
+    number of chance clusters of that size and more. ``detections``: kind "no return", largest first; the score is the
+    Gaussian deviation that is as improbable as the expected number of chance clusters as large, at most 37.
+    """
+
+    outline: np.ndarray
+    unseen: np.ndarray
+    blind: float
+    dropouts: float
+    least_points: int
+    expected: float
+    detections: tuple[Detection, ...]
+
+    @property
+    def blind_text(self) -> str:
+        """How much of the target is blind, and what chance has to do with it."""
+        places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
+        return (
+            f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places} of {self.least_points}"
+            f" connected pixels and more ({self.expected:.1g} expected by chance; scattered dropouts"
+            f" {100 * self.dropouts:.2g} %)"
+        )
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """The same as plain data."""
+        return {
+            "blind_share": self.blind,
+            "scattered_dropouts": self.dropouts,
+            "least_points": self.least_points,
+            "expected_by_chance": self.expected,
+        }
+
+
+@dataclass(frozen=True)
 class Measurement:
     """Size and place of one detection, camera frame, metres; NaN where an estimate could not be made (``model_note``).
 

@@ -170,7 +170,7 @@ class _Surroundings:
         if ring.sum() < 12:
             return None
         offset, noise = _level(residual[ring])
-        plane = _local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own, cloud.projection)
+        plane = local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own, cloud.projection)
         if plane is None:
             return None
         used = finite & ~_other_damage(residual - offset, own, noise, blur)
@@ -212,7 +212,7 @@ def _level(values: np.ndarray) -> tuple[float, float]:
     return middle, median_size_of(values - middle) / 0.6745
 
 
-def _local_plane(
+def local_plane(
     points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression.

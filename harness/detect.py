@@ -46,8 +46,8 @@ def _parser() -> argparse.ArgumentParser:
         "--out",
         type=Path,
         metavar="DIR",
-        help="write findings.csv, findings.json, annotated.png and cloud.ply here; of several views merged.ply,"
-        " registrations.json and view3d.html (turns in the browser) too",
+        help="write findings.csv, findings.json, annotated.png, blind.png (where nothing returned) and cloud.ply here;"
+        " of several views merged.ply, registrations.json and view3d.html (turns in the browser) too",
     )
     add(
         "--unit",
@@ -113,7 +113,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _inspect_capture(arguments: argparse.Namespace) -> int:
     from harness.inspection import printed
-    from harness.report.findings import Judged, write_findings
+    from harness.report.findings import write_findings
 
     detector, settings = steps.detector_of(arguments, arguments.crop, arguments.set)
     recording = steps.opened(arguments, arguments.paths)
@@ -124,15 +124,16 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
     cloud = steps.averaged(arguments, recording)
     evidence = detector.analyse(cloud)
     threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
-    detections = detector.find(cloud, evidence, threshold)
-    judged = Judged(cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections))
+    judged = steps.judged(detector, cloud, evidence, threshold)
     printed.print_warnings((*recording.warnings, *evidence.warnings))
     printed.print_capture(recording, cloud, evidence, arguments.crop)
+    if judged.missing is not None:
+        print(judged.missing.blind_text)
     print(printed.threshold_text(threshold, evidence, origin))
     printed.print_findings(judged.findings)
     if arguments.out is not None:
         about = _about(arguments, recording, quiet, judged, detector, settings, threshold, origin)
-        title = f"{recording.name}: {len(detections)} findings beyond {printed.beyond_text(threshold, evidence)}"
+        title = f"{recording.name}: {len(judged.detections)} findings beyond {printed.beyond_text(threshold, evidence)}"
         for path in write_findings(arguments.out, judged, about, title):
             print(f"wrote {path}")
     return 0
@@ -168,6 +169,7 @@ def _about(
         "capture": steps.capture_facts(recording, judged.cloud),
         "threshold": {"k": threshold, "mm": 1e3 * threshold * evidence.scale_m, "from": origin},
         "warnings": evidence.warnings,
+        "missing_returns": None if judged.missing is None else judged.missing.facts,
         "surface": {"one_unit_of_score_mm": 1e3 * evidence.scale_m, **evidence.notes},
         "settings": {
             "average": arguments.average,

@@ -35,7 +35,15 @@ CORNERS_M = transform_points(
     POSES[0],
     np.array([(x * board.HALF_WIDTH_M, y * board.HALF_HEIGHT_M, 0.0) for x in (-1, 1) for y in (-1, 1)]),
 )
-FILES = ["annotated.png", "findings.csv", "findings.json", "merged.ply", "registrations.json", "view3d.html"]
+FILES = [
+    "annotated.png",
+    "blind.png",
+    "findings.csv",
+    "findings.json",
+    "merged.ply",
+    "registrations.json",
+    "view3d.html",
+]
 SHARP = ("--set", "hole_model.blur_px=1")
 """The board's hole is drawn without a camera's blur."""
 

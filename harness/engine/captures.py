@@ -12,6 +12,7 @@ from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment, Point
 from harness.experiment.recorded import recording_of
 from harness.experiment.schema import CaptureSource
+from harness.inspection.steps import judged as judged_cloud
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text
@@ -66,10 +67,7 @@ def _judged(point: Point) -> tuple[Judged, float]:
     evidence = detector.analyse(cloud)
     threshold = config.threshold.k
     assert threshold is not None  # a capture cannot be calibrated on; the experiment's checks say so
-    detections = detector.find(cloud, evidence, threshold)
-    return Judged(
-        cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections)
-    ), threshold
+    return judged_cloud(detector, cloud, evidence, threshold), threshold
 
 
 def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[str, object]:

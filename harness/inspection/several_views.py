@@ -176,14 +176,11 @@ def _judge(
     checks: Checks,
     detector: Detector,
 ) -> Inspection:
-    from harness.report.findings import Judged
-
     cloud = mapped.merged.cloud
     evidence = detector.analyse(cloud)
     # a quiet capture was refused before
     threshold, origin = steps.threshold_of(arguments, detector, lambda: (steps.DEFAULT_K, ""))
-    detections = detector.find(cloud, evidence, threshold)
-    judged = Judged(cloud, evidence, detections, tuple(detector.measure(cloud, evidence, d) for d in detections))
+    judged = steps.judged(detector, cloud, evidence, threshold)
     return Inspection(recordings, mapped, checks, detector, judged, threshold, origin)
 
 
@@ -203,6 +200,8 @@ def _print(inspection: Inspection) -> None:
     cell_m = None if merged.surface_map is None else merged.surface_map.cell_m
     grid = f", a map of {width} x {height} cells of {printed.mm(cell_m)}" if cell_m is not None else ""
     print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
+    if judged.missing is not None:
+        print(judged.missing.blind_text)
     print(printed.surface_text(cloud, judged.evidence))
     print(printed.threshold_text(inspection.threshold, judged.evidence, inspection.origin))
     printed.print_findings(judged.findings, grid="px" if cell_m is None else "cell")
@@ -246,6 +245,7 @@ def _about(
             "notes": mapped.merged.notes,
         },
         "warnings": evidence.warnings,
+        "missing_returns": None if judged.missing is None else judged.missing.facts,
         "threshold": {
             "k": inspection.threshold,
             "mm": 1e3 * inspection.threshold * evidence.scale_m,

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from harness.vocabulary.errors import UserError
 
 if TYPE_CHECKING:
-    from detectors.interface import Detector
+    from detectors.interface import Detector, Evidence
     from detectors.recordings import Recording
+    from harness.report.findings import Judged
     from harness.vocabulary.capture import Cloud
 
 DEFAULT_K = 5.0
@@ -108,6 +109,19 @@ def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
 
     cloud = average(recording, AverageConfig(method=arguments.average))
     return replace(cloud, projection=recording.projection)
+
+
+def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
+    """Findings beyond a threshold and missing returns, each damage once, with their sizes."""
+    from detectors.missing import measure_missing, missing_returns, one_damage_once
+    from harness.report.findings import Judged
+
+    missing = missing_returns(cloud, evidence)
+    unseen = () if missing is None else missing.detections
+    found = one_damage_once(cloud.valid.shape, detector.find(cloud, evidence, threshold), unseen)
+    measures = (measure_missing if one.kind == "no return" else detector.measure for one in found)
+    measured = tuple(measure(cloud, evidence, one) for measure, one in zip(measures, found, strict=True))
+    return Judged(cloud, evidence, found, measured, missing)
 
 
 def threshold_of(

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from detectors.interface import Detection, Evidence, Measurement
-from harness.report.findings_picture import save_picture
+from detectors.interface import Detection, Evidence, Measurement, MissingReturns
+from harness.report.findings_picture import save_blind_map, save_picture
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import atomic_path
 from harness.vocabulary.units import MM
@@ -31,7 +31,9 @@ COLUMNS = (
 FINDINGS_VERSION = 2
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 VERSION_COLUMN = "findings_version"
-FILES = ("findings.csv", "findings.json", "annotated.png", "cloud.ply")
+BLIND_MAP = "blind.png"
+"""Where the cloud has a pixel grid."""
+FILES = ("findings.csv", "findings.json", "annotated.png", BLIND_MAP, "cloud.ply")
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,10 @@ class Finding:
     """One row: the best of both measures, camera frame. NaN where nothing could be measured.
 
     ``kind``: ``hole`` (behind the surface), ``bump`` (before it), or ``no return`` (nothing came back).
-    ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth) or ``extent`` (the thesis'
-    extreme points). ``depth_from``: likewise, or ``extreme residual`` of the cluster's points.
+    ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth), ``extent`` (the thesis'
+    extreme points) or ``area`` (of pixels without return). ``depth_from``: likewise, or ``extreme residual`` of the
+    cluster's points; ``none`` of pixels without return. ``score``: the detector's, or of pixels without return that of
+    `detectors.interface.MissingReturns`.
     """
 
     id: int
@@ -61,12 +65,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with all that a detector said about it; ``measurements`` and ``detections`` side by side."""
+    """A cloud with all that a detector said about it; ``measurements`` and ``detections`` side by side. ``missing``:
+    what the cloud lacks, None where it has no pixel grid."""
 
     cloud: Cloud
     evidence: Evidence
     detections: tuple[Detection, ...]
     measurements: tuple[Measurement, ...]
+    missing: MissingReturns | None = None
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -83,7 +89,9 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
     size_from = "extent" if not modelled else "contour" if math.isnan(measured.model_diameter_se_m) else "model"
     depth_m, depth_from = measured.model_depth_m, size_from
-    if math.isnan(depth_m):
+    if detection.kind == "no return":
+        size_from, depth_from = "area", "none"
+    elif math.isnan(depth_m):
         residuals = evidence.residual_m.reshape(-1)[detection.pixels]
         depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
     return Finding(
@@ -119,8 +127,10 @@ def write_findings(
     Raises UserError where the folder cannot be written or the disk is full.
     """
     is_new = not folder.exists()
-    further = beside or {}
-    names = (*FILES[:-1], cloud_name, *further)
+    further = dict(beside or {})
+    if (missing := judged.missing) is not None:
+        further[BLIND_MAP] = lambda path: save_blind_map(path, judged.cloud, missing, judged.detections)
+    names = (*(name for name in FILES[:-1] if name != BLIND_MAP), cloud_name, *further)
     try:
         with ExitStack() as stack:
             part = {name: stack.enter_context(atomic_path(folder / name)) for name in names}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from detectors.interface import Detection, Evidence
+from detectors.interface import Detection, Evidence, MissingReturns
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.units import MM
 
@@ -72,10 +72,46 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
     canvas.print_png(str(path))
 
 
+def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
+    """Write the PNG: the share of the frames in which each pixel returned nothing (of a map, whether a cell was seen),
+    the target's outline, and the numbered circles of findings without return."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    left, right, bottom, top = _around(cloud, missing.outline)
+    height_in = min(WIDTH_IN * 0.82 * (bottom - top) / (right - left) + 0.9, 30.0)
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="compressed")
+    canvas = FigureCanvasAgg(figure)
+    unit = "cell" if cloud.projection == "parallel" else "px"
+    figure.suptitle(f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", fontsize=10)
+    axis = figure.subplots()
+    shown = axis.imshow(
+        100 * missing.unseen, extent=_edges(cloud), interpolation="nearest", cmap="Greys", vmin=0, vmax=100
+    )
+    figure.colorbar(shown, ax=axis, shrink=0.6).set_label("frames without a return, %", fontsize=8)
+    rows, columns = (
+        np.arange(n) + first
+        for n, first in zip(missing.outline.shape, (cloud.region.row0, cloud.region.col0), strict=True)
+    )
+    if min(missing.outline.shape) > 1 and not missing.outline.all():
+        axis.contour(columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8)
+    axis.set(xlabel=f"u, {unit}", ylabel=f"v, {unit}", xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    canvas.draw()
+    marks = (m for m, one in zip(_marks(cloud, detections), detections, strict=True) if one.kind == "no return")
+    _draw_marks(axis, tuple(marks))
+    figure.set_layout_engine("none")
+    canvas.print_png(str(path))
+
+
 def _shown(cloud: Cloud, evidence: Evidence) -> tuple[float, float, float, float]:
     """(left, right, bottom, top) of the axes: what was judged and a twelfth of it around, within the picture."""
+    return _around(cloud, np.isfinite(evidence.residual_m))
+
+
+def _around(cloud: Cloud, part: np.ndarray) -> tuple[float, float, float, float]:
+    """Of a part (h, w) bool of the cloud's grid."""
     left, right, bottom, top = _edges(cloud)
-    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
+    rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
         return left, right, bottom, top
     region = cloud.region
