@@ -1,4 +1,5 @@
-"""Compiled passes of the automatic crop: where neighbours lie on one surface, where it bends, and its largest part."""
+"""Compiled passes of the automatic crop: where neighbours lie on one surface, where it bends, and its connected
+parts."""
 
 from __future__ import annotations
 
@@ -13,32 +14,43 @@ PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 
 
 @numba.njit(**PLAIN)
-def _is_step(points_m: np.ndarray, a: tuple[int, int], b: tuple[int, int], tilt: float, noise_m: float) -> bool:
-    """Whether z changes between two pixels by more than a surface of that tilt and noise explain, or is missing."""
-    dx = points_m[b[0], b[1], 0] - points_m[a[0], a[1], 0]
-    dy = points_m[b[0], b[1], 1] - points_m[a[0], a[1], 1]
-    dz = points_m[b[0], b[1], 2] - points_m[a[0], a[1], 2]
-    return not abs(dz) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
+def _is_step(
+    points_m: np.ndarray, a: tuple[int, int], b: tuple[int, int], tilt: float, noise_m: float, central: bool
+) -> bool:
+    """Whether z changes between two pixels by more than a surface of that tilt and noise explain, or is missing.
+
+    ``central``: the way across is measured between the two rays at the nearer depth, so that a step in depth, which
+    off the axis moves x and y too, does not pass for a way across.
+    """
+    za, zb = points_m[a[0], a[1], 2], points_m[b[0], b[1], 2]
+    xa, ya, xb, yb = points_m[a[0], a[1], 0], points_m[a[0], a[1], 1], points_m[b[0], b[1], 0], points_m[b[0], b[1], 1]
+    if central:
+        nearer = min(za, zb)
+        dx, dy = nearer * (xb / zb - xa / za), nearer * (yb / zb - ya / za)
+    else:
+        dx, dy = xb - xa, yb - ya
+    return not abs(zb - za) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
 
 
 @numba.njit(**PLAIN)
-def links(points_m: np.ndarray, tilt: float, noise_m: float) -> tuple[np.ndarray, np.ndarray]:
+def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> tuple[np.ndarray, np.ndarray]:
     """Whether each of pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h, w)."""
     h, w = points_m.shape[:2]
     right, down = np.zeros((h, w), dtype=np.bool_), np.zeros((h, w), dtype=np.bool_)
     for r in range(h):
         for c in range(w):
             if c + 1 < w:
-                right[r, c] = not _is_step(points_m, (r, c), (r, c + 1), tilt, noise_m)
+                right[r, c] = not _is_step(points_m, (r, c), (r, c + 1), tilt, noise_m, central)
             if r + 1 < h:
-                down[r, c] = not _is_step(points_m, (r, c), (r + 1, c), tilt, noise_m)
+                down[r, c] = not _is_step(points_m, (r, c), (r + 1, c), tilt, noise_m, central)
     return right, down
 
 
 @numba.njit(**PLAIN)
-def largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(h, w) bool: the largest set of nodes (h, w) that are joined by links to the right and downwards (both (h, w)),
-    of equal ones the first in the order of the pixels."""
+def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sets of nodes (h, w) that are joined by links to the right and downwards (both (h, w)): (h, w) the number of
+    each pixel's set, 0 for none and for sets of fewer than ``least`` pixels; and their sizes, largest first, of equal
+    ones the first in the order of the pixels. Set number i has the size ``sizes[i - 1]``."""
     h, w = nodes.shape
     parents = np.arange(h * w)
     for r in range(h):
@@ -51,18 +63,22 @@ def largest_component(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) ->
             if r > 0 and nodes[r - 1, c] and down[r - 1, c]:
                 ours, theirs = root_of(parents, r * w + c), root_of(parents, (r - 1) * w + c)
                 parents[max(ours, theirs)] = min(ours, theirs)
-    sizes = np.zeros(h * w, dtype=np.int64)
+    counts = np.zeros(h * w, dtype=np.int64)
     for i in range(h * w):
         # a parent comes before its children: one step leads to the root
         parents[i] = parents[parents[i]]
         if nodes[i // w, i % w]:
-            sizes[parents[i]] += 1
-    largest = np.argmax(sizes)
-    inside = np.zeros((h, w), dtype=np.bool_)
-    for r in range(h):
-        for c in range(w):
-            inside[r, c] = nodes[r, c] and parents[r * w + c] == largest
-    return inside
+            counts[parents[i]] += 1
+    roots = np.flatnonzero(counts >= max(least, 1))
+    roots = roots[np.argsort(-counts[roots], kind="mergesort")]
+    number = np.zeros(h * w, dtype=np.int32)
+    for i in range(len(roots)):
+        number[roots[i]] = i + 1
+    numbers = np.zeros((h, w), dtype=np.int32)
+    for i in range(h * w):
+        if nodes[i // w, i % w]:
+            numbers[i // w, i % w] = number[parents[i]]
+    return numbers, counts[roots]
 
 
 @numba.njit(**PLAIN)

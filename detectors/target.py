@@ -1,0 +1,327 @@
+"""Which of a view's smooth surfaces is the target: the nearest large one, and how sure that is.
+
+Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
+through its hole, or they only meet. Each comparison gives odds that the one and not the other is the target; the
+surface with the best odds is proposed, and where some of them are poor, the choice is called doubtful. The odds are a
+model of how people take pictures of a target, not a measured rate; the constants below state it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from detectors.smooth_surfaces import Surfaces, holes_filled, inset, nearest_pixel, raster, smooth_surfaces
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.units import MM
+
+DOUBTFUL_BELOW = 0.8
+"""Probability of a comparison below which the choice is called doubtful."""
+CENTRE_SPREAD = 0.25
+"""Of the picture's width and height: standard deviation of the weight that pixels have. People aim at the target."""
+LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
+"""Weight in the view at which a thing is as likely the target as the surface that it lies on, or stands far before."""
+OBSTACLE_AREA = 0.2
+"""Area, as a part of that of a target seen whole behind it, at which a thing before it is as likely the target."""
+GRAZING = 0.5
+"""Cosine of the tilt, 60 degrees, beyond which a surface counts for less: nobody inspects at a grazing angle, and the
+pixels that mix two surfaces look like a third that is seen so."""
+STEEPNESS = 2.0
+"""Odds grow with this power of weights and areas."""
+SURROUNDED = 0.7
+"""Part of its outline inside the picture that must border on a surface for a thing to lie on it."""
+BORDERING = 0.1
+"""Part of an outline from which on two surfaces are neighbours."""
+CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
+"""Surfaces nearer to one another at their common border meet there; noise of a difference widens that."""
+STEP_PART = 0.3
+"""Part of a common border that must be a step: a board's foot meets the floor that its sides stand before."""
+CUT_OFF = 0.15
+"""Part of its outline on the edge of the picture from which on a surface goes on outside of it, as walls and floors."""
+ENCLOSED = 0.9
+MOST_SAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A surface that may be the target. ``outline`` (h, w) bool on the choice's grid: its pixels and what they enclose,
+    but for other candidates that stand before it. ``distance_m``, ``nearest_m``, ``farthest_m``: median, 1st and 99th
+    percentile of z. ``extent_m``: sides of the smallest rectangle around it in its own mean plane, longer first.
+    ``share``: part of all pixels that are its own. ``weight``: the same with pixels weighted towards the centre, less at a
+    grazing angle.    ``tilt_deg``: of its mean plane's normal to the viewing axis. ``cut_off``: part of its outline on the picture's
+    edge."""
+
+    outline: np.ndarray
+    pixels: int
+    distance_m: float
+    nearest_m: float
+    farthest_m: float
+    extent_m: tuple[float, float]
+    share: float
+    weight: float
+    tilt_deg: float
+    cut_off: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``candidates``: the proposal first, then the others by their odds; ``taken``: the number, from 1, of the
+    candidate that was taken. ``mask`` (h, w) bool: valid pixels of the cloud inside its outline. ``grid``: the cloud,
+    or the raster that stands in for it, whose pixels the outlines count. ``warnings``: why the choice is doubtful."""
+
+    candidates: tuple[Candidate, ...]
+    taken: int
+    mask: np.ndarray
+    grid: Cloud
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Probability that a surface and not another is the target, and the reason for a doubt."""
+
+    probability: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Border:
+    """Where one surface borders on another. ``part``: of its outline. ``ahead``, ``back``: the parts of this border at
+    which the other lies behind, and before it, by more than `CONTACT_MM` and noise. ``behind_m``: how far behind, the
+    median of the former."""
+
+    part: float
+    ahead: float
+    back: float
+    behind_m: float
+
+    @property
+    def stands_before(self) -> bool:
+        """Whether the border is a step behind which the other lies."""
+        return self.ahead >= STEP_PART and self.ahead > 2.0 * self.back
+
+
+# ---------------------------------------------------------------- the choice
+
+
+def propose(cloud: Cloud, crease_deg: float, smooth_px: int, inset_px: int, wanted: int | None) -> Choice:
+    """The target of a cloud with a valid point: the proposal, or candidate number ``wanted``.
+
+    Raises UserError, with the candidates, where there is none of that number.
+    """
+    if cloud.organised:
+        surfaces = smooth_surfaces(cloud, crease_deg, smooth_px)
+        candidates, warnings = choose(surfaces, cloud, wanted)
+        taken = _taken(candidates, wanted)
+        mask = candidates[taken - 1].outline & cloud.valid if candidates else np.zeros(cloud.valid.shape, bool)
+        return Choice(candidates, taken, inset(mask, inset_px), cloud, warnings)
+    grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
+    surfaces = smooth_surfaces(grid, crease_deg, max(3, 2 * round(smooth_px / spacings / 2) - 1))
+    candidates, warnings = choose(surfaces, grid, wanted)
+    taken = _taken(candidates, wanted)
+    kept = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    if inset_px:
+        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        kept = inset(kept, math.ceil((inset_px - 1) / spacings) + 1)
+    mask = cloud.valid.copy()
+    mask[mask] = kept[rows, columns]
+    return Choice(candidates, taken, mask, grid, warnings)
+
+
+def _taken(candidates: tuple[Candidate, ...], wanted: int | None) -> int:
+    if wanted is None or wanted <= len(candidates):
+        return wanted or 1
+    known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+    raise UserError(
+        f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
+        legal=f"1 to {len(candidates)}:{known}" if candidates else "none",
+        fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
+    )
+
+
+def choose(surfaces: Surfaces, grid: Cloud, wanted: int | None) -> tuple[tuple[Candidate, ...], tuple[str, ...]]:
+    """The candidates, best odds first, and what makes the first doubtful (nothing where the user chose)."""
+    count = len(surfaces.own)
+    described = [_described(surfaces, grid, number) for number in range(count)]
+    borders = [_borders(surfaces, grid, number) for number in range(count)]
+    judged = [
+        [_judged(described, borders, surfaces, i, j) if i != j else Judgement(1.0, "") for j in range(count)]
+        for i in range(count)
+    ]
+    odds = [sum(math.log(each.probability) for each in row) for row in judged]
+    order = sorted(range(count), key=lambda number: (-odds[number], number))
+    candidates = tuple(_without_others(described, judged, borders, surfaces, number) for number in order)
+    if wanted is not None or not order:
+        return candidates, ()
+    against = {place: judged[order[0]][other] for place, other in enumerate(order[1:], start=2)}
+    doubts = {place: each.reason for place, each in against.items() if each.probability < DOUBTFUL_BELOW}
+    if not doubts:
+        return candidates, ()
+    reasons = "; ".join(f"{reason} (--target {place} takes the other)" for place, reason in doubts.items())
+    return candidates, (f"it is doubtful which surface is the target: {reasons}",)
+
+
+def described_text(candidate: Candidate) -> str:
+    """Distance, extent, share of the view and tilt in words."""
+    long, short = (f"{side / MM:.3g}" for side in candidate.extent_m)
+    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f}"
+    return (
+        f"{candidate.distance_m:.2f} m away ({depths} m), {long} x {short} mm, {100 * candidate.share:.2g} % of the"
+        f" view, tilted by {candidate.tilt_deg:.0f} degrees"
+    )
+
+
+# ---------------------------------------------------------------- two surfaces
+
+
+def _judged(
+    described: list[Candidate], borders: list[dict[int, Border]], surfaces: Surfaces, i: int, j: int
+) -> Judgement:
+    """Whether surface i and not j is the target."""
+    ahead = _front_judgement(described, borders, surfaces, i, j)
+    if ahead is not None:
+        return ahead
+    behind = _front_judgement(described, borders, surfaces, j, i)
+    if behind is not None:
+        return Judgement(1.0 - behind.probability, behind.reason)
+    return _side_by_side(described[i], described[j])
+
+
+def _front_judgement(
+    described: list[Candidate], borders: list[dict[int, Border]], surfaces: Surfaces, front: int, back: int
+) -> Judgement | None:
+    """Whether ``front`` is the target, where it stands before ``back``; None where it does not."""
+    ours = borders[front].get(back)
+    if ours is None or not ours.stands_before:
+        return None
+    it, other = described[front], described[back]
+    if _encloses(surfaces, front, back):
+        seen = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
+        probability = _probability(0.5 / max(seen, 1e-6))
+        return Judgement(probability, "a surface is seen through a large opening of another")
+    if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
+        why = f"a thing that covers {100 * it.share:.2g} % of the view lies on a larger surface, or is fixed before it"
+        return Judgement(_probability(it.weight / LYING_WEIGHT), why)
+    if other.cut_off < CUT_OFF:
+        ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+        why = f"a thing that covers {100 * it.share:.2g} % of the view stands before a surface that is seen whole"
+        return Judgement(_probability(ratio / OBSTACLE_AREA), why)
+    why = f"the nearer surface covers only {100 * it.share:.2g} % of the view"
+    return Judgement(_probability(it.weight / STANDING_WEIGHT), why)
+
+
+def _side_by_side(it: Candidate, other: Candidate) -> Judgement:
+    """Of two that meet, or have nothing to do with one another: weight, a frontal view and nearness count."""
+    ratio = it.weight / max(other.weight, 1e-9)
+    facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+    near = other.distance_m / max(it.distance_m, 1e-6)
+    return Judgement(_probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near")
+
+
+def _probability(odds_base: float) -> float:
+    odds = max(odds_base, 1e-9) ** STEEPNESS
+    return min(max(odds / (1.0 + odds), 1e-4), 1.0 - 1e-4)
+
+
+def _encloses(surfaces: Surfaces, outer: int, inner: int) -> bool:
+    own = surfaces.own[inner]
+    inside = np.count_nonzero(own & surfaces.filled[outer])
+    return inside >= ENCLOSED * np.count_nonzero(own)
+
+
+# ---------------------------------------------------------------- one surface
+
+
+def _described(surfaces: Surfaces, grid: Cloud, number: int) -> Candidate:
+    own = surfaces.own[number]
+    places = np.flatnonzero(own)
+    some = grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
+    near, median, far = np.quantile(some[:, 2], (0.01, 0.5, 0.99)).tolist()
+    centred = some - some.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    facing = min(abs(float(axes[2, 0])), 1.0)
+    return Candidate(
+        outline=surfaces.filled[number],
+        pixels=len(places),
+        distance_m=median,
+        nearest_m=near,
+        farthest_m=far,
+        extent_m=_extent_m(centred @ axes[:, 1:]),
+        share=len(places) / own.size,
+        weight=_centre_weight(own) * min(1.0, (facing / GRAZING) ** 2),
+        tilt_deg=math.degrees(math.acos(facing)),
+        cut_off=_cut_off(surfaces.filled[number], grid),
+    )
+
+
+def _extent_m(plan_m: np.ndarray) -> tuple[float, float]:
+    """(longer, shorter) side of the smallest rectangle around places (n, 2), without the outermost hundredth."""
+    turn = math.radians(float(cv2.minAreaRect(plan_m.astype(np.float32))[2]))
+    along = plan_m @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    low, high = np.quantile(along, (0.005, 0.995), axis=0)
+    short, long = sorted(((high - low) / 0.99).tolist())
+    return long, short
+
+
+def _centre_weight(mask: np.ndarray) -> float:
+    """Part of the picture that the mask (h, w) holds, its pixels weighted by a Gaussian about the centre."""
+    row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in mask.shape)
+    return float(row @ mask @ column / (row.sum() * column.sum()))
+
+
+def _cut_off(filled: np.ndarray, grid: Cloud) -> float:
+    """Part of the outline that lies on the picture's edge; without a pixel grid, beyond which no point lies."""
+    inner = cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    outline = filled & ~inner
+    if grid.organised:
+        edge = np.ones(filled.shape, dtype=bool)
+        edge[1:-1, 1:-1] = False
+    else:
+        seen = cv2.dilate(grid.valid.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        edge = cv2.dilate((~holes_filled(seen)).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return float(np.count_nonzero(outline & edge) / max(np.count_nonzero(outline), 1))
+
+
+def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, Border]:
+    """The surfaces beyond this one's outline, by number."""
+    filled, own = surfaces.filled[number], surfaces.own[number]
+    apart, nearest = nearest_pixel(own)
+    ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~filled)
+    z, seeds = grid.points_m[..., 2].reshape(-1), nearest.reshape(-1)
+    outline = len(np.unique(seeds[ring]))
+    limit = max(CONTACT_MM * MM, CONTACT_SIGMAS * surfaces.noise_m)
+    found = {}
+    for other in range(len(surfaces.own)):
+        there = ring[surfaces.own[other].reshape(-1)[ring]]
+        part = len(np.unique(seeds[there])) / max(outline, 1)
+        if other != number and part >= BORDERING:
+            steps = z[there] - z[seeds[there]]
+            behind = steps[steps > limit]
+            away = float(np.median(behind)) if len(behind) else 0.0
+            found[other] = Border(part, len(behind) / len(steps), float((steps < -limit).mean()), away)
+    return found
+
+
+def _without_others(
+    described: list[Candidate],
+    judged: list[list[Judgement]],
+    borders: list[dict[int, Border]],
+    surfaces: Surfaces,
+    number: int,
+) -> Candidate:
+    """The candidate without what it encloses and what stands before it as a target of its own; a thing that lies on it
+    stays."""
+    outline = described[number].outline
+    kernel = np.ones((3, 3), np.uint8)
+    for other in range(len(described)):
+        border = borders[other].get(number)
+        if border is None or not border.stands_before or judged[other][number].probability < 0.5:
+            continue
+        if _encloses(surfaces, number, other):
+            grown = cv2.dilate(surfaces.filled[other].astype(np.uint8), kernel, iterations=surfaces.reach_px) > 0
+            outline = outline & ~grown
+    return replace(described[number], outline=outline)
