@@ -27,12 +27,18 @@ BRIDGED_PX = 2
 random, chains of neighbours would break."""
 SMOOTH_MM = 16.0
 """Width of the window on a coarse grid: a step of 15 mm must still bend the smoothed surface sharply."""
+MIXED_PX = 3
+"""Bends are judged across at least twice so many pixels, where that is no more than 24 mm."""
 NORMAL_NOISE = 0.06
 """Radians: so noisy may the slope of the smoothed surface be at most; a noisier cloud takes a wider window."""
 WIDEST_SMOOTH_PX = 41
 LEAST_SHARE, LEAST_PX = 0.004, 100
 """Of all pixels, and pixels: a smaller surface is no candidate. A board of 150 x 100 mm at 1.5 m holds 0.5 % of an
 Azure Kinect's view."""
+LEAST_SHARED_PX = 10
+"""Pixels that the rims of two surfaces must share to be judged as one."""
+CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
+"""Surfaces nearer to one another at a common border meet there; noise of a difference widens that."""
 MOST_SURFACES = 8
 WIDE_PART = 0.1
 """Of a surface's pixels: so many must be the middle of a full smoothing window of its own. The smoothing makes a ramp
@@ -68,6 +74,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     noise_m = _step_noise(cloud)
     pitch_m = _pitch(points)
     window = _window_px(pitch_m, noise_m, smooth_px)
+    # a camera that interpolates spreads a step over some pixels: on a coarse grid, more than the window
+    half = max(window // 2, min(MIXED_PX, int(0.75 * SMOOTH_MM * MM / pitch_m)) if pitch_m else 0, 1)
     smooth = _smoothed(points, valid, window)
     central = sees_from_origin(cloud)
     if noise_m <= pitch_m:
@@ -77,17 +85,19 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         known = np.where(valid[..., None], smooth, np.nan)
         right, down = kernels.links(known, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
     normals = kernels.unit_normals(smooth)
-    bends = kernels.turns(normals, max(window // 2, 1), math.cos(math.radians(crease_deg)))
+    bends = kernels.turns(normals, half, math.cos(math.radians(crease_deg)))
     cores, sizes = kernels.components(valid & ~bends, right, down, 1)
     count = _number_large(cores, sizes, max(LEAST_PX, int(LEAST_SHARE * valid.size)), window)
-    reach = 2 * (window // 2) + 1
+    reach = window // 2 + 1 + half
     own = np.zeros((count, *valid.shape), dtype=bool)
     for number in range(1, count + 1):
         own[number - 1] = _with_rim(cores, number, valid, right, down, reach)
-    _share_contested(own, cores, Smooth(points, smooth, normals, central))
+    local = Smooth(points, smooth, normals, central)
+    own = _joined(own, cores, local, max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m), math.radians(crease_deg / 2.0))
+    _share_contested(own, cores, local)
     filled = np.zeros_like(own)
-    for number in range(count):
-        filled[number] = holes_filled(own[number])
+    for number, each in enumerate(own):
+        filled[number] = holes_filled(each)
     return Surfaces(own & cloud.valid, filled, noise_m, reach)
 
 
@@ -223,6 +233,28 @@ def _with_rim(
     numbers, _ = kernels.components(free, right, down, 1)
     whole: np.ndarray = core | (numbers == 1)
     return whole
+
+
+def _joined(own: np.ndarray, cores: np.ndarray, smooth: Smooth, apart_m: float, turn: float) -> np.ndarray:
+    """``own`` with surfaces made one, in ``cores`` too, where the rims of two hold the same pixels and each one's plane
+    goes on into the other's: a row of holes, or a strip lying across a board, parts its core and not the board.
+    ``apart_m`` and ``turn`` (radians): the most by which the planes may differ."""
+    stays = np.arange(len(own))
+    for i in range(len(own)):
+        for j in range(i + 1, len(own)):
+            pixels = np.flatnonzero(own[i] & own[j])
+            if len(pixels) < LEAST_SHARED_PX or stays[i] == stays[j]:
+                continue
+            seeds = [nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels] for number in (i, j)]
+            misses = np.maximum(*(smooth.misses_m(pixels, each) for each in seeds))
+            cosines = np.prod([smooth.normals.reshape(-1, 3)[each] for each in seeds], axis=0).sum(axis=1)
+            if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
+                stays[stays == stays[j]] = stays[i]
+    kept = np.unique(stays)
+    numbers = np.zeros(max(len(own), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
+    numbers[1 : len(own) + 1] = np.searchsorted(kept, stays) + 1
+    cores[:] = numbers[cores]
+    return np.array([own[stays == each].any(axis=0) for each in kept]) if len(own) else own
 
 
 def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: Smooth) -> None:

@@ -14,7 +14,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from detectors.smooth_surfaces import Surfaces, holes_filled, inset, nearest_pixel, raster, smooth_surfaces
+from detectors.smooth_surfaces import (
+    CONTACT_MM,
+    CONTACT_SIGMAS,
+    Surfaces,
+    holes_filled,
+    inset,
+    nearest_pixel,
+    raster,
+    smooth_surfaces,
+)
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import MM
@@ -36,8 +45,6 @@ SURROUNDED = 0.7
 """Part of its outline inside the picture that must border on a surface for a thing to lie on it."""
 BORDERING = 0.1
 """Part of an outline from which on two surfaces are neighbours."""
-CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
-"""Surfaces nearer to one another at their common border meet there; noise of a difference widens that."""
 STEP_PART = 0.3
 """Part of a common border that must be a step: a board's foot meets the floor that its sides stand before."""
 CUT_OFF = 0.15
@@ -48,12 +55,14 @@ MOST_SAMPLES = 20_000
 
 @dataclass(frozen=True)
 class Candidate:
-    """A surface that may be the target. ``outline`` (h, w) bool on the choice's grid: its pixels and what they enclose,
-    but for other candidates that stand before it. ``distance_m``, ``nearest_m``, ``farthest_m``: median, 1st and 99th
-    percentile of z. ``extent_m``: sides of the smallest rectangle around it in its own mean plane, longer first.
-    ``share``: part of all pixels that are its own. ``weight``: the same with pixels weighted towards the centre, less at a
-    grazing angle.    ``tilt_deg``: of its mean plane's normal to the viewing axis. ``cut_off``: part of its outline on the picture's
-    edge."""
+    """A surface that may be the target.
+
+    ``outline`` (h, w) bool on the choice's grid: its pixels and what they enclose, but for other candidates that stand
+    before it. ``distance_m``, ``nearest_m``, ``farthest_m``: median, 1st and 99th percentile of z. ``extent_m``: sides
+    of the smallest rectangle around it in its own mean plane, longer first. ``share``: part of all pixels that are its
+    own. ``weight``: the same with pixels weighted towards the centre, less at a grazing angle. ``tilt_deg``: of its
+    mean plane's normal to the viewing axis. ``cut_off``: part of its outline on the picture's edge.
+    """
 
     outline: np.ndarray
     pixels: int
@@ -102,7 +111,7 @@ class Border:
     @property
     def stands_before(self) -> bool:
         """Whether the border is a step behind which the other lies."""
-        return self.ahead >= STEP_PART and self.ahead > 2.0 * self.back
+        return bool(self.ahead >= STEP_PART and self.ahead > 2.0 * self.back)
 
 
 # ---------------------------------------------------------------- the choice
@@ -167,11 +176,12 @@ def choose(surfaces: Surfaces, grid: Cloud, wanted: int | None) -> tuple[tuple[C
 
 def described_text(candidate: Candidate) -> str:
     """Distance, extent, share of the view and tilt in words."""
-    long, short = (f"{side / MM:.3g}" for side in candidate.extent_m)
-    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f}"
+    long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
+    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f} m"
+    share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
     return (
-        f"{candidate.distance_m:.2f} m away ({depths} m), {long} x {short} mm, {100 * candidate.share:.2g} % of the"
-        f" view, tilted by {candidate.tilt_deg:.0f} degrees"
+        f"{candidate.distance_m:.2f} m away ({depths}), {long} x {short} mm, {share} % of the view, tilted by"
+        f" {candidate.tilt_deg:.0f} degrees"
     )
 
 
@@ -229,8 +239,8 @@ def _probability(odds_base: float) -> float:
 
 def _encloses(surfaces: Surfaces, outer: int, inner: int) -> bool:
     own = surfaces.own[inner]
-    inside = np.count_nonzero(own & surfaces.filled[outer])
-    return inside >= ENCLOSED * np.count_nonzero(own)
+    inside, whole = int(np.count_nonzero(own & surfaces.filled[outer])), int(np.count_nonzero(own))
+    return inside >= ENCLOSED * whole
 
 
 # ---------------------------------------------------------------- one surface
@@ -283,7 +293,7 @@ def _cut_off(filled: np.ndarray, grid: Cloud) -> float:
     else:
         seen = cv2.dilate(grid.valid.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         edge = cv2.dilate((~holes_filled(seen)).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    return float(np.count_nonzero(outline & edge) / max(np.count_nonzero(outline), 1))
+    return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
 
 def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, Border]:

@@ -46,8 +46,9 @@ def _parser() -> argparse.ArgumentParser:
         "--out",
         type=Path,
         metavar="DIR",
-        help="write findings.csv, findings.json, annotated.png, blind.png (where nothing returned) and cloud.ply here;"
-        " of several views merged.ply, registrations.json and view3d.html (turns in the browser) too",
+        help="write findings.csv, findings.json, annotated.png, targets.png (the surfaces to choose from), blind.png"
+        " (where nothing returned) and cloud.ply here; of several views merged.ply, registrations.json and view3d.html"
+        " (turns in the browser) too",
     )
     add(
         "--unit",
@@ -62,8 +63,15 @@ def _parser() -> argparse.ArgumentParser:
         "--crop",
         default="auto",
         metavar="KIND",
-        help=f"which part is the target: {LEGAL_CROP}; default auto, the largest surface less the 3 pixels of its rim"
-        " where the camera mixes in what is behind (depth aligned to a finer colour camera: --set crop.inset_px=8)",
+        help=f"which part is the target: {LEGAL_CROP}; default auto, the nearest large smooth surface less the 3 pixels"
+        " of its rim where the camera mixes in what is behind (depth aligned to a finer colour camera:"
+        " --set crop.inset_px=8)",
+    )
+    add(
+        "--target",
+        type=_number,
+        metavar="N",
+        help="with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows",
     )
     add("--detector", default="thesis", help="detector's name (default: thesis)")
     add(
@@ -79,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         default="mean",
         help="how frames are averaged (default: mean)",
     )
-    add("--max-frames", type=_count, metavar="N", help="use the first N frames only")
+    add("--max-frames", type=_number, metavar="N", help="use the first N frames only")
     add("--threshold", type=float, metavar="K", help=f"threshold in units of score (default {DEFAULT_K:g})")
     add(
         "--quiet-capture",
@@ -96,9 +104,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of frames: 1 or more")
+def _number(text: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of 1 or more")
     return int(text)
 
 
@@ -113,6 +121,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _inspect_capture(arguments: argparse.Namespace) -> int:
     from harness.inspection import printed
+    from harness.inspection.target import choice_by, choice_facts, pictures, print_choice
     from harness.report.findings import write_findings
 
     detector, settings = steps.detector_of(arguments, arguments.crop, arguments.set)
@@ -122,10 +131,12 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
     if arguments.frames_report:
         printed.print_frames(recording)
     cloud = steps.averaged(arguments, recording)
+    choice = choice_by(getattr(detector, "settings", None), cloud)
     evidence = detector.analyse(cloud)
     threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
     judged = steps.judged(detector, cloud, evidence, threshold)
-    printed.print_warnings((*recording.warnings, *evidence.warnings))
+    printed.print_warnings((*recording.warnings, *(choice.warnings if choice else ()), *evidence.warnings))
+    print_choice(choice)
     printed.print_capture(recording, cloud, evidence, arguments.crop)
     if judged.missing is not None:
         print(judged.missing.blind_text)
@@ -133,8 +144,9 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
     printed.print_findings(judged.findings)
     if arguments.out is not None:
         about = _about(arguments, recording, quiet, judged, detector, settings, threshold, origin)
+        about = {"target": choice_facts(choice), **about}
         title = f"{recording.name}: {len(judged.detections)} findings beyond {printed.beyond_text(threshold, evidence)}"
-        for path in write_findings(arguments.out, judged, about, title):
+        for path in write_findings(arguments.out, judged, about, title, beside=pictures(choice)):
             print(f"wrote {path}")
     return 0
 

@@ -147,7 +147,7 @@ def _board(random, scene, distance=None, most_tilt=35.0, size=None, holes=True):
     distance = random.uniform(0.5, 1.0) if distance is None else distance
     size = size or (random.uniform(0.2, 0.45), random.uniform(0.15, 0.35))
     centre = np.array([*_pair(random, -0.06, 0.06), distance])
-    some = tuple((*_pair(random, -0.06, 0.06), random.uniform(0.002, 0.03)) for _ in range(3)) if holes else ()
+    some = tuple((*_pair(random, -0.06, 0.06), random.uniform(0.002, 0.02)) for _ in range(3)) if holes else ()
     normal = tilted(random, most_tilt)
     scene.board(1, centre, normal, size, random.uniform(-15, 15), some)
     return centre, normal, size
@@ -270,6 +270,15 @@ def board_beyond_the_view(random, scene):
     scene.wall(0, away + random.uniform(0.2, 1.0))
 
 
+def two_boards(random, scene):
+    """Alike, side by side: either may be meant."""
+    away = random.uniform(0.7, 0.9)
+    for number, side in ((1, -1.0), (2, 1.0)):
+        place = [side * random.uniform(0.14, 0.16), random.uniform(-0.03, 0.03), away + random.uniform(0, 0.04)]
+        scene.board(number, place, tilted(random, 10), (0.22, 0.26))
+    scene.wall(0, away + random.uniform(0.3, 1.0))
+
+
 def only_a_wall(random, scene):
     scene.wall(1, random.uniform(0.5, 1.5), tilted(random, 30))
 
@@ -283,7 +292,7 @@ SCENES = {
     for f in (
         board_before_wall, board_close_before_wall, board_on_floor, object_on_plate, object_on_board_before_wall,
         plate_with_large_holes, pipe, sphere, bent_sheet, box_in_front, hand_in_front, board_beyond_the_view,
-        only_a_wall, board_alone,
+        two_boards, only_a_wall, board_alone,
     )
 }  # fmt: skip
 """Each puts its target in as surface 1."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detectors.crop_kernels import largest_component, links, turns, unit_normals
+from detectors.crop_kernels import components, links, turns, unit_normals
 from detectors.median import median_of, median_size_of, quantile_of
 
 
@@ -22,49 +22,63 @@ def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
 
 
 def by_picture(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The largest component by labelling a picture in which every link is a pixel of its own."""
+    """The components' numbers by labelling a picture in which every link is a pixel of its own."""
     h, w = nodes.shape
     picture = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
     picture[::2, ::2] = nodes
     picture[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
     picture[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
-    labels = cv2.connectedComponents(picture, connectivity=4)[1][::2, ::2]
-    sizes = np.bincount(labels[nodes], minlength=2)
-    sizes[0] = 0
-    return (labels == int(np.argmax(sizes))) & nodes
+    labels: np.ndarray = cv2.connectedComponents(picture, connectivity=4)[1][::2, ::2]
+    return np.where(nodes, labels, 0)
 
 
+@pytest.mark.parametrize("central", [False, True])
 @pytest.mark.parametrize("seed", range(5))
-def test_links_are_steps_within_tilt_and_noise(seed: int) -> None:
+def test_links_are_steps_within_tilt_and_noise(seed: int, central: bool) -> None:
     points = rough_points(seed)
-    right, down = links(points, 6.0, 3e-3)
+    right, down = links(points, 6.0, 3e-3, central)
     for found, there, here in (
         (right[:, :-1], points[:, 1:], points[:, :-1]),
         (down[:-1], points[1:], points[:-1]),
     ):
-        step = there - here
         with np.errstate(invalid="ignore"):
-            expected = np.abs(step[..., 2]) <= 6.0 * np.hypot(step[..., 0], step[..., 1]) + 3e-3
+            across = there[..., :2] - here[..., :2]
+            if central:
+                between_rays = there[..., :2] / there[..., 2:] - here[..., :2] / here[..., 2:]
+                across = np.minimum(there[..., 2:], here[..., 2:]) * between_rays
+            step = np.abs(there[..., 2] - here[..., 2])
+            expected = step <= 6.0 * np.hypot(across[..., 0], across[..., 1]) + 3e-3
         np.testing.assert_array_equal(found, expected)
         assert expected.any() and not expected.all()
     assert not right[:, -1].any() and not down[-1].any()
 
 
+def test_a_step_far_off_the_axis_is_a_step() -> None:
+    """The ray to the farther point leads away from the axis: that is no way across the surface."""
+    z = np.array([[0.7, 1.3]])
+    points = np.stack([z * [[0.400, 0.402]], 0 * z, z], axis=-1)
+    assert links(points, 6.0, 3e-3, central=False)[0][0, 0]
+    assert not links(points, 6.0, 3e-3, central=True)[0][0, 0]
+
+
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), share=st.sampled_from([0.3, 0.6, 0.9]))
-def test_the_largest_component_is_that_of_a_labelled_picture(seed: int, share: float) -> None:
+@given(seed=st.integers(0, 10_000), share=st.sampled_from([0.3, 0.6, 0.9]), least=st.sampled_from([1, 4]))
+def test_the_components_are_those_of_a_labelled_picture(seed: int, share: float, least: int) -> None:
     random = np.random.default_rng(seed)
     nodes, right, down = random.random((3, 9, 13)) < share
-    found, expected = largest_component(nodes, right, down), by_picture(nodes, right, down)
-    # of two that are equally large either may be called the largest
-    assert found.sum() == expected.sum()
-    if not np.array_equal(found, expected):
-        assert not (found & expected).any()
+    found, sizes = components(nodes, right, down, least)
+    expected = by_picture(nodes, right, down)
+    counts = np.bincount(expected[nodes]) if nodes.any() else np.zeros(1, int)
+    assert sizes.tolist() == sorted((n for n in counts.tolist() if n >= least), reverse=True)
+    for number, size in enumerate(sizes, start=1):
+        assert (found == number).sum() == size
+        assert len(set(expected[found == number].tolist())) == 1
 
 
 def test_no_node_has_no_component() -> None:
     nothing = np.zeros((4, 5), dtype=bool)
-    assert not largest_component(nothing, ~nothing, ~nothing).any()
+    found, sizes = components(nothing, ~nothing, ~nothing, 1)
+    assert not found.any() and not len(sizes)
 
 
 @pytest.mark.parametrize("half", [1, 4])

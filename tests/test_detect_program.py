@@ -49,6 +49,57 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
+# ---- which surface is the target -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def before_wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board of 300 x 240 mm with a hole of 40 mm before a wall, as 16-bit images."""
+    from target_scenes import Scene
+
+    scene = Scene("pico")
+    scene.board(1, [0.0, 0.0, 0.5], [0.1, 0.0, -1.0], (0.3, 0.24), holes=((0.05, 0.03, 0.02),))
+    scene.wall(0, 1.2)
+    folder = tmp_path_factory.mktemp("captures") / "before_wall"
+    (folder / "depth").mkdir(parents=True)
+    random = np.random.default_rng(0)
+    for number in range(4):
+        z = scene.cloud(random, 1e-3, mix_px=1).points_m[..., 2]
+        cv2.imwrite(str(folder / "depth" / f"{number:05d}.png"), np.round(1e3 * z).astype(np.uint16))
+    lens = scene.lens
+    stated = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "width": 160, "height": 120}
+    (folder / "intrinsic.json").write_text(json.dumps(stated))
+    return folder
+
+
+def test_it_says_first_what_it_took_and_how_to_take_another(
+    before_wall: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert detect.main([str(before_wall), "--out", str(tmp_path / "out")]) == 0
+    first, second = capsys.readouterr().out.splitlines()[:2]
+    assert (
+        first.startswith("target 1 of 2: 0.50 m away (0.49 to 0.51 m), 30") and " % of the view, tilted by 6" in first
+    )
+    assert second.startswith("  instead, with --target 2: 1.20 m away (1.20 to 1.20 m), ")
+    told = json.loads((tmp_path / "out" / "findings.json").read_text())["target"]
+    assert told["taken"] == 1 and [each["number"] for each in told["candidates"]] == [1, 2]
+    assert told["candidates"][0]["extent_mm"] == pytest.approx([300, 240], abs=8)
+    picture = cv2.imread(str(tmp_path / "out" / "targets.png"))
+    assert (picture == (255, 0, 255)).all(axis=-1).sum() > 1000
+    assert [row["kind"] for row in rows_of(tmp_path / "out" / "findings.csv")] == ["hole"]
+    assert detect.main([str(before_wall), "--target", "2"]) == 0
+    first, second = capsys.readouterr().out.splitlines()[:2]
+    assert first.startswith("target 2 of 2: 1.20 m away") and second.startswith("  instead, with --target 1: 0.50 m")
+
+
+def test_a_target_that_is_not_there_is_refused_with_those_that_are(
+    before_wall: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = failed(capsys, before_wall, "--target", "3")
+    assert "there are 2 large smooth surfaces" in message and "--target 1: 0.50 m" in message
+    assert "another crop" in failed(capsys, before_wall, "--target", "1", "--crop", "none")
+
+
 # ---- what it finds ---------------------------------------------------------------------------------------------------
 
 
@@ -61,7 +112,7 @@ def test_it_finds_the_hole_and_writes_everything(
     assert "4 frames averaged" in said
     assert "left out: depth/00002.png: the whole range jumps by +18" in said
     assert "not calibrated" in said
-    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, "targets.png"))
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
     assert header == "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,findings_version\n"
@@ -142,7 +193,7 @@ def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
 ) -> None:
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--out", str(tmp_path / "out")]) == 0
-    assert "points lie off the largest surface or on its rim" in capsys.readouterr().out
+    assert "points lie off the target or on its rim" in capsys.readouterr().out
     (row,) = rows_of(tmp_path / "out" / "findings.csv")
     v, u = np.mgrid[: plane.LENS.height, : plane.LENS.width]
     assert int(row["points"]) == (np.hypot(u - plane.HOLE_U, v - plane.HOLE_V) < plane.HOLE_RADIUS_PX).sum()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -12,13 +13,18 @@ from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment, Point
 from harness.experiment.recorded import recording_of
 from harness.experiment.schema import CaptureSource
+from harness.inspection.printed import print_warnings
 from harness.inspection.steps import judged as judged_cloud
+from harness.inspection.target import choice_by, choice_facts, pictures
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import MM
 from harness.vocabulary.versions import RESULTS_VERSION
+
+if TYPE_CHECKING:
+    from detectors.target import Choice
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: bool) -> int:
@@ -33,9 +39,10 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
     write_text(folder / "experiment.yaml", resolved_yaml(experiment))
     rows = []
     for number, point in enumerate(experiment.points):
-        judged, threshold = _judged(point)
+        judged, threshold, choice = _judged(point)
         name = f"point-{number:03d}"
-        write_findings(folder / name, judged, _about(point, judged.cloud, threshold, command), point.label or name)
+        about = {"target": choice_facts(choice), **_about(point, judged.cloud, threshold, command)}
+        write_findings(folder / name, judged, about, point.label or name, beside=pictures(choice))
         mm = threshold * judged.evidence.scale_m / MM
         rows.append(
             {
@@ -49,6 +56,9 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
                 "findings": len(judged.findings),
             }
         )
+        print_warnings(
+            f"{name}: {warning}" for warning in (*(choice.warnings if choice else ()), *judged.evidence.warnings)
+        )
         print(f"{name} {point.label}: {len(judged.findings)} findings beyond {mm:.2f} mm")
         for left in judged.cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")
@@ -58,16 +68,17 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
     return 0
 
 
-def _judged(point: Point) -> tuple[Judged, float]:
+def _judged(point: Point) -> tuple[Judged, float, Choice | None]:
     config = point.config
     assert isinstance(config.source, CaptureSource)
     frames = config.capture.frames
     cloud = prefix_averages(recording_of(config.source), [frames], config.capture.average)[frames]
     detector = load_detector(config.detector.name, dict(config.detector.settings))
+    choice = choice_by(getattr(detector, "settings", None), cloud)
     evidence = detector.analyse(cloud)
     threshold = config.threshold.k
     assert threshold is not None  # a capture cannot be calibrated on; the experiment's checks say so
-    return judged_cloud(detector, cloud, evidence, threshold), threshold
+    return judged_cloud(detector, cloud, evidence, threshold), threshold, choice
 
 
 def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[str, object]:

@@ -46,9 +46,7 @@ def print_capture(recording: Recording, cloud: Cloud, evidence: Evidence, crop: 
     _print_kept(cloud, kept, crop)
     if not cloud.organised and crop == "auto" and kept.sum() < cloud.valid.sum():
         off = cloud.valid.sum() - kept.sum()
-        print(
-            f"note: {off} points lie off the largest surface or on its rim: not judged; --crop none judges all of them"
-        )
+        print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
     print(surface_text(cloud, evidence))
 
 

@@ -76,7 +76,7 @@ def mapping_config(arguments: argparse.Namespace) -> tuple[MappingConfig, tuple[
     from detectors.mapping.settings import MappingConfig
 
     data: dict[str, Any] = {
-        "crop": crop_from_text(arguments.crop),
+        "crop": crop_from_text(arguments.crop, arguments.target),
         "marks": {"kind": arguments.marks or MARKS[0]},
         "registration": {"method": arguments.register},
         "merge": {"kind": arguments.merge or MERGES[0]},

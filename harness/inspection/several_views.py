@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from harness.inspection import printed, steps
 from harness.inspection.poses import read_poses
 from harness.inspection.registrations import Checks, checks_of, print_registrations, registration_rows
 from harness.inspection.several_arguments import mapping_config
+from harness.inspection.target import choice_by, choice_facts, pictures, print_choice
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import MM
 from harness.vocabulary.versions import RESULTS_VERSION
@@ -23,9 +25,12 @@ if TYPE_CHECKING:
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
+    from detectors.target import Choice
     from detectors.views import PreparedView, View
     from harness.report.findings import Judged
 
+P = ParamSpec("P")
+T = TypeVar("T")
 START_FROM_MARKS = ("icp", "cpd")
 """Methods that need a place to start from. `joint` finds its own by marks, `odometry` uses none and goes from view to
 view, `nominal` has nothing but the poses."""
@@ -37,6 +42,7 @@ class Inspection:
 
     recordings: tuple[Recording, ...]
     mapped: Mapped
+    choices: tuple[Choice | None, ...]
     checks: Checks
     detector: Detector
     judged: Judged
@@ -61,9 +67,13 @@ def inspect_views(arguments: argparse.Namespace) -> int:
     guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = tuple(steps.opened(arguments, [path]) for path in paths)
     views = tuple(_view(arguments, *each) for each in zip(_names(paths), recordings, guesses, strict=True))
-    prepared = tuple(_prepared(*each, config, arguments.crop) for each in zip(recordings, views, strict=True))
+    choices = tuple(_of_view(view, choice_by, config, view.cloud) for view in views)
+    # a wrong target explains much of what may fail below
+    printed.print_warnings(_doubts(views, choices))
+    pairs = zip(recordings, views, choices, strict=True)
+    prepared = tuple(_prepared(*each, config, arguments.crop) for each in pairs)
     mapped = _mapped(prepared, config, has_poses=arguments.poses is not None)
-    inspection = _judge(arguments, recordings, mapped, checks_of(mapped, config), detector)
+    inspection = _judge(arguments, recordings, mapped, choices, checks_of(mapped, config), detector)
     _print(inspection)
     if arguments.out is not None:
         _write(arguments, inspection, config, settings)
@@ -124,19 +134,33 @@ def _mapped(prepared: tuple[PreparedView, ...], config: MappingConfig, has_poses
     return Mapped(prepared, registrations, merge(prepared, registrations, config.merge))
 
 
-def _prepared(recording: Recording, view: View, config: MappingConfig, crop: str) -> PreparedView:
+def _doubts(views: tuple[View, ...], choices: tuple[Choice | None, ...]) -> tuple[str, ...]:
+    """Why the choice of the target is doubtful, view by view."""
+    pairs = zip(views, choices, strict=True)
+    return tuple(f"view {view.name}: {warning}" for view, choice in pairs if choice for warning in choice.warnings)
+
+
+def _prepared(
+    recording: Recording, view: View, choice: Choice | None, config: MappingConfig, crop: str
+) -> PreparedView:
     """One view with its target and marks, which are told at once: they explain a registration that fails later.
 
     Raises UserError where it has no target.
     """
     from detectors.mapping.map_views import prepare
 
-    try:
-        prepared = prepare(view, config)
-    except UserError as mistake:
-        raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
+    prepared = _of_view(view, prepare, view, config)
+    print_choice(choice)
     printed.print_view(recording, prepared, crop)
     return prepared
+
+
+def _of_view(view: View, step: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+    """A step's outcome; its UserError names the view."""
+    try:
+        return step(*arguments, **named)
+    except UserError as mistake:
+        raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
 def _started_from_marks(prepared: tuple[PreparedView, ...]) -> tuple[PreparedView, ...]:
@@ -173,6 +197,7 @@ def _judge(
     arguments: argparse.Namespace,
     recordings: tuple[Recording, ...],
     mapped: Mapped,
+    choices: tuple[Choice | None, ...],
     checks: Checks,
     detector: Detector,
 ) -> Inspection:
@@ -181,7 +206,7 @@ def _judge(
     # a quiet capture was refused before
     threshold, origin = steps.threshold_of(arguments, detector, lambda: (steps.DEFAULT_K, ""))
     judged = steps.judged(detector, cloud, evidence, threshold)
-    return Inspection(recordings, mapped, checks, detector, judged, threshold, origin)
+    return Inspection(recordings, mapped, choices, checks, detector, judged, threshold, origin)
 
 
 # ---- what is told ----------------------------------------------------------------------------------------------------
@@ -221,6 +246,8 @@ def _write(
         "registrations.json": lambda path: path.write_text(plain_json(rows), encoding="utf-8"),
         "view3d.html": lambda path: write_view3d(path, scene_of(inspection.mapped, judged), title),
     }
+    for number, choice in enumerate(inspection.choices, start=1):
+        beside |= pictures(choice, f"targets-{number}.png")
     about = _about(arguments, inspection, config, settings)
     for path in write_findings(arguments.out, judged, about, title, cloud_name="merged.ply", beside=beside):
         print(f"wrote {path}")
@@ -232,12 +259,12 @@ def _about(
     """What the JSON says beside the findings."""
     judged, mapped = inspection.judged, inspection.mapped
     evidence, detector = judged.evidence, inspection.detector
-    pairs = zip(inspection.recordings, mapped.views, strict=True)
+    pairs = zip(inspection.recordings, mapped.views, inspection.choices, strict=True)
     return {
         "frame": "of the merged cloud; registrations.json says where it stands to the first view's camera",
         "captures": [
-            {"view": prepared.view.name, **steps.capture_facts(recording, prepared.view.cloud)}
-            for recording, prepared in pairs
+            {"view": view.view.name, **steps.capture_facts(recording, view.view.cloud), "target": choice_facts(choice)}
+            for recording, view, choice in pairs
         ],
         "merged": {
             "views": mapped.merged.views_used,

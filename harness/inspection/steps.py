@@ -32,22 +32,33 @@ def detector_of(
     settings: dict[str, Any] = {}
     known = detector_type(arguments.detector).settings_type
     if "crop" in known.model_fields:
-        settings["crop"] = crop_from_text(crop)
+        # of several views --crop is the mapping's, and so is --target
+        settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
+    elif arguments.target is not None:
+        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop that could take it")
     for assignment in assignments:
         assign(settings, assignment)
     detector = load_detector(arguments.detector, settings)
     return detector, known.from_data(settings).to_data()
 
 
-def crop_from_text(text: str) -> dict[str, Any]:
-    """The crop's declaration from ``auto``, ``none``, ``box:..`` or ``polygon:..``; UserError on anything else."""
+def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
+    """The crop's declaration from ``auto``, ``none``, ``box:..`` or ``polygon:..``, and which of the automatic crop's
+    candidates is meant; UserError on anything else."""
     kind, _, values = text.partition(":")
+    if target is not None and text != "auto":
+        raise UserError(
+            f"--target {target}: chooses among the surfaces that the automatic crop finds, and --crop {text} is"
+            " another crop",
+            legal="--target with --crop auto",
+            fix="leave out one of the two",
+        )
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
     except ValueError as error:
         raise UserError(f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP) from error
     if kind in ("auto", "none") and not numbers:
-        return {"kind": kind}
+        return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
         x, y, z = numbers[0:2], numbers[2:4], numbers[4:6]
         return {"kind": "box", "x_mm": x, "y_mm": y, "z_mm": z, "range_max_m": None}

@@ -20,7 +20,7 @@ RESULT_FILES = frozenset(
     | {f"{name}.parquet" for name in ("sites", "findings", "operating", "pixels")}
 )
 """What sweeps and comparisons write into a folder of results, beside its journal."""
-CAPTURE_FILES = frozenset({"findings.csv", "findings.json", "annotated.png", "blind.png", "cloud.ply"})
+CAPTURE_FILES = frozenset({"findings.csv", "findings.json", "annotated.png", "targets.png", "blind.png", "cloud.ply"})
 """What is written for each real capture."""
 OURS = b"# tofpod experiment "
 LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
