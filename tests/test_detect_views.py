@@ -92,7 +92,9 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert detect.main([*views, "--register", "marks", "--out", str(out), *SHARP]) == 0
     said = capsys.readouterr().out
     assert "marks: 5 of 5 to be relied on" in said and "merged: 3 views" in said and "loops: 1 of three views" in said
-    assert sorted(path.name for path in out.iterdir()) == FILES
+    pictures = [f"targets-{number}.png" for number in (1, 2, 3)]
+    assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, *pictures))
+    assert said.count("target 1 of 1: ") == 3
     told = json.loads((out / "registrations.json").read_text(), parse_constant=pytest.fail)
     assert [row["view"] for row in told["views"]] == ["view_0", "view_1", "view_2"] and told["reference"] == "view_0"
     assert told["results_version"] == RESULTS_VERSION
