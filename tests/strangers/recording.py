@@ -222,9 +222,10 @@ def _truth(
 ) -> Truth:
     extent = damage.radius_m + damage.length_m / 2
     along_z = float(np.percentile(np.abs(known), 90)) if known.size else abs(damage.depth_m)
-    if damage.profile == "through":
-        along_z = float(np.median(np.abs(known))) if known.size else np.inf
-    depths = sorted((abs(damage.depth_m) if damage.profile != "through" else along_z, along_z))
+    least = abs(damage.depth_m)
+    if damage.profile == "through":  # from its wall to what is behind
+        least, along_z = np.percentile(np.abs(known), [25, 98]) if known.size else (np.inf, np.inf)
+    depths = sorted((float(least), float(along_z)))
     tapered = damage.profile in ("bowl", "cosine", "cone")
     inner = (0.5 if tapered else 1.0) * 2 * damage.radius_m
     kind = "no return" if absent else "bump" if damage.depth_m < 0 else "hole"
