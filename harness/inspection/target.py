@@ -63,8 +63,11 @@ def _facts(candidate: Candidate) -> dict[str, Any]:
 
 def pictures(choice: Choice | None, name: str = PICTURE) -> dict[str, Callable[[Path], object]]:
     """The numbered picture of the candidates, by its file's name, for `harness.report.findings.write_findings`."""
+    from detectors.target import described_text
     from harness.report.targets_picture import save_targets
 
     if choice is None or not choice.candidates:
         return {}
-    return {name: lambda path: save_targets(path, choice)}
+    outlines = [candidate.outline for candidate in choice.candidates]
+    texts = [described_text(candidate) for candidate in choice.candidates]
+    return {name: lambda path: save_targets(path, choice.grid, outlines, texts, choice.taken)}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from detectors.target import Choice, described_text
 from harness.vocabulary.capture import Cloud
 
 DPI, WIDTH_IN = 120, 10.0
@@ -15,15 +15,15 @@ TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144
 """Colours that stand apart from grey and from one another, also for people who see red and green alike."""
 
 
-def save_targets(path: Path, choice: Choice) -> None:
-    """Write the PNG: the colour picture, else the amplitude, else the depth, with each candidate's outline and number;
-    without a pixel grid the raster that stood in for it. The legend says what each is and which option takes it."""
+def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
+    """Write the PNG: the colour picture, else the amplitude, else the depth of a grid, with each outline (h, w) and its
+    number, counted from 1 as ``taken`` is. The legend holds each one's text and the option that takes it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patheffects import withStroke
 
-    height, width = choice.grid.valid.shape
-    rows = len(choice.candidates)
+    height, width = grid.valid.shape
+    rows = len(outlines)
     figure = Figure(
         figsize=(WIDTH_IN, min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * rows + 0.6),
         dpi=DPI,
@@ -31,23 +31,23 @@ def save_targets(path: Path, choice: Choice) -> None:
     )
     canvas = FigureCanvasAgg(figure)
     axis = figure.subplots()
-    axis.imshow(_shown(choice.grid), interpolation="nearest")
+    axis.imshow(_shown(grid), interpolation="nearest")
     axis.set_axis_off()
     colours = iter(OTHERS * 2)
-    for number, candidate in enumerate(choice.candidates, start=1):
-        taken = number == choice.taken
-        colour = TAKEN if taken else next(colours)
-        outline = np.pad(candidate.outline, 1).astype(float)
+    for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
+        chosen = number == taken
+        colour = TAKEN if chosen else next(colours)
+        padded = np.pad(outline, 1).astype(float)
         axis.contour(
-            np.arange(-1, width + 1), np.arange(-1, height + 1), outline, [0.5], colors=colour,
-            linewidths=2.4 if taken else 1.4,
+            np.arange(-1, width + 1), np.arange(-1, height + 1), padded, [0.5], colors=colour,
+            linewidths=2.4 if chosen else 1.4,
         )  # fmt: skip
-        u, v = _label_place(candidate.outline)
+        u, v = _label_place(outline)
         stroke = [withStroke(linewidth=4, foreground="black")]
         axis.text(u, v, str(number), color=colour, fontsize=22, weight="bold", ha="center", va="center",
                   path_effects=stroke)  # fmt: skip
-        how = "taken" if taken else f"--target {number}"
-        axis.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {described_text(candidate)}")
+        how = "taken" if chosen else f"--target {number}"
+        axis.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
     figure.legend(loc="outside lower center", fontsize=9, frameon=False)
     canvas.print_png(str(path))
 
