@@ -98,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
     add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
     add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
-    add("--raw", metavar="WxH[:TYPE[:BYTES]]", help="layout of a file of bare numbers: 640x480:u2, after so many bytes")
+    add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
     add("--frames-report", action="store_true", help="list every frame with its valid part and median distance")
     several_arguments.add_to(parser)
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import pickle
 from collections.abc import Callable
@@ -18,7 +19,9 @@ from hypothesis import strategies as st
 from detectors.recordings import Recording, open_capture
 from detectors.recordings.distances import frame_from_points, metres_per_unit, rounding_step_m
 from detectors.recordings.intrinsics import read_lens
+from harness import detect
 from harness.vocabulary.capture import Frame, Reason
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 
 STORED = plane.depth_mm()
@@ -403,6 +406,24 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
     np.testing.assert_allclose(down.first_frame().z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
 
 
+def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    v, u = np.mgrid[:150, :200]
+    noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=u.shape), (0, 0), 1.0)
+    flat = 100 + 0.01 * u + 0.1 * noise / noise.std()
+    bowl = np.clip(1 - ((u - 120) ** 2 + (v - 60) ** 2) / 12**2, 0, None)
+    np.savez(tmp_path / "flat.npz", height=flat)
+    np.savez(tmp_path / "crater.npz", height=flat - 4 * bowl)
+    for name, lines in (("flat", 0), ("crater", 1)):
+        out = tmp_path / name
+        asked = ["--pitch", "0.5mm", "--out", str(out), "--threshold", "5", "--detector", "thesis"]
+        assert detect.main([str(tmp_path / f"{name}.npz"), *asked]) == 0, capsys.readouterr().err
+        findings = [row for row in csv.DictReader((out / "findings.csv").open()) if row["kind"] != "no return"]
+        assert len(findings) == lines
+    assert findings[0]["kind"] == "hole" and float(findings[0]["u_px"]) == pytest.approx(120, abs=2)
+
+
 # ---- phones ----------------------------------------------------------------------------------------------------------
 
 
@@ -435,3 +456,11 @@ def test_the_raw_frame_of_a_plane(shared_data: Path) -> None:
         [shared_data / "vzense_plane" / "bg.bin"], lens=Lens(640, 480, 465.0, 465.0, 320.0, 240.0), raw="640x480"
     )
     assert float(np.nanmedian(recording.first_frame().z_m)) == pytest.approx(0.918, abs=0.02)
+
+
+def test_the_interleaved_frame_of_another_maker(shared_data: Path) -> None:
+    path, lens = shared_data / "adi_tof" / "frame_mode2.bin", Lens(512, 512, 400.0, 400.0, 256.0, 256.0)
+    with pytest.raises(UserError, match="512x512:u2/5"):
+        open_capture([path])
+    z_m = open_capture([path], lens=lens, raw="512x512:u2/5", unit="mm").first_frame().z_m
+    assert float(np.nanmedian(np.abs(np.diff(z_m)))) < 0.02

@@ -234,12 +234,19 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
     path.write_bytes(bytes(2 * 640 * 480))
     assert "--raw 640x480" in refusal(path)
     assert "no such layout" in refusal(path, raw="640,480")
-    assert "needs 614402" not in refusal(path, raw="640x481") and "needs 615680" in refusal(path, raw="640x481")
-    # depth, brightness, confidence
+    assert "needs 615680" in refusal(path, raw="640x481")
+    # planes of depth, brightness and confidence
     path.write_bytes(STORED.tobytes() + (STORED // 9).tobytes() + np.full(STORED.shape, 200, np.uint8).tobytes())
     assert "--array :0" in refusal(path, raw="96x72", lens=plane.LENS)
     recording = open_capture([path], raw="96x72", lens=plane.LENS, array=":0")
     assert len(list(recording.frames())) == 1
+    # the same pixel by pixel
+    pixels = np.zeros(STORED.shape, np.dtype([("depth", "<u2"), ("rest", "u1", 3)]))
+    pixels["depth"], pixels["rest"] = STORED, 77
+    path.write_bytes(pixels.tobytes())
+    assert "the layout is another" in refusal(path, raw="96x72", lens=plane.LENS, array=":0")
+    read = open_capture([path], raw="96x72:u2/5", lens=plane.LENS).first_frame()
+    np.testing.assert_allclose(np.nan_to_num(read.z_m), STORED / 1e3, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,10 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
-LEGAL_RAW = "--raw WIDTHxHEIGHT[:TYPE[:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; BYTES before the first frame"
+LEGAL_RAW = (
+    "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
+    "BYTES before the first frame"
+)
 SENSOR_SIZES = (
     *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
@@ -37,6 +40,8 @@ SENSOR_SIZES = (
 """(width, height) of the depth images of usual cameras."""
 SAME_SCENE = 0.05
 """Part of its distance by which the median pixel of two frames of one scene differs at most."""
+NEIGHBOURS = 0.1
+"""The same of neighbouring pixels: rows of a floor seen flat differ by 1 %, noise by less; a wrong layout by 100 %."""
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
@@ -90,15 +95,17 @@ def open_stack(
     """Open a file of arrays; ``array`` NAME or NAME:NUMBER chooses. Raises UserError where the axes are no capture's or
     a depth array has no lens."""
     stack = named_stack(str(path), load(path), lens, array)
-    if isinstance(load, RawLoader) and array is None:
-        _refuse_other_planes(path, stack.distances, load.left_over(path))
+    if isinstance(load, RawLoader):
+        load.refuse_doubtful(path, stack.distances)
     height, width = stack.distances.shape[1:3]
     lens_file = None
     if not stack.has_points:
         lens_file = intrinsics or (None if lens else lens_file_beside(path.parent))
         lens = read_lens(lens_file, width, height) if lens_file else lens
         if lens is None:
-            raise no_lens(str(path))
+            lacking = no_lens(str(path))
+            fix = f"{lacking.fix}; of a height map, the distance between its pixels: --pitch 0.5mm"
+            raise UserError(lacking.message, legal=lacking.legal, fix=fix)
         if (lens.width, lens.height) != (width, height):
             raise UserError(f"{path}: {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}")
     given = scale_m or default_metres(stack.distances.dtype)
@@ -123,70 +130,81 @@ def load_npy(path: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on; what is left over at its
-    end is not read."""
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on. ``step``: bytes from pixel
+    to pixel, more than a number's where brightness and confidence stand between."""
 
     width: int
     height: int
     kind: str
+    step: int
     offset: int
 
     @classmethod
     def stated(cls, text: str) -> RawLoader:
-        """From WIDTHxHEIGHT[:TYPE[:BYTES]]. Raises UserError for anything else."""
-        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248]))?(?::(\d{1,12}))?", text)
+        """From WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]. Raises UserError for anything else."""
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text)
         if match is None:
             raise UserError(f"--raw {text}: no such layout", legal=LEGAL_RAW)
-        width, height, kind, offset = match.groups()
+        width, height, kind, step, offset = match.groups()
         refuse_pixels(f"--raw {text}", int(width), int(height))
         kind = kind or "u2"
-        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(offset or 0))
-
-    def left_over(self, path: Path) -> int:
-        """Bytes behind the last whole frame."""
-        return (path.stat().st_size - self.offset) % (self.width * self.height * np.dtype(self.kind).itemsize)
+        own = np.dtype(kind).itemsize
+        if int(step or own) < own:
+            raise UserError(f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW)
+        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """The frames (n, h, w), mapped. Raises UserError where there is none."""
-        kind = np.dtype(self.kind)
-        size = path.stat().st_size - self.offset
-        count = size // (self.width * self.height * kind.itemsize)
-        if count < 1:
+        kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
+        frame = self.width * self.height * self.step
+        if size < frame:
             raise UserError(
                 f"{path}: has {size} bytes from byte {self.offset} on, but a frame of {self.width} x {self.height}"
-                f" numbers of {kind.itemsize} bytes needs {self.width * self.height * kind.itemsize}",
+                f" numbers in steps of {self.step} bytes needs {frame}",
                 legal=LEGAL_RAW,
             )
-        return {"": np.memmap(path, kind, "r", self.offset, (count, self.height, self.width))}
+        content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
+        strides = (frame, self.width * self.step, self.step)
+        return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
+
+    def refuse_doubtful(self, path: Path, frames: np.ndarray) -> None:
+        """Raise UserError where neighbours differ as no surface's do, or the planes are no frames of one scene."""
+        first, last = (frames[i].astype(np.float64) for i in (0, -1))
+        rough = _apart(first[:, 1:], first[:, :-1])
+        if not rough < NEIGHBOURS:
+            raise UserError(
+                f"{path}: read so, the median pixel differs from its neighbour by {100 * rough:.3g} %: the layout is"
+                " another",
+                legal=LEGAL_RAW,
+                fix=raw_layout_of(path).fix,
+            )
+        left_over = (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
+        apart = _apart(first, last)
+        if len(frames) > 1 and (left_over or not apart < SAME_SCENE):
+            raise UserError(
+                f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
+                f" {100 * apart:.3g} % between the first and the last plane: depth beside brightness and confidence?",
+                legal="frames of one scene, or one plane",
+                fix="choose the plane with the depth: --array :0",
+            )
 
 
-def _refuse_other_planes(path: Path, frames: np.ndarray, left_over: int) -> None:
-    """Raise UserError where the file's further planes are no frames of the same scene: brightness or confidence follow
-    the depth, in other types (``left_over`` bytes at the end), or other numbers at most pixels."""
-    if len(frames) == 1:
-        return
-    first, last = (frames[i].astype(np.float64) for i in (0, -1))
-    both = (first > 0) & (last > 0)
-    apart = float(np.median(np.abs(first - last)[both] / first[both])) if both.any() else 1.0
-    if left_over or not apart < SAME_SCENE:
-        raise UserError(
-            f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by {100 * apart:.3g} %"
-            " between the first and the last plane: depth beside brightness and confidence?",
-            legal="frames of one scene, or one plane",
-            fix="choose the plane with the depth: --array :0",
-        )
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    """Median part by which the numbers of two arrays differ, of those where both have one; infinity without any."""
+    both = (one > 0) & (other > 0)
+    return float(np.median(np.abs(one - other)[both] / one[both])) if both.any() else float("inf")
 
 
 def raw_layout_of(path: Path) -> UserError:
     """The message for a file of bare numbers: the layouts of usual cameras that its size fits."""
     size = path.stat().st_size
-    whole = [wh for wh in SENSOR_SIZES if size == 2 * wh[0] * wh[1]]
-    parts = [wh for wh in SENSOR_SIZES if size % (wh[0] * wh[1]) == 0]
-    fitting = ", ".join(f"--raw {width}x{height}" for width, height in (whole or parts)[:4])
+    layouts = {f"{w}x{h}": size // (w * h) for w, h in SENSOR_SIZES if size % (w * h) == 0 and size >= 2 * w * h}
+    ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
+    fitting = " or ".join(f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked)
     return UserError(
         f"{path}: nothing says how its {size} bytes are laid out",
         legal=LEGAL_RAW,
-        fix=f"state the layout, by its size {fitting}" if fitting and size else "state the layout",
+        fix=f"state the layout; its size fits {fitting}" if fitting else "state the layout",
     )
 
 
@@ -206,7 +224,10 @@ def named_array(
             raise UserError(
                 f"{name}: {what} (it holds {held})",
                 legal="one array named " + ", ".join(usual) + "; " + LEGAL_AXES,
-                fix=f"choose by --array NAME, for instance --array {(found or list(arrays))[0]}" if arrays else None,
+                fix=f"choose by --array NAME, for instance --array {(found or list(arrays))[0]}"
+                " (of a height map with --pitch, the distance between its pixels)"
+                if arrays
+                else None,
             )
         (key,) = found
     if key not in arrays:

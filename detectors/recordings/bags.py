@@ -198,11 +198,12 @@ def _chosen_topic(
             legal=kinds,
             fix="record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info",
         )
+    own = next((topic for topic in images if _infos_of(topics, topic)), "")
     found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
     raise UserError(
         f"{path}: {found}",
         legal=", ".join([*clouds, *images]),
-        fix=f"choose one, for instance --topic {(images or clouds)[0]}",
+        fix=f"choose one, for instance --topic {own or (images or clouds)[0]}",
     )
 
 

@@ -84,7 +84,7 @@ def open_capture(
     file with the depth pixels' lens, which counts before one found beside the frames or attached to them; ``lens`` the
     same as a value. ``frames`` selects frames by number. ``topic``: of a ROS bag the topic with the depth images or
     clouds, where several have some. ``array``: NAME or NAME:NUMBER in a file of arrays. ``pitch``: the distance between
-    the pixels of a height map (``0.5mm``). ``raw``: WIDTHxHEIGHT[:TYPE[:BYTES]], the layout of bare numbers. Raises
+    the pixels of a height map (``0.5mm``). ``raw``: the layout of bare numbers (`RawLoader.stated`). Raises
     UserError for every fault of the files.
     """
     paths = [Path(path) for path in paths]
