@@ -61,8 +61,11 @@ def filling(rng: Rng, cam: Camera, distance: tuple[float, float] = (0.4, 1.0), t
 
 
 def wall(surface: Surface, gap_m: float, tilt_deg: float = 0.0, towards_deg: float = 0.0) -> Surface:
-    """An endless plane behind a surface, parallel to the image but for its own tilt."""
-    return Surface(surface.origin_m + np.array([0, 0, gap_m]), turned(tilt_deg, towards_deg), 9.0, 9.0)
+    """An endless plane behind a surface's farthest corner, parallel to the image but for its own tilt."""
+    x, y = (0.999 * half if half < 5 else 0.0 for half in (surface.half_x_m, surface.half_y_m))
+    corners = [surface.point_m(i * x, j * y)[2] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    at = np.array([*surface.origin_m[:2], np.nanmax(corners) + gap_m])
+    return Surface(at, turned(tilt_deg, towards_deg), 9.0, 9.0)
 
 
 def damaged(
