@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from detectors.recordings.distances import no_return_codes
 from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
+from scenes.sensor.camera import lens_named, lens_names
 from tests import recorded_plane as plane
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -26,7 +28,7 @@ def noisy(distance_m: float, unit_m: float, seed: int = 0) -> np.ndarray:
     return np.rint((distance_m / (1 - 0.1 * x) + noise_m) / unit_m)
 
 
-def opened(folder: Path, stored: np.ndarray, unit: str | None = None, lens: Lens = plane.LENS) -> Recording:
+def opened(folder: Path, stored: np.ndarray, unit: str | None = None, lens: Lens | None = plane.LENS) -> Recording:
     folder.mkdir(exist_ok=True)
     cv2.imwrite(str(folder / "1.png"), stored.astype(np.uint16))
     return open_capture([folder], lens=lens, unit=unit)
@@ -118,3 +120,76 @@ def test_a_camera_with_millimetres_is_believed_within_its_reach_only(tmp_path: P
     assert "3.2 m" in warning and "--unit 4000/m (0.8 m)" in warning
     with pytest.raises(UserError, match="--unit 4000/m"):
         opened(tmp_path / "beyond", np.full((576, 640), 5200), lens=LENS)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "unit_mm"),
+    (
+        ("depth_scale", 0.00025, 0.25),
+        ("depth_units", "0.25 mm", 0.25),
+        ("depth_scale", 4000.0, 0.25),
+        ("DepthMapFactor", 5000.0, 0.2),
+        ("depth_scale", 0.1, 0.1),
+        ("depth_unit", "millimeters", 1.0),
+    ),
+)
+def test_a_file_beside_the_pictures_states_the_unit(tmp_path: Path, key: str, value: object, unit_mm: float) -> None:
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "metadata.json").write_text(json.dumps({"serial": "f1", key: value}))
+    recording = opened(tmp_path / "c", noisy(0.9, unit_mm / 1e3))
+    assert recording.unit_text == f"depth unit {unit_mm:g} mm, from metadata.json" and not recording.warnings
+    assert np.nanmedian(recording.first_frame().z_m) == pytest.approx(0.9, rel=0.02)
+
+
+def test_text_in_the_picture_states_the_unit(tmp_path: Path) -> None:
+    from PIL import Image, PngImagePlugin
+
+    text = PngImagePlugin.PngInfo()
+    text.add_text("depth_scale", "0.00025")
+    Image.fromarray(noisy(0.9, 2.5e-4).astype(np.uint16)).save(tmp_path / "1.png", pnginfo=text)
+    assert open_capture([tmp_path], lens=plane.LENS).unit_text == "depth unit 0.25 mm, from 1.png"
+
+
+# ---- named cameras and lenses of other sizes -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "mode", "unit_mm"),
+    (
+        ("azure_kinect_nfov", (640, 576), "azure_kinect_nfov", 1.0),
+        ("azure_kinect_nfov", (512, 512), "azure_kinect_wfov_binned", 1.0),
+        ("azure_kinect_wfov_binned", (512, 512), "azure_kinect_wfov_binned", 1.0),
+        ("realsense_l515", (640, 480), "realsense_l515_vga", 0.25),
+    ),
+)
+def test_a_named_camera_knows_its_modes_and_its_unit(
+    tmp_path: Path, name: str, size: tuple[int, int], mode: str, unit_mm: float
+) -> None:
+    recording = opened(tmp_path / "c", np.full(size[::-1], round(900 / unit_mm)), lens=lens_named(name))
+    assert recording.unit_text == f"depth unit {unit_mm:g} mm, from the camera of {mode}"
+    assert f"the lens is the nominal one of {mode}" in recording.notes and type(recording.lens) is Lens
+    assert (recording.lens.width, recording.lens.height) == size
+
+
+def test_a_size_that_no_mode_of_the_camera_has_is_told_with_those_that_exist(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="1280 x 720") as caught:
+        opened(tmp_path / "c", np.full((720, 1280), 900), lens=lens_named("azure_kinect_wfov_binned"))
+    assert "azure_kinect_nfov_binned 320 x 288" in str(caught.value) and "aligned" in str(caught.value)
+
+
+def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
+    """A pixel of a binned mode covers four of the sensor, whose directions surround its own."""
+    assert set(lens_names()) >= {"azure_kinect_nfov_binned", "azure_kinect_wfov_unbinned", "realsense_l515_vga"}
+    whole, binned = lens_named("azure_kinect_wfov_unbinned"), lens_named("azure_kinect_wfov_binned")
+    np.testing.assert_allclose(binned.slopes(100, 200), whole.slopes(200.5, 400.5), atol=1e-6)
+    narrow, small = lens_named("azure_kinect_nfov"), lens_named("azure_kinect_nfov_binned")
+    np.testing.assert_allclose(narrow.slopes(8, 20), whole.slopes(200, 200), atol=1e-6)
+    np.testing.assert_allclose(small.slopes(8, 20), narrow.slopes(16.5, 40.5), atol=1e-6)
+
+
+def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: Path) -> None:
+    text = {"width": 192, "height": 144, "fx": 300.0, "fy": 302.0, "cx": 94.5, "cy": 72.5}
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "intrinsic.json").write_text(json.dumps(text))
+    recording = opened(tmp_path / "c", noisy(0.7, 1e-3), lens=None)
+    assert recording.lens == plane.LENS and "scaled to 96 x 72" in recording.warnings[0]

@@ -16,7 +16,7 @@ from detectors.recordings.distances import (
     refuse_narrow,
     rounding_step_m,
 )
-from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
+from detectors.recordings.intrinsics import lens_file_beside, lens_of_size, no_lens, read_lens
 from detectors.recordings.recording import Recording
 from harness.vocabulary.archives import read_npy
 from harness.vocabulary.capture import Frame
@@ -106,8 +106,7 @@ def open_stack(
             lacking = no_lens(str(path))
             fix = f"{lacking.fix}; of a height map, the distance between its pixels: --pitch 0.5mm"
             raise UserError(lacking.message, legal=lacking.legal, fix=fix)
-        if (lens.width, lens.height) != (width, height):
-            raise UserError(f"{path}: {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}")
+        lens = lens_of_size(str(path), lens, width, height)
     given = scale_m or default_metres(stack.distances.dtype)
     reader = StackReader(path, given, load, lens, array)
     first = next(reader.frames())

@@ -24,7 +24,7 @@ from detectors.recordings.azure_calibration import (
     parse_calibration,
 )
 from detectors.recordings.distances import UNITS_M, frame_from_depth
-from detectors.recordings.intrinsics import no_lens, read_lens
+from detectors.recordings.intrinsics import lens_of_size, no_lens, read_lens
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
@@ -89,11 +89,7 @@ def open_mkv(path: Path, scale_m: float | None, intrinsics: Path | None, lens: L
         colour = colour_camera(str(path), cameras, *header.colour_size) if header.colour_size else None
     if lens is None:
         raise no_lens(str(path))
-    if (lens.width, lens.height) != size:
-        raise UserError(
-            f"{path}: depth pictures of {size[0]} x {size[1]} pixels, but the lens is of {lens.width} x {lens.height}",
-            fix="leave --intrinsics out: the recording carries its calibration",
-        )
+    lens = lens_of_size(str(path), lens, *size)
     if colour is not None:
         notes.append("colour sampled at each depth point's place in the colour picture, without a test for occlusion")
     scale_m = scale_m or UNITS_M["mm"]

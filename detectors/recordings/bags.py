@@ -18,7 +18,7 @@ import numpy as np
 from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag, messages, topics_of
 from detectors.recordings.distances import UNITS_M, default_metres, frame_from_depth, rounding_step_m
 from detectors.recordings.image_messages import DEPTH_NUMBERS, encoding_of, stored_depth
-from detectors.recordings.intrinsics import KNOWN_MODELS, no_lens, read_lens
+from detectors.recordings.intrinsics import KNOWN_MODELS, lens_of_size, no_lens, read_lens
 from detectors.recordings.point_messages import frame_from_message
 from detectors.recordings.recording import Recording, slopes_of
 from harness.vocabulary.capture import Frame, Reason
@@ -141,11 +141,7 @@ def _open_images(
         lens = read_lens(intrinsics, width, height)
     if lens is None:
         lens = _lens_of_images(path, bag, topics, topic, stored.shape)
-    if (lens.width, lens.height) != (width, height):
-        raise UserError(
-            f"{path}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
-            fix="leave --intrinsics out, or give the lens of these images",
-        )
+    lens = lens_of_size(str(path), lens, width, height)
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     if scale_m is None and stored.dtype.kind == "u":
         scale_m, unit_topic = _stated_unit(bag, topics, topic)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, frame_from_depth, rounding_step_m
-from detectors.recordings.intrinsics import lens_file_beside, no_lens, read_lens
+from detectors.recordings.intrinsics import lens_file_beside, lens_of_size, no_lens, read_lens
 from detectors.recordings.pictures import PNG_SIGNATURE, decoded, read_picture, refuse_broken_png
 from detectors.recordings.recording import Recording
 from harness.vocabulary.capture import Frame
@@ -91,11 +91,7 @@ def _open(
     lens = read_lens(lens_file, width, height) if lens_file else lens
     if lens is None:
         raise no_lens(f"{root}")
-    if (lens.width, lens.height) != (width, height):
-        raise UserError(
-            f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
-            fix="pass --intrinsics FILE with the lens of these images",
-        )
+    lens = lens_of_size(name, lens, width, height)
     aligned, notes = _aligned(colours, width, height)
     if not any(lens.distortion):
         notes = (*notes, "no lens distortion is stated; the images are taken as undistorted")

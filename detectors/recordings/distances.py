@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,9 @@ NEAREST_M, FARTHEST_M = 0.05, 20.0
 """Bounds of a plausible median distance: nearer than any time-of-flight camera works, farther than any of them sees."""
 
 LEGAL_UNITS = "mm, cm, m, um, tum (5000 to the metre), or N/m for N to the metre (4000/m)"
+
+UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfactor", "pngdepthscale", "zunits")
+UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
 
 TURNED_SHARE = 0.99
 """Part of the points that must have z below 0 before they are turned: no camera measures behind itself."""
@@ -219,6 +223,30 @@ class Unit:
     scale_m: float
     origin: str
     warning: str = ""
+
+
+def scale_in(statements: dict[str, Any], median: float) -> float | None:
+    """Metres in one stored number as names with values state it, None where they do not.
+
+    Values are metres (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000, ORB-SLAM: 5000)
+    or a unit's name; they are three powers of ten apart, and the ``median`` stored number tells which it is.
+    """
+    for key, value in statements.items():
+        if re.sub("[^a-z]", "", str(key).lower()) not in UNIT_KEYS:
+            continue
+        counted = re.fullmatch(r"\s*([\d.eE+-]*)\s*([a-z]*)\s*", str(value))
+        if counted is None or counted.group(2).rstrip("s") not in ("", *UNIT_NAMES):
+            continue
+        try:
+            number = float(counted.group(1) or 1.0)
+        except ValueError:
+            continue
+        named = UNIT_NAMES.get(counted.group(2).rstrip("s"))
+        scales = [number * named] if named else [number, number * 1e-3, 1.0 / number if number else 0.0]
+        fitting = {scale for scale in scales if 0.1 <= median * scale <= 10.0}
+        if len(fitting) == 1:
+            return fitting.pop()
+    return None
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from detectors.recordings.azure_calibration import depth_lens, depth_mode_of_size, parse_calibration
+from detectors.recordings.pictures import png_texts
 from harness.vocabulary.declaration.problems import DeclarationError
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes, refuse_bytes
+from harness.vocabulary.lens import Lens, OtherLens
+from harness.vocabulary.limits import PICTURE_BYTES, TEXT_BYTES, bounded_bytes, refuse_bytes
 
 LEGAL_LENS = (
     "JSON or YAML with fx, fy, cx, cy in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
@@ -31,6 +34,8 @@ FOUND_BESIDE = (
 """Stems of the files that are taken for the lens of the frames beside or below them."""
 
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+BESIDE = 20
+"""Files beside a capture that are asked for its unit."""
 SHOWN_KEYS = 20
 LARGEST = 1e12
 """Of any number of a lens, in any unit."""
@@ -41,6 +46,21 @@ def lens_file_beside(folder: Path) -> Path | None:
     """The file in ``folder`` that holds its frames' lens, None where there is none."""
     candidates = (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml"))
     return next((path for path in candidates if path.is_file()), None)
+
+
+def statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """What the JSON and YAML files in and above the folder of a capture's first file say, and the text in that file
+    where it is a PNG. Files that cannot be read say nothing here: they may belong to something else."""
+    folders = dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ())
+    if files and files[0].suffix.lower() == ".png":
+        yield files[0], png_texts(bounded_bytes(files[0], PICTURE_BYTES))
+    for folder in folders:
+        beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
+        for path in islice(beside, BESIDE):
+            try:
+                yield path, _parsed(path)
+            except UserError:
+                continue
 
 
 def no_lens(name: str) -> UserError:
@@ -65,14 +85,41 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
     data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
     stated = _stated_size(data)
-    if stated not in (None, (width, height)):
+    if stated is not None and stated != (width, height) and stated[0] * height != stated[1] * width:
         raise UserError(
             f"{path}: is for images of {stated[0]} x {stated[1]} pixels, but the depth images have {width} x {height}",
             fix="give the lens of the depth images themselves (or of the colour camera that they are aligned to)",
         )
     fx, fy, cx, cy = _centre_and_focal(path, data)
+    side = stated[0] / width if stated else 1.0
+    fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
     _refuse_odd_numbers(path, (fx, fy, cx, cy), width, height)
-    return Lens(width, height, fx, fy, cx, cy, _distortion(path, data))
+    distortion = _distortion(path, data)
+    if stated in (None, (width, height)):
+        return Lens(width, height, fx, fy, cx, cy, distortion)
+    warning = (
+        f"{path.name} is the lens of images of {stated[0]} x {stated[1]} pixels; it is scaled to {width} x {height},"
+        " which is right unless the smaller image is cut out of the larger"
+    )
+    return OtherLens(width, height, fx, fy, cx, cy, distortion, warning=warning)
+
+
+def lens_of_size(name: str, lens: Lens, width: int, height: int) -> Lens:
+    """The lens for images of ``width`` x ``height``: the one given, or of the same camera the mode of that size.
+
+    Raises UserError where it is of another size.
+    """
+    modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
+    found = next((mode for mode in modes if (mode.width, mode.height) == (width, height)), None)
+    if found is not None:
+        return found
+    known = [f"{mode.mode} {mode.width} x {mode.height}" for mode in modes[1:] if isinstance(mode, OtherLens)]
+    raise UserError(
+        f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
+        legal=f"the modes of this camera: {', '.join(known)}" if known else None,
+        fix="pass --intrinsics FILE with the lens of these images"
+        + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
+    )
 
 
 def _parsed(path: Path) -> dict[str, Any]:

@@ -14,8 +14,9 @@ from detectors.recordings.azure_mkv import open_mkv
 from detectors.recordings.bag_files import BAG_SUFFIXES, ROS1_SUFFIX, is_bag_folder
 from detectors.recordings.bags import open_bag
 from detectors.recordings.depth_images import open_depth_folder, open_depth_list, png_kind
-from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit
+from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, scale_in
 from detectors.recordings.height_maps import open_height_map
+from detectors.recordings.intrinsics import statements_beside
 from detectors.recordings.matlab import load_mat
 from detectors.recordings.phones import is_stray, open_r3d, open_stray
 from detectors.recordings.point_lists import POINT_LISTS, open_point_lists
@@ -23,7 +24,7 @@ from detectors.recordings.pointclouds import open_clouds
 from detectors.recordings.recording import Recording
 from harness.vocabulary.archives import read_npz
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.lens import Lens, OtherLens
 
 STACKS = {".npy": load_npy, ".npz": read_npz, ".mat": load_mat}
 CLOUDS = (".ply", ".pcd")
@@ -105,30 +106,39 @@ def open_capture(
     recording = opened(metres_per_unit(unit) if unit else None)
     said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
     if not said.origin:
-        said = _unit_by_data(recording)
+        said = _unit_not_stated(recording)
         if said.scale_m != recording.scale_m:
             recording = opened(said.scale_m)
-    first = recording.first_frame()
-    return replace(
-        recording,
-        unit_from=said.origin,
-        notes=(*recording.notes, *first.notes),
-        warnings=(*recording.warnings, *((said.warning,) if said.warning else ())),
-    )
+    first, given = recording.first_frame(), recording.lens
+    notes, warnings = (*recording.notes, *first.notes), (*recording.warnings, said.warning)
+    if isinstance(given, OtherLens):
+        notes, warnings = (*notes, given.note), (*warnings, given.warning)
+        recording = replace(recording, lens=given.plain)
+    notes, warnings = tuple(filter(None, notes)), tuple(filter(None, warnings))
+    return replace(recording, unit_from=said.origin, notes=notes, warnings=warnings)
 
 
-def _unit_by_data(recording: Recording) -> Unit:
-    """The unit of a capture whose files do not state it, by the first selected frame that has a distance."""
+def _unit_not_stated(recording: Recording) -> Unit:
+    """The unit of a capture whose format leaves it open: of a file beside, of the named camera, or by the data of the
+    first selected frame that has a distance."""
     chosen = recording.selection or slice(None)
     for frame in islice(recording.reader.frames(), chosen.start, chosen.stop, chosen.step):
         z_m = frame.z_m[np.isfinite(frame.z_m)].astype(np.float64)
         if z_m.size:
-            stored = z_m / recording.scale_m
-            # Back to whole numbers what float32 metres hold to 1e-7.
-            stored = np.rint(stored) if recording.scale_m == UNITS_M["mm"] else stored
-            height, width = recording.region.shape
-            return decided_unit(recording.name, stored, recording.scale_m, (width, height))
-    return Unit(recording.scale_m, "what is usual")
+            break
+    else:
+        return Unit(recording.scale_m, "what is usual")
+    stored, integers = z_m / recording.scale_m, recording.scale_m == UNITS_M["mm"]
+    if integers:
+        stored = np.rint(stored)  # float32 metres hold whole numbers to 1e-7
+        for path, texts in statements_beside(recording.files):
+            scale_m = scale_in(texts, float(np.median(stored)))
+            if scale_m is not None:
+                return Unit(scale_m, path.name)
+        if isinstance(recording.lens, OtherLens) and recording.lens.unit_m:
+            return Unit(recording.lens.unit_m, f"the camera of {recording.lens.mode}")
+    height, width = recording.region.shape
+    return decided_unit(recording.name, stored, recording.scale_m, (width, height))
 
 
 def _is_bag(path: Path) -> bool:

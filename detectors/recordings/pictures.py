@@ -49,6 +49,18 @@ def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
     return picture
 
 
+def png_texts(content: bytes) -> dict[str, str]:
+    """The names and values that a PNG's tEXt chunks hold before its picture."""
+    texts, at = {}, len(PNG_SIGNATURE)
+    while at + 12 <= len(content) and content[at + 4 : at + 8] != b"IDAT":
+        end = at + 8 + int.from_bytes(content[at : at + 4], "big")
+        if content[at + 4 : at + 8] == b"tEXt":
+            key, _, value = content[at + 8 : end].decode("latin1").partition("\0")
+            texts[key] = value
+        at = end + 4
+    return texts
+
+
 def picture_size(name: str, content: bytes) -> tuple[int, int]:
     """(width, height) from the header. Raises UserError where it is neither PNG nor JPEG, or cut off before."""
     if content.startswith(PNG_SIGNATURE) and content[12:16] == b"IHDR" and len(content) >= 24:

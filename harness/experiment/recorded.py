@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.experiment.schema import CaptureSource
-from scenes.sensor.camera import camera_names, load_camera
+from scenes.sensor.camera import lens_named, lens_names, load_camera
 
 if TYPE_CHECKING:
     from detectors.recordings import Recording
@@ -23,7 +23,7 @@ def recording_of(source: CaptureSource) -> Recording:
     from detectors.recordings import open_capture  # brings the readers of every format
 
     name = source.intrinsics
-    lens = load_camera(name).nominal_lens if name in camera_names() and name else None
+    lens = lens_named(name) if name and name in lens_names() else None
     file = Path(name) if name and lens is None else None
     return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)
 
@@ -31,7 +31,8 @@ def recording_of(source: CaptureSource) -> Recording:
 def content_of(source: CaptureSource) -> dict[str, object]:
     """All that decides a recording's numbers: its files by name and content, the unit, the lens where it is named."""
     files = [[file.name, _file_digest(file, *_state(file))] for file in recording_of(source).files]
-    named = load_camera(source.intrinsics).lens.to_data() if source.intrinsics in camera_names() else None
+    camera = lens_names().get(source.intrinsics or "")
+    named = load_camera(camera).lens.to_data() if camera else None
     return {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
 
 

@@ -92,13 +92,13 @@ def opened(arguments: argparse.Namespace, paths: list[Path]) -> Recording:
 
     lens, file = None, None
     if arguments.intrinsics is not None:
-        from scenes.sensor.camera import camera_names, load_camera
+        from scenes.sensor.camera import lens_named, lens_names
 
         file = Path(arguments.intrinsics)
-        if arguments.intrinsics in camera_names():
-            lens, file = load_camera(arguments.intrinsics).nominal_lens, None
+        if arguments.intrinsics in lens_names():
+            lens, file = lens_named(arguments.intrinsics), None
         elif not file.exists():
-            legal = f"a file, or one of the cameras {', '.join(camera_names())}"
+            legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
     first = slice(arguments.max_frames) if arguments.max_frames else None
     return open_capture(

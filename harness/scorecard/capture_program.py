@@ -20,7 +20,7 @@ from harness.vocabulary.files import write_text
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.provenance import record
 from harness.vocabulary.versions import RESULTS_VERSION
-from scenes.sensor.camera import camera_names, load_camera
+from scenes.sensor.camera import camera_names, lens_named, lens_names, load_camera
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,10 @@ def _lens(intrinsics: str | None) -> tuple[Lens | None, Path | None]:
     """A camera's nominal lens, or a file, from what the user wrote."""
     if intrinsics is None:
         return None, None
-    if intrinsics in camera_names():
-        return load_camera(intrinsics).nominal_lens, None
+    if intrinsics in lens_names():
+        return lens_named(intrinsics), None
     if not Path(intrinsics).exists():
-        legal = f"a file, or one of the cameras {', '.join(camera_names())}"
+        legal = f"a file, or one of the cameras {', '.join(lens_names())}"
         raise UserError(f"--intrinsics {intrinsics}: no such file and no such camera", legal=legal)
     return None, Path(intrinsics)
 

@@ -59,3 +59,23 @@ class Lens:
         flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
         pixels, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
+
+
+@dataclass(frozen=True)
+class OtherLens(Lens):
+    """A lens that was not measured for the images themselves, with what to say of it.
+
+    ``note`` and ``warning``: sentences, "" for none. ``mode``: of a camera's nominal lens, its depth mode by name;
+    ``unit_m``: metres in a stored number there. ``others``: the lenses of the same camera's other modes.
+    """
+
+    note: str = ""
+    warning: str = ""
+    mode: str = ""
+    unit_m: float | None = None
+    others: tuple[OtherLens, ...] = ()
+
+    @property
+    def plain(self) -> Lens:
+        """The lens alone."""
+        return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lens import OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -111,6 +113,27 @@ def camera_file(name: str) -> Path:
 def load_camera(name: str) -> AnyCamera:
     """The camera of that name. Raises UserError as `camera_file`, and for a file that does not describe a camera."""
     return _camera_at(camera_file(name))
+
+
+def lens_names() -> dict[str, str]:
+    """The names under which `lens_named` knows a lens: cameras and their further depth modes, each with its camera."""
+    names: dict[str, str] = {}
+    for camera in camera_names():
+        names |= dict.fromkeys((camera, *load_camera(camera).modes), camera)
+    return names
+
+
+def lens_named(name: str) -> OtherLens:
+    """The nominal lens of a camera or depth mode, with those of the camera's other modes; UserError for other names."""
+    camera_name = lens_names().get(name, name)
+    camera = load_camera(camera_name)
+    plain = {camera_name: camera.nominal_lens}
+    plain |= {mode: facts.lens(camera.nominal_lens) for mode, facts in camera.modes.items()}
+    lenses = [
+        OtherLens(**vars(lens), note=f"the lens is the nominal one of {mode}", mode=mode, unit_m=camera.z_step_m)
+        for mode, lens in plain.items()
+    ]
+    return replace(next(lens for lens in lenses if lens.mode == name), others=tuple(lenses))
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.lens import Lens
@@ -113,6 +113,25 @@ class LensFacts(Config):
         )
 
 
+class ModeFacts(Config):
+    """Another depth mode of a camera: its image behind the same lens, a crop of larger or smaller pixels.
+
+    ``first_px``: column and row of its first pixel's corner, and ``side_px`` the side of its pixels, both in pixels of
+    the file's own mode.
+    """
+
+    width_px: PositiveInt
+    height_px: PositiveInt
+    first_px: Fact[tuple[float, float]]
+    side_px: Positive
+
+    def lens(self, own: Lens) -> Lens:
+        """The mode's lens, where ``own`` is that of the file's own mode."""
+        side, (column, row) = self.side_px.value, self.first_px.value
+        cx, cy = (own.cx + 0.5 - column) / side - 0.5, (own.cy + 0.5 - row) / side - 0.5
+        return Lens(self.width_px.value, self.height_px.value, own.fx / side, own.fy / side, cx, cy, own.distortion)
+
+
 class UnitFacts(Config):
     """How one unit differs from the nominal camera as a whole, and its frames from each other; any kind of camera.
 
@@ -140,6 +159,8 @@ class CameraFacts(Config):
     wavelength_nm: Wavelength
     lens: LensFacts
     unit: UnitFacts
+    modes: dict[str, ModeFacts] = Field(default_factory=dict, exclude=True)
+    """Other modes by name: only their images are known. No simulation uses them, so that digests leave them out."""
 
     @cached_property
     def nominal_lens(self) -> Lens:
