@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Literal
 
+import cv2
 import numpy as np
 from pydantic import Field
 
@@ -281,3 +282,53 @@ class _Settled:
             lens=source.lens,
             left_out=tuple(self._left_out),
         )
+
+
+# ---- how far the noise reaches ---------------------------------------------------------------------------------------
+
+REACH_FRAMES = 6
+REACH_WINDOW_PX = 384
+"""Side of the window, about the middle of the valid pixels, that is looked at."""
+FARTHEST_LAG_PX = 30
+SHARED = 0.1
+"""Correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels."""
+REACH_PIXELS = 5000
+"""Pixels that must be valid in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
+
+
+def noise_reach_px(frames: Sequence[Frame]) -> float:
+    """The lag, in pixels, at which the noise of neighbours along rows and columns stops being alike; 0 for unknown.
+
+    Differences of successive frames hold noise alone. A filter over b x b pixels correlates them over b - 1 pixels,
+    interpolation to a grid f times finer over f b. The median over pairs of frames and both axes. Unknown with one
+    frame, without noise beyond the rounding step, or where the correlation does not end (something moves).
+    """
+    lags: list[int] = []
+    for first, second in pairwise(frames):
+        difference = second.z_m.astype(np.float64) - first.z_m
+        rows, columns = np.isfinite(difference).nonzero()
+        if rows.size < REACH_PIXELS:
+            continue
+        top, left = (max(0, int(np.median(places)) - REACH_WINDOW_PX // 2) for places in (rows, columns))
+        difference = difference[top : top + REACH_WINDOW_PX, left : left + REACH_WINDOW_PX]
+        known = np.isfinite(difference)
+        known &= np.abs(np.nan_to_num(difference)) < 8 * float(np.abs(difference[known]).mean())
+        side = (2 * FARTHEST_LAG_PX + 1,) * 2
+        weight = cv2.boxFilter(known.astype(np.float64), -1, side)
+        level = cv2.boxFilter(np.where(known, difference, 0.0), -1, side) / np.maximum(weight, 1e-9)
+        noise = np.where(known, difference - level, 0.0)
+        lags += [_first_unlike_lag(noise, known), _first_unlike_lag(noise.T, known.T)]
+    known_lags = [lag for lag in lags if lag]
+    return float(np.median(known_lags)) if len(known_lags) > len(lags) / 2 else 0.0
+
+
+def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:
+    """The first lag along rows at which the mean product of noises falls below `SHARED`; 0 for none."""
+
+    def product(lag: int) -> float:
+        width = noise.shape[1] - lag
+        return float((noise[:, lag:] * noise[:, :width]).sum()) / max((known[:, lag:] & known[:, :width]).sum(), 1)
+
+    variance = product(0)
+    lags = range(1, min(FARTHEST_LAG_PX, noise.shape[1]) if variance > 0 else 1)
+    return next((lag for lag in lags if product(lag) < SHARED * variance), 0)

@@ -59,11 +59,13 @@ class HoleModelConfig(Config):
 def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
     """Sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or cells.
 
+    Depth that was upsampled or aligned to a finer camera is blurred over more pixels than the camera's filter has.
     A map adds the linear interpolation of its views' pixels, whose variance is a sixth of a pixel squared, to the
     square's twelfth: as a square of side sqrt(blur^2 + 2) pixels. Cells of more than a pixel take a mean of their own.
     """
     if cloud.map_views is None or not cloud.organised:
-        return float(config.blur_px), float(config.blur_px)
+        blur_px = max(float(config.blur_px), cloud.noise_reach_px)
+        return blur_px, blur_px
     across, down = (np.diff(cloud.points_m[..., k], axis=1 - k) for k in (0, 1))
     cells = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 for steps in (across, down)]
     pixels = [pitch / cell for pitch, cell in zip(cloud.map_views.pixel_m, cells, strict=True)]

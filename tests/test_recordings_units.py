@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from detectors.average import noise_reach_px
 from detectors.recordings import Recording, open_capture
-from detectors.recordings.distances import no_return_codes
-from harness.vocabulary.capture import Reason
+from detectors.recordings.distances import decided_unit, no_return_codes
+from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 from scenes.sensor.camera import lens_named, lens_names
@@ -193,3 +196,64 @@ def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: 
     (tmp_path / "c" / "intrinsic.json").write_text(json.dumps(text))
     recording = opened(tmp_path / "c", noisy(0.7, 1e-3), lens=None)
     assert recording.lens == plane.LENS and "scaled to 96 x 72" in recording.warnings[0]
+
+
+# ---- images that are not the camera's own ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("side", "finer", "least", "most"), ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)))
+def test_the_reach_of_noise_is_the_filter_times_the_upsampling(side: int, finer: int, least: int, most: int) -> None:
+    rng, frames = np.random.default_rng(3), []
+    for number in range(3):
+        noise = cv2.blur(rng.normal(0, 1e-3 * side, (240, 240)), (side, side))
+        z_m = cv2.resize(0.7 + noise, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+        frames.append(Frame(str(number), z_m, np.zeros(z_m.shape, np.uint8)))
+    assert least <= noise_reach_px(frames) <= most
+    assert noise_reach_px(frames[:1]) == 0.0 and noise_reach_px([frames[0], frames[0]]) == 0.0
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs the real captures")
+def test_real_depth_that_was_aligned_to_colour_is_told_from_the_cameras_own() -> None:
+    aligned = list(islice(open_capture([DATA / "azure_drilled_board"]).frames(), 6))
+    own = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
+    assert noise_reach_px(own) == 5.0  # the depth engine's filter
+    assert noise_reach_px(aligned) > 7.0  # 5 pixels of 252 px focal length in an image of 601 px
+
+
+def walls() -> list[Path]:
+    return sorted((DATA / "azure_nfov_walls").glob("[0-9]*.png"))
+
+
+def test_a_missing_colour_picture_is_said(tmp_path: Path) -> None:
+    folder = plane.write_open3d_folder(tmp_path / "o", 4)
+    (folder / "color" / "00003.png").unlink()
+    assert "4 depth and 3 colour pictures: 1 depth pictures have no colour" in open_capture([folder]).notes
+
+
+# ---- how often the unit is right -------------------------------------------------------------------------------------
+
+
+def test_units_of_many_scenes_are_right_or_asked_for() -> None:
+    """Targets at 0.3 to 1.5 m over a tenth to all of the view, before walls up to 2 m behind them."""
+    counts = {unit_mm: verdicts(unit_mm) for unit_mm in (1.0, 0.25, 0.2, 0.1, 10.0)}
+    assert counts[1.0]["asked"] <= 2 and counts[1.0]["wrong"] == counts[1.0]["silently wrong"] == 0, counts
+    for unit_mm in (0.25, 0.2, 0.1, 10.0):
+        assert counts[unit_mm]["silently wrong"] <= 0.05 * 200, counts
+
+
+def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
+    rng, found = np.random.default_rng(11), Counter[str]()
+    for _ in range(scenes):
+        near_m, share, behind_m = rng.uniform(0.3, 1.5), rng.uniform(0.1, 1.0), rng.uniform(0.2, 2.0)
+        z_m = np.where(np.arange(2000) < 2000 * share, near_m, near_m + behind_m) + rng.normal(0, 2e-3, 2000)
+        stored = np.rint(z_m * 1e3 / unit_mm)
+        # 1024 x 768 is the L515's alone, which stores 0.25 mm
+        size = rng.choice([(640, 576), (640, 480), (512, 512), (1280, 720), (1024, 768)][: 4 if unit_mm == 1 else 5])
+        try:
+            unit = decided_unit("x", stored, 1e-3, (int(size[0]), int(size[1])))
+        except UserError:
+            found["asked"] += 1
+            continue
+        right = unit.scale_m == pytest.approx(unit_mm * 1e-3)
+        found[("" if unit.warning else "silently ") + ("right" if right else "wrong")] += 1
+    return found

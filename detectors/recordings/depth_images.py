@@ -60,6 +60,10 @@ def open_depth_folder(folder: Path, scale_m: float | None, intrinsics: Path | No
     colours = _matched_colours(pictures, depths, TUM_MATCH_S if tum else 0.0)
     recording = _open(folder.name, depths, colours, scale_m, intrinsics, lens, root)
     recording = replace(recording, unit_from="depth.txt, which marks TUM RGB-D" if tum else "")
+    without = sum(colour is None for colour in colours)
+    if any(colours) and (without or len(pictures) != len(depths)):
+        note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without} depth pictures have no colour"
+        return replace(recording, notes=(*recording.notes, note))
     if pictures and not any(colours):
         what = "time stamp" if tum else "number"
         note = f"none of {len(pictures)} colour pictures has the {what} of a depth picture in its name: no colour"

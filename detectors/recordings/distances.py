@@ -50,7 +50,7 @@ NEAR_M = (0.8, 1.8)
 """Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
 """Beyond the first, any distance keeps so much of the weight of the commonest."""
-SURE, LIKELY, SHOWN = 0.97, 0.75, 0.003
+SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
 """Probabilities: above the first nothing is said but the unit, below the second the user is asked, below the third a
 reading is not offered."""
 MILLIMETRE_SIZES = {
@@ -63,6 +63,9 @@ MILLIMETRE_SIZES = {
 }
 """Image sizes of cameras that all store 1 mm (Azure Kinect and Femto, Kinect v2, iPhone) and the median distance in
 metres that they can reach: the data sheets' range and what bright walls add to it."""
+
+QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
 
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
@@ -300,6 +303,8 @@ def _weights(near: float, median: float, integers: bool, divisor: int, size: tup
         weight = for_integers if integers else for_floats
         if reach_m is not None and unit == "mm":
             weight = 0.0 if median * metres > reach_m else 10 * weight
+        if integers and unit == "4000/m":
+            weight *= QUARTER_SIZES.get(size, 1.0)
         if divisor > 1 and round(1e-3 / metres) == divisor:
             weight *= 100.0
         if not NEAREST_M <= median * metres <= FARTHEST_M:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from harness.vocabulary.capture import Cloud
 
 
+WIDEST_NATIVE_PX = 6.5
+"""The widest filter of a known camera's own image averages 5 pixels; a measured reach scatters by one."""
+
+
 def mm(metres: float) -> str:
     """A length in millimetres, three digits."""
     return f"{1e3 * metres:.3g} mm"
@@ -105,6 +109,11 @@ def _print_frames_used(recording: Recording, cloud: Cloud, name: str) -> None:
     print(recording.unit_text)
     for note in recording.notes:
         print(f"note: {note}")
+    if cloud.noise_reach_px > WIDEST_NATIVE_PX:
+        print(
+            f"note: {cloud.noise_reach_px:.0f} pixels share their noise: the depth was upsampled, aligned to"
+            " another camera or smoothed; sizes are taken with a blur of that many pixels"
+        )
     for left in cloud.left_out:
         print(f"left out: {left.name}: {left.why}")
 

@@ -116,10 +116,13 @@ def opened(arguments: argparse.Namespace, paths: list[Path]) -> Recording:
 
 def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
     """The capture's average as --average says."""
-    from detectors.average import AverageConfig, average
+    from itertools import islice
+
+    from detectors.average import REACH_FRAMES, AverageConfig, average, noise_reach_px
 
     cloud = average(recording, AverageConfig(method=arguments.average))
-    return replace(cloud, projection=recording.projection)
+    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
+    return replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
@@ -177,6 +180,7 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
         "frames_used": cloud.n_frames,
         "frames_left_out": [dataclasses.asdict(left) for left in cloud.left_out],
         "lens": dataclasses.asdict(cloud.lens) if cloud.lens else None,
+        "noise_reach_px": cloud.noise_reach_px or None,
         "depth_unit": {"mm": 1e3 * recording.scale_m, "from": recording.unit_from},
         "rounding_step_mm": 1e3 * cloud.z_step_m,
         "notes": recording.notes,

@@ -114,6 +114,8 @@ class Cloud:
     how its grid samples space: "central" (rays through the origin, a camera) or "parallel" (equal cells in x and y, a
     map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts included, where its maker
     states it; a plain average does not. ``map_views``: of a map, what it was made from, where its maker says.
+    ``noise_reach_px``: the distance at which pixels no longer share their noise, which is the side of the square that
+    filter and interpolation blur over; 0 where nobody measured it.
     """
 
     points_m: np.ndarray
@@ -131,6 +133,7 @@ class Cloud:
     projection: Literal["central", "parallel"] = "central"
     mean_variance_m2: np.ndarray | None = None
     map_views: MapViews | None = None
+    noise_reach_px: float = 0.0
 
     @property
     def valid(self) -> np.ndarray:
