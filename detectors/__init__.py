@@ -19,6 +19,7 @@ GROUP = "tofpod.detectors"
 
 BUILT_IN = {
     "blind": "detectors.blind:BlindDetector",
+    "local": "detectors.local:LocalDetector",
     "oracle": "detectors.oracle:Oracle",
     "thesis": "detectors.thesis:ThesisDetector",
 }

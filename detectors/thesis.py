@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
 from detectors.median import median_of, median_size_of
-from detectors.rounding import rounding_left_m2
+from detectors.rounding import rounding_variances
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surface import SurfaceConfig, fit_surface
 from detectors.surface_kernels import columns_at
@@ -109,31 +109,9 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
-    """The standard deviation that the rounding of z leaves in the average, metres: the least credible scale.
-
-    Rounding to a step q errs by q / sqrt(12). Noise of deviation s before the rounding (a dither) turns part of that
-    into noise, which averages out, and leaves a fixed pattern with the variance b^2 (`rounding_left_m2`). So after n
-    frames the rounding's variance is b^2 + (q^2 / 12 - b^2) / n. s^2 is the frames' median variance less q^2 / 12; on a
-    surface so quiet that most pixels never change it is 0 and the floor stays q / sqrt(12), 0.29 mm for 1 mm; likewise
-    where the averaged z still lies on the steps, as a median does. Without a step, z is taken to have been stored as
-    float32.
-    """
-    z = cloud.points_m[..., 2][mask]
-    step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
-    whole = step**2 / 12.0
-    if cloud.n_frames > 2 and _on_half_steps(z, step):
-        return float(np.sqrt(whole))
-    variances = cloud.variance_m2[mask]
-    variances = variances[np.isfinite(variances)]
-    dither = max(median_of(variances) - whole, 0.0) if len(variances) else 0.0
-    fixed = rounding_left_m2(step, dither)
-    return float(np.sqrt(fixed + (whole - fixed) / max(cloud.n_frames, 1)))
-
-
-def _on_half_steps(z: np.ndarray, step: float) -> bool:
-    """Whether nine in ten of some points lie on multiples of half a step (the median of an even number of frames)."""
-    some = z[:: max(1, len(z) // 1000)] / (0.5 * step)
-    return bool(np.mean(np.abs(some - np.round(some)) < 0.01) > 0.9)
+    """The standard deviation that the rounding of z leaves in the average, metres (`rounding_variances`): the least
+    credible scale."""
+    return float(np.sqrt(sum(rounding_variances(cloud, mask))))
 
 
 def _spread(residual: np.ndarray, z: np.ndarray, scale: str) -> float:

@@ -1,0 +1,188 @@
+"""The local detector: the contract, single pixels, neighbours, the noise of each place, clouds without a grid, maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detectors.interface import Detection
+from detectors.local import LocalConfig, LocalDetector
+from harness.testing import check_detector
+from harness.testing.clouds import LENS
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Region
+
+SHAPE = (200, 240)
+NOISE_M = 3e-4
+DETECTOR = LocalDetector(LocalConfig.from_data({"crop": {"kind": "none"}}))
+
+
+def seen(depth_m: Callable[[np.ndarray, np.ndarray], np.ndarray], seed: int = 1, noise_m: float = NOISE_M) -> Cloud:
+    """A frontal plane at 0.7 m, 1.4 mm a pixel, with ``depth_m(u, v)`` of pixels added and white noise."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    z = 0.7 + depth_m(u, v) + noise_m * np.random.default_rng(seed).standard_normal(SHAPE)
+    slopes = np.stack([(u - 119.5) / LENS.fx, (v - 99.5) / LENS.fy, np.ones(SHAPE)], axis=-1)
+    flat = np.zeros(SHAPE, dtype=np.uint8)
+    return Cloud(
+        points_m=slopes * z[..., None],
+        reason=flat,
+        count=flat.astype(np.int64) + 20,
+        variance_m2=np.full(SHAPE, 20 * noise_m**2),
+        region=Region(0, SHAPE[0], 0, SHAPE[1]),
+        z_step_m=0.0,
+        n_frames=20,
+    )
+
+
+def disc(u0: float, v0: float, radius_px: float, depth_m: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    return lambda u, v: depth_m * (np.hypot(u - u0, v - v0) < radius_px)
+
+
+def found(cloud: Cloud, threshold: float = 6.0) -> tuple[Detection, ...]:
+    return DETECTOR.find(cloud, DETECTOR.analyse(cloud), threshold)
+
+
+def places_px(cloud: Cloud, detections: tuple[Detection, ...]) -> np.ndarray:
+    """(n, 2) column and row, by column."""
+    centres = np.array([one.centre_m for one in detections]).reshape(-1, 3)
+    slopes = centres[:, :2] / centres[:, 2:]
+    return np.array(sorted((slopes * [LENS.fx, LENS.fy] + [119.5, 99.5]).tolist())).reshape(-1, 2)
+
+
+def test_it_keeps_the_contract() -> None:
+    check_detector(LocalDetector)
+
+
+def test_white_noise_scores_as_noise_does() -> None:
+    """Some 4,000 independent means of seven widths: beyond 6 deviations by chance with probability 5e-5."""
+    evidence = DETECTOR.analyse(seen(lambda u, v: 0 * u))
+    assert 3.0 < DETECTOR.quiet_threshold(seen(lambda u, v: 0 * u), evidence) < 6.0
+
+
+def test_what_no_single_pixel_shows_is_found_by_its_mean() -> None:
+    """A dent of one deviation, 30 pixels wide: 700 pixels, so that their mean stands out by 20 deviations."""
+    cloud = seen(disc(120, 100, 15, NOISE_M))
+    places = places_px(cloud, found(cloud))
+    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 4
+
+
+def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is() -> None:
+    def holes(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        flying = 0.5 * ((u == 60) & (v == 80))
+        return flying + disc(170, 120, 2.0, 0.005)(u, v)
+
+    cloud = seen(holes)
+    places = places_px(cloud, found(cloud))
+    assert len(places) == 1 and np.abs(places[0] - [170, 120]).max() < 1
+
+
+def test_neighbours_stay_apart_and_a_deep_hole_hides_no_shallow_one() -> None:
+    """Two diameters from centre to centre; gaps of 7 mm, which a linkage of 10 mm closes. The deep hole is 100 times as
+    deep as its neighbour."""
+    row = [(60.0, 0.003), (70.0, 0.003), (80.0, 0.003), (150.0, 0.2), (164.0, 0.002)]
+    cloud = seen(lambda u, v: sum((disc(u0, 100, 2.5, depth)(u, v) for u0, depth in row), start=0 * u))
+    places = places_px(cloud, found(cloud))
+    assert np.abs(places[:, 0] - [u0 for u0, _ in row]).max() < 1.5
+
+
+def test_a_deep_hole_leaves_no_ring_of_false_findings() -> None:
+    cloud = seen(disc(120, 100, 12, 0.03))
+    assert len(found(cloud, 5.5)) == 1
+
+
+def test_holes_and_bumps_side_by_side_are_findings_of_their_own() -> None:
+    cloud = seen(lambda u, v: disc(100, 100, 5, 0.004)(u, v) - disc(111, 100, 5, 0.004)(u, v))
+    evidence = DETECTOR.analyse(cloud)
+    detections = DETECTOR.find(cloud, evidence, 6.0)
+    depths = [DETECTOR.measure(cloud, evidence, one).model_depth_m for one in detections]
+    assert sorted(np.sign(depths)) == [-1, 1]
+
+
+def test_noise_counts_where_it_is() -> None:
+    """Ten times the noise on the right half: a hole that is found in the quiet half is lost in the noise there, and
+    the noisy half calls no more often. The window of the noise blurs the step itself."""
+    rough = np.random.default_rng(5).standard_normal(SHAPE)
+
+    def half(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        noise = np.where(u >= 120, 10 * NOISE_M * rough, 0.0)
+        return noise + disc(60, 100, 3, 0.0015)(u, v) + disc(180, 100, 3, 0.0015)(u, v)
+
+    places = places_px(seen(half), found(seen(half)))
+    away = places[np.abs(places[:, 0] - 120) > 50]
+    assert len(away) == 1 and abs(away[0, 0] - 60) < 2
+
+
+def test_invalid_pixels_and_borders_are_not_evidence() -> None:
+    cloud = seen(disc(120, 100, 4, 0.004))
+    gone = np.random.default_rng(3).random(SHAPE) < 0.3
+    gone[40:60, 40:60] = True
+    holed = replace(cloud, points_m=np.where(gone[..., None], np.nan, cloud.points_m))
+    places = places_px(holed, found(holed))
+    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 2
+
+
+def test_a_cloud_without_a_grid_is_judged_on_a_raster() -> None:
+    cloud = seen(disc(120, 100, 6, 0.005))
+    order = np.random.default_rng(2).permutation(SHAPE[0] * SHAPE[1])
+
+    def listed(image: np.ndarray) -> np.ndarray:
+        return image.reshape(1, len(order), *image.shape[2:])[:, order]
+
+    names = ("points_m", "reason", "count", "variance_m2")
+    region = Region(0, 1, 0, len(order))
+    loose = replace(cloud, organised=False, region=region, **{name: listed(getattr(cloud, name)) for name in names})
+    places = places_px(loose, found(loose))
+    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 2
+
+
+def test_a_map_trusts_points_by_their_variance() -> None:
+    """Every second column is ten times as noisy: with variances the dent stands out by the quiet columns alone."""
+    rough = 10 * NOISE_M * np.random.default_rng(4).standard_normal(SHAPE)
+    cloud = seen(lambda u, v: np.where(u % 2 == 1, rough, 0.0) + disc(120, 100, 6, 0.0015)(u, v))
+    noise = np.where(np.arange(SHAPE[1]) % 2 == 1, 10 * NOISE_M, NOISE_M)
+    stated = replace(cloud, mean_variance_m2=np.broadcast_to(noise**2, SHAPE).copy())
+    scores = [DETECTOR.analyse(one).score[97:104, 117:124].max() for one in (cloud, stated)]
+    assert scores[1] > 2 * scores[0] and scores[1] > 8
+
+
+def test_many_thresholds_at_once_are_those_one_by_one() -> None:
+    cloud = seen(lambda u, v: disc(80, 60, 4, 0.004)(u, v) + disc(150, 130, 8, 0.002)(u, v))
+    evidence = DETECTOR.analyse(cloud)
+    thresholds = (3.0, 4.0, 8.0)
+    for centres, threshold in zip(DETECTOR.centres_at(cloud, evidence, thresholds), thresholds, strict=True):
+        single = [one.centre_m for one in DETECTOR.find(cloud, evidence, threshold)]
+        np.testing.assert_array_equal(centres, np.array(single).reshape(-1, 3))
+
+
+MOUTHS_U = (190, 300, 407, 517, 626, 736, 218, 321, 423, 729, 836, 944, 1059)
+MOUTHS_U += (244, 340, 437, 726, 825, 721, 816, 718, 809, 902, 716, 803, 390)
+MOUTHS_V = (603, 602, 601, 603, 603, 605, 492, 491, 491, 491, 493, 493, 494)
+MOUTHS_V += (394, 394, 393, 392, 392, 303, 302, 222, 219, 216, 147, 144, 85)
+MOUTHS_PX = np.array([MOUTHS_U, MOUTHS_V]).T
+"""Mouths of a drilled plate that nothing lies beside, read off the mean depth by eye, to some 3 pixels."""
+
+
+def test_a_real_drilled_plate(shared_data: Path) -> None:
+    """A metal plate with holes of 5 mm at 0.25 m, with tags and an object on it, seen by an Azure Kinect."""
+    from detectors.average import AverageConfig, average
+    from detectors.recordings import open_capture
+
+    folder = shared_data / "azure_drilled_board"
+    if not folder.is_dir():
+        pytest.skip("the capture of the drilled plate is not here")
+    cloud = average(open_capture([folder]), AverageConfig())
+    detector = LocalDetector(LocalConfig())
+    evidence = detector.analyse(cloud)
+    holes = [
+        detector.measure(cloud, evidence, one)
+        for one in detector.find(cloud, evidence, 5.0)
+        if np.median(evidence.residual_m.reshape(-1)[one.pixels]) > 0
+    ]
+    places = np.array([(one.u_px, one.v_px) for one in holes])
+    apart = np.linalg.norm(MOUTHS_PX[:, None] - places[None], axis=-1)
+    hit = apart.min(axis=1) < 12
+    assert hit.sum() >= len(MOUTHS_PX) - 1
