@@ -14,11 +14,14 @@ from scipy.stats import binom
 from detectors import load_detector
 from detectors.interface import Detection, Evidence
 from detectors.missing import ALPHA, measure_missing, missing_returns, one_damage_once
+from harness.evaluation.study.limit import limit_of
 from harness.inspection.steps import judged as judged_cloud
 from harness.report.findings import write_findings
+from harness.report.study_rows import limit_rows
 from harness.testing.clouds import LENS, SHAPE, plane, without
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
+from tests.synthetic_study import study_record
 
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]]
 FIELD = (90, 120)
@@ -191,3 +194,20 @@ def test_findings_without_return_stand_in_the_table_and_a_map_of_blind_pixels_be
     line = next(text for text in (tmp_path / "findings.csv").read_text().splitlines() if "no return" in text)
     assert line.split(",")[8:10] == ["", ""]
     assert cv2.imread(str(tmp_path / "blind.png")).std() > 0
+
+
+def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
+    """The limit's row says both kinds; a record of hits by depth alone says no kind."""
+    record = study_record().set_ups[0]
+    by_depth = record.inspected.hit.copy()
+    lost = np.flatnonzero(~by_depth)[:5]
+    unseen = np.zeros(len(by_depth), bool)
+    unseen[lost] = True
+    seen = replace(record.inspected, hit=by_depth | unseen, by_depth=by_depth, by_no_return=unseen)
+
+    both, alone = limit_rows([limit_of(replace(record, inspected=seen), draws=50), limit_of(record, draws=50)])
+
+    n, hits = len(by_depth), int(by_depth.sum())
+    assert both.found == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
+    assert f"5 of {hits + 5} hits by missing returns alone" in both.why
+    assert alone.found == f"{hits} of {n}"

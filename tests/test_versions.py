@@ -11,7 +11,7 @@ import pytest
 
 from harness import design
 from harness.compare import write_comparison
-from harness.evaluation.study.record import RECORD_VERSION, read_record, record_text
+from harness.evaluation.study.record import OLDEST_VERSION, RECORD_VERSION, read_record, record_text
 from harness.evaluation.study.verdict import compare_studies
 from harness.experiment.load import EXPERIMENT_VERSION, load_experiment, resolved_yaml
 from harness.inspection.poses import POSES_KEY, read_poses
@@ -80,7 +80,7 @@ def test_the_stamp_of_a_text(text, found):
     ("version", "told"),
     [
         (RECORD_VERSION + 1, f"newer tofpod: it is a record of version {RECORD_VERSION + 1}"),
-        (RECORD_VERSION - 1, f"is a record of version {RECORD_VERSION - 1}"),
+        (OLDEST_VERSION - 1, f"is a record of version {OLDEST_VERSION - 1}"),
         (None, "states no version"),
         ("one", "states the version 'one'"),
     ],

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from detectors.interface import FindsAtOnce
-from harness.engine.judge import Judgement, centres_m
+from detectors.missing import missing_returns, one_damage_once
+from harness.engine.judge import Judgement, centres_m, places_of
 from harness.engine.sight import Sight
 from harness.engine.sight_kernels import highest_within
 from harness.evaluation.match import match
@@ -36,16 +37,22 @@ class Judged:
 
 
 def study_rows(sight: Sight, judgement: Judgement, radius_m: float, *, hole_free: bool) -> Judged:
-    """The rows of one board: of a board that only sets a threshold, the area that was judged."""
+    """The rows of one board: of a board that only sets a threshold, the area that was judged, and what stood out most
+    and where. Findings without return stand in ``no_return`` of each damage and ``no_return_calls`` of the run, beside
+    those by depth."""
     score = judgement.evidence.score
     run = {**judgement.run, "inspected_m2": sight.area_m2(np.isfinite(score))}
     threshold = run["threshold"]
     if np.isnan(threshold):
-        return Judged(run, [])
+        return Judged(run | _loudest(sight, score), [])
+    without_return, calls = _without_return(sight, judgement, radius_m, hole_free=hole_free)
+    run["no_return_calls"] = calls
     signals = highest_within(sight.places_m, score, centres_m(sight), radius_m).tolist()
     sites = list(_sites(sight, judgement, signals)) if hole_free else []
     judged = [] if hole_free else zip(judgement.holes, signals, strict=True)
-    holes = [{**row, "signal": signal} for row, signal in judged]
+    holes = [
+        {**row, "signal": signal, "no_return": number in without_return} for number, (row, signal) in enumerate(judged)
+    ]
     tables = {
         "sites": sites,
         "findings": list(_findings(sight, judgement, hole_free=hole_free)),
@@ -53,6 +60,33 @@ def study_rows(sight: Sight, judgement: Judgement, radius_m: float, *, hole_free
         "pixels": [] if hole_free else list(_pixels(sight, score, threshold)),
     }
     return Judged(run, holes, tables)
+
+
+def _loudest(sight: Sight, score: np.ndarray) -> dict[str, float]:
+    """Where on the board the pixel with the highest score lies; NaN where it is off the board."""
+    if not np.isfinite(score).any():
+        return {"loudest_x_mm": np.nan, "loudest_y_mm": np.nan}
+    x_m, y_m = sight.places_m.reshape(-1, 2)[int(np.nanargmax(score))]
+    return {"loudest_x_mm": float(x_m) / MM, "loudest_y_mm": float(y_m) / MM}
+
+
+def _without_return(
+    sight: Sight, judgement: Judgement, radius_m: float, *, hole_free: bool
+) -> tuple[frozenset[int], int]:
+    """Damages (indices into the truth) that a finding without return hits, and how many of these findings are false
+    calls: those that hit none and are no part of a finding by depth. None for detectors that test the harness, whose
+    findings are not what a cloud shows."""
+    cloud = sight.cloud
+    tests = getattr(judgement.detector, "tests_the_harness", False)
+    missing = None if tests else missing_returns(cloud, judgement.evidence)
+    if missing is None or not missing.detections:
+        return frozenset(), 0
+    found = missing.detections
+    pairs = {} if hole_free else match(centres_m(sight), places_of(sight, found), radius_m)
+    hits = {id(found[number]) for number in pairs.values()}
+    alone = one_damage_once(cloud.valid.shape, judgement.detections, found)
+    calls = sum(one.kind == "no return" and id(one) not in hits for one in alone)
+    return frozenset(pairs), calls
 
 
 def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:

@@ -18,7 +18,7 @@ from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
 from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.versions import check_version
 
-JOURNAL_VERSION = 4
+JOURNAL_VERSION = 5
 """Raised by every change to the records' content or to what a trial computes."""
 SUFFIX = ".jsonl"
 NOTHING = "null"

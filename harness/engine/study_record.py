@@ -61,8 +61,9 @@ def _set_up(point: Point, group: Group, tables: Tables, failed: int) -> SetUpRec
         unflawed=Unflawed(
             board=unflawed["board"].to_numpy(int),
             repeat=unflawed["repeat"].to_numpy(int),
-            calls=unflawed["false_calls"].to_numpy(int),
+            calls=(unflawed["false_calls"] + unflawed["no_return_calls"]).to_numpy(int),
             area_m2=unflawed["inspected_m2"].to_numpy(float),
+            no_return_calls=unflawed["no_return_calls"].to_numpy(int),
         ),
     )
 
@@ -74,6 +75,7 @@ def _of(table: pd.DataFrame, variant: str, frames: int) -> pd.DataFrame:
 
 
 def _inspected(holes: pd.DataFrame) -> Inspected:
+    by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
     return Inspected(
         board=holes["board"].to_numpy(int),
         hole=holes["hole"].to_numpy(str),
@@ -82,8 +84,10 @@ def _inspected(holes: pd.DataFrame) -> Inspected:
         depth_mm=holes["true_depth_mm"].to_numpy(float),
         x_mm=holes["true_x_mm"].to_numpy(float),
         y_mm=holes["true_y_mm"].to_numpy(float),
-        hit=holes["detected"].to_numpy(bool),
+        hit=by_depth | by_no_return,
         signal=holes["signal"].to_numpy(float),
+        by_depth=by_depth,
+        by_no_return=by_no_return,
     )
 
 

@@ -190,7 +190,7 @@ def _row(limit: SetUpLimit) -> LimitRow:
         a90_95=bound_text(limit.a90_95, most_mm),
         over_boards=bound_text(limit.over_boards, most_mm),
         false_calls=rate_text(limit.false_calls),
-        found=f"{limit.hits} of {limit.inspections}",
+        found=_found(limit),
         targets=str(limit.targets),
         boards=str(limit.boards),
         effect=f"{limit.design_effect:.2f}" if np.isfinite(limit.design_effect) else "–",
@@ -198,6 +198,14 @@ def _row(limit: SetUpLimit) -> LimitRow:
         over_demonstrated=limit.over_boards.demonstrated and not limit.beyond(limit.over_boards.value),
         notes=tuple(_beside(limit)),
     )
+
+
+def _found(limit: SetUpLimit) -> str:
+    """Hits, and in brackets those by each kind of finding."""
+    seen, text = limit.record.inspected, f"{limit.hits} of {limit.inspections}"
+    if seen.by_depth is None or seen.by_no_return is None:
+        return text
+    return f"{text} ({int(seen.by_depth.sum())} by depth, {int(seen.by_no_return.sum())} by missing returns)"
 
 
 def _beside(limit: SetUpLimit) -> list[str]:
@@ -213,6 +221,9 @@ def _beside(limit: SetUpLimit) -> list[str]:
     if limit.boards_matter:
         effect = f"design effect {limit.design_effect:.1f}"
         said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
+    only = limit.hits if limit.record.inspected.by_depth is None else int(limit.record.inspected.by_depth.sum())
+    if only < limit.hits:
+        said.append(f"{limit.hits - only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
     if limit.record.failed:
         said.append(f"{limit.record.failed} trials failed and are missing")
     return said

@@ -12,7 +12,7 @@ from harness.evaluation.pod.statement import CONFIDENCE, PodStatement
 from harness.evaluation.study.chance import ChanceHits
 from harness.evaluation.study.curves import PRO_LIMIT
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.record import StudyRecord
+from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import SetUpResult
 from harness.report.page_parts import mm
 from harness.report.study_rows import bound_text, mm_text, name_of, percent_text, unmeasured, with_interval
@@ -57,7 +57,7 @@ def threshold_rows(limits: Sequence[SetUpLimit]) -> Rows:
                 f"{record.threshold:.3g}",
                 mm(record.threshold_mm),
                 str(record.calibration_runs) if record.calibration_runs else "none: given",
-                "–" if calls is None else _counted(calls),
+                "–" if calls is None else _counted(calls) + _unseen(record.unflawed),
                 "–" if calls is None else with_interval(calls.rate_per_m2, calls.interval_per_m2),
                 f"{over.low:.2f} to {over.high:.2f}" if over.known else "–",
             )
@@ -151,6 +151,11 @@ def threshold_note(record: StudyRecord) -> str:
 
 def _counted(calls: FalseCallRate) -> str:
     return f"{calls.calls} call{'' if calls.calls == 1 else 's'} on {calls.area_m2:.3g} m²"
+
+
+def _unseen(unflawed: Unflawed) -> str:
+    """False calls without return among those counted."""
+    return "" if unflawed.no_return_calls is None else f", {int(unflawed.no_return_calls.sum())} without return"
 
 
 def _tests(statement: PodStatement) -> list[tuple[str, str]]:

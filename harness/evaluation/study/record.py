@@ -19,8 +19,10 @@ from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
 from harness.vocabulary.versions import check_version
 
-RECORD_VERSION = 1
-"""Raised when a field's meaning, or what counts as a hit, changes: records of two versions cannot be compared."""
+RECORD_VERSION = 2
+"""1: hits by depth alone. Raised when a field's meaning, or what counts as a hit, changes."""
+OLDEST_VERSION = 1
+"""Still read: where nothing is lost by missing returns its hits are those of today."""
 LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
 AGAIN = "run the study again, which writes the file anew; it is not made to be edited by hand"
 
@@ -31,7 +33,8 @@ class Inspected:
 
     ``board``, ``repeat`` (n,) int, ``hole`` (n,) str name it; ``diameter_mm``, ``depth_mm`` (removed material),
     ``x_mm``, ``y_mm`` (on the board) are true. ``hit`` (n,) bool. ``signal`` (n,): the highest score within the hit
-    radius of the damage's centre, NaN where no pixel there was judged.
+    radius of the damage's centre, NaN where no pixel there was judged. ``by_depth``, ``by_no_return`` (n,) bool: hits
+    by each kind of finding, either of which is a ``hit``; None where hits were counted by depth alone.
     """
 
     board: np.ndarray
@@ -43,17 +46,20 @@ class Inspected:
     y_mm: np.ndarray
     hit: np.ndarray
     signal: np.ndarray
+    by_depth: np.ndarray | None = None
+    by_no_return: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
     """Runs on hole-free boards that set no threshold: ``board``, ``repeat`` (m,) int, ``calls`` (m,) int false calls,
-    ``area_m2`` (m,) of face that was judged."""
+    ``area_m2`` (m,) of face that was judged; ``no_return_calls`` (m,) int: calls without return among them, or None."""
 
     board: np.ndarray
     repeat: np.ndarray
     calls: np.ndarray
     area_m2: np.ndarray
+    no_return_calls: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +135,7 @@ def read_record(path: Path) -> StudyRecord:
         raise UserError(f"{file}: is no JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
         raise UserError(f"{file}: is no study's record", legal=LEGAL)
-    check_version(data["record_version"], RECORD_VERSION, file, "a record", again="run the study again")
+    check_version(data["record_version"], RECORD_VERSION, file, "a record", oldest=OLDEST_VERSION, again=AGAIN)
     if wrong := mistake_in(data):
         raise UserError(f"{file}: is damaged: {wrong}", fix=AGAIN)
     named = {field.name: data[field.name] for field in fields(StudyRecord) if field.name != "set_ups"}
@@ -143,18 +149,20 @@ def _set_up_data(one: SetUpRecord) -> dict[str, Any]:
 
 
 def _columns(table: Inspected | Unflawed) -> dict[str, list[Any]]:
-    columns = {field.name: getattr(table, field.name).tolist() for field in fields(table)}
+    there = {field.name: getattr(table, field.name) for field in fields(table)}
+    columns = {name: column.tolist() for name, column in there.items() if column is not None}
     return {name: [None if value != value else value for value in column] for name, column in columns.items()}
 
 
 def _set_up(data: Mapping[str, Any]) -> SetUpRecord:
     plain = {f.name: data[f.name] for f in fields(SetUpRecord) if f.name not in ("inspected", "unflawed")}
     plain["threshold_mm"] = np.nan if plain["threshold_mm"] is None else plain["threshold_mm"]
-    inspected = Inspected(**{f.name: _array(f.name, data["inspected"][f.name]) for f in fields(Inspected)})
-    unflawed = Unflawed(**{f.name: _array(f.name, data["unflawed"][f.name]) for f in fields(Unflawed)})
+    inspected = Inspected(**{name: _array(name, column) for name, column in data["inspected"].items()})
+    unflawed = Unflawed(**{name: _array(name, column) for name, column in data["unflawed"].items()})
     return SetUpRecord(**plain, inspected=inspected, unflawed=unflawed)
 
 
 def _array(name: str, column: list[Any]) -> np.ndarray:
-    kind: Any = {"board": int, "repeat": int, "calls": int, "hole": str, "hit": bool}.get(name, float)
+    kinds: dict[str, Any] = {"board": int, "repeat": int, "calls": int, "no_return_calls": int, "hole": str}
+    kind = bool if name in ("hit", "by_depth", "by_no_return") else kinds.get(name, float)
     return np.array([np.nan if value is None else value for value in column], kind)

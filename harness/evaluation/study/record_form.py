@@ -34,7 +34,8 @@ class _Columns(Config):
 
     @model_validator(mode="after")
     def _one_table(self) -> _Columns:
-        columns = {name: getattr(self, name) for name in type(self).model_fields}
+        there = {name: getattr(self, name) for name in type(self).model_fields}
+        columns = {name: column for name, column in there.items() if column is not None}
         lengths = {len(column): name for name, column in columns.items()}
         if len(lengths) > 1:
             raise ValueError("columns of different lengths: " + ", ".join(f"`{k}` {n}" for n, k in lengths.items()))
@@ -54,6 +55,8 @@ class InspectedForm(_Columns):
     y_mm: tuple[float, ...]
     hit: tuple[bool, ...]
     signal: tuple[float | None, ...]
+    by_depth: tuple[bool, ...] | None = None
+    by_no_return: tuple[bool, ...] | None = None
 
 
 class UnflawedForm(_Columns):
@@ -61,6 +64,7 @@ class UnflawedForm(_Columns):
 
     calls: tuple[Number, ...]
     area_m2: tuple[Size, ...]
+    no_return_calls: tuple[Number, ...] | None = None
 
 
 class SetUpForm(Config):
