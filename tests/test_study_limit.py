@@ -34,7 +34,7 @@ def with_hits(record: SetUpRecord, hit: np.ndarray) -> SetUpRecord:
 
 
 def first_rows(record: SetUpRecord, n: int) -> SetUpRecord:
-    columns = {field.name: getattr(record.inspected, field.name)[:n] for field in dataclasses.fields(Inspected)}
+    columns = {name: column[:n] for name, column in vars(record.inspected).items() if column is not None}
     return dataclasses.replace(record, inspected=Inspected(**columns))
 
 
