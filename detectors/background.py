@@ -11,7 +11,7 @@ Not modelled: creases, several sheets, surfaces with real structure that is as s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,8 +35,12 @@ TILE_CELLS, FOLDS = 3, 5
 DEGREES = (1, 2, 3, 4, 5)
 TUNING = 4.685
 """Tukey's bisquare, 95 % efficient."""
+LEAST_SCALE_M = 0.04
+"""Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows such shapes."""
 WORTH = 0.1
 """Of the noise of a pixel: a shape whose typical error of prediction is no more than this above the best is as good."""
+NOISIER = 1.25
+"""Five standard errors of the median of 49 deviations of 16 pixels each: below it noise is taken to be even."""
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
 
@@ -194,26 +198,34 @@ def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
 
 
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
-    candidates = [_fitted(cells, _degree_name(d), _of_degree(d), None) for d in DEGREES]
-    candidates.insert(2, _fitted(cells, "quadric", lambda p, w: quadric(p, w, cells.central), None))
-    shapes = [shape for shape in candidates if shape is not None]
-    errors = np.array([_prediction_errors(cells, shape) for shape in shapes])
+    shapes: list[_Shape] = []
+    errors: list[np.ndarray] = []
     worth = WORTH * _pixel_noise(cells)
+    for name, fit_to in _formulas(cells):
+        shape = _fitted(cells, name, fit_to, None)
+        if shape is not None:
+            shapes.append(shape)
+            errors.append(_prediction_errors(cells, shape))
+        # two more that predict no better end the search
+        if len(shapes) > 2 and _simplest(errors, worth) <= len(shapes) - 3:
+            break
     best = shapes[_simplest(errors, worth)]
     if config.shape == "auto" and _structure(cells, best.fit)[0] < FREE_FORM_FROM:
         return best
-    base = shapes[int(np.argmin(errors.mean(axis=1)))]
+    base = shapes[int(np.argmin([each.mean() for each in errors]))]
     free = [best] if config.shape == "auto" else []
     for wavelength in _wavelengths(cells, config):
         made = _fitted(cells, "free form", _of_wavelength(cells, base, wavelength), wavelength)
         if made is not None:
             free.append(made)
-    errors = np.array([_prediction_errors(cells, shape) for shape in free])
-    return free[_simplest(errors, worth)]
+    return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
 
 
-def _degree_name(degree: int) -> str:
-    return "plane" if degree == 1 else f"polynomial of degree {degree}"
+def _formulas(cells: _Cells) -> list[tuple[str, Callable[[np.ndarray, np.ndarray], Fit | None]]]:
+    """Simple ones first."""
+    named = [("plane" if d == 1 else f"polynomial of degree {d}", _of_degree(d)) for d in DEGREES]
+    named.insert(2, ("quadric", lambda points, weights: quadric(points, weights, cells.central)))
+    return named
 
 
 def _of_degree(degree: int) -> Callable[[np.ndarray, np.ndarray], Fit | None]:
@@ -228,12 +240,12 @@ def _of_wavelength(cells: _Cells, base: _Shape, wavelength: float) -> Callable[[
 
 
 def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
-    """In the picture's units, long ones first: down to 8 cells, twice what is predicted together."""
+    """In the picture's units, long ones first: down to twice what is predicted together, or the least scale."""
     if config.scale_mm is not None:
         return [2 * config.scale_mm * MM * cells.side / cells.side_m]
     longest = max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1
     ladder, cells_long = [], float(longest)
-    while cells_long >= 2 * TILE_CELLS:
+    while cells_long >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
         ladder.append(cells_long * cells.side)
         cells_long /= 1.6
     return ladder or [longest * cells.side]
@@ -259,9 +271,11 @@ def _fitted(
         known = np.isfinite(error) & (cells.weights > 0)
         if known.sum() < 0.98 * (cells.weights > 0).sum():
             return None
-        scale = max(median_size_of(error[known]) / 0.6745, floor)
+        scale, before = max(median_size_of(error[known]) / 0.6745, floor), weights
         robust = bisquare_weights(np.where(known, error, np.inf), TUNING * scale)
         weights = cells.weights * (robust * ~_beside(cells, robust == 0) if widened else robust)
+        if np.abs(weights - before).max() < 0.05:
+            break
     return None if fit is None else _Shape(name, fit_to, fit, weights, wavelength)
 
 
@@ -300,10 +314,10 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
     return _group_medians(np.abs(error), tile, int(tile.max()) + 1)[0]
 
 
-def _simplest(errors: np.ndarray, worth: float) -> int:
-    """The first of shapes, simple ones first, whose mean error (shapes, tiles) is above the least by no more than
-    ``worth`` or a standard error of the difference."""
-    means = errors.mean(axis=1)
+def _simplest(errors: Sequence[np.ndarray], worth: float) -> int:
+    """The first of shapes, simple ones first, whose mean error over tiles is above the least by no more than ``worth``
+    or a standard error of the difference. ``errors``: (tiles,) of each shape."""
+    means = [each.mean() for each in errors]
     best = int(np.argmin(means))
     for i in range(best):
         difference = errors[i] - errors[best]
@@ -364,34 +378,85 @@ def _judged(
     points: np.ndarray, mask: np.ndarray, cells: _Cells, name: str, fit: Fit, wavelength: float | None
 ) -> Background:
     fitted = fit(points)
+    unseen = ~(np.isfinite(fitted) & ~_too_steep(cells, points, fit))
+    fitted[unseen] = np.nan
     cells = _refreshed(cells, points, fit)
-    share, rms, _ = _structure(cells, fit)
-    noise = _noise_map(cells)
-    pixel = _pixel_noise(cells)
+    warning, notes = _misfit(cells, fit, name)
     scale_m = None if wavelength is None else 0.5 * wavelength * cells.side_m / cells.side
-    fits = share < MISFIT_FROM
-    warning = (
-        ""
-        if fits
-        else (
-            f"the surface ({name}) does not fit here: structure of {1e3 * rms:.2g} mm rms at scales above"
-            f" {STRUCTURE_CELLS * cells.side_m / MM:.3g} mm, where a pixel's noise is {1e3 * pixel:.2g} mm, on"
-            f" {100 * share:.0f} % of the target; findings there may be the surface's own shape"
-        )
-    )
     text = name
     if scale_m is not None:
-        text += f", follows shapes wider than {scale_m / MM:.0f} mm: shallow dents that wide are taken for shape"
-    of = cells.of.copy()
-    pixels = np.where(of >= 0, noise[of], pixel)
-    notes = {"misfit_share": share, "misfit_rms_m": rms, "shape": name}
-    return Background(
-        _on(mask, fitted), _on(mask, points[:, 2] - fitted), _on(mask, pixels), text, scale_m, fits, warning, notes
+        text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
+    if unseen.mean() > 0.001:
+        text += (
+            f"; {100 * unseen.mean():.1f} % of the target, seen at more than {STEEPEST_DEG:g} degrees, is not judged"
+        )
+    noise = np.where(cells.of >= 0, _noise_map(cells)[cells.of], _pixel_noise(cells))
+    images = [_on(mask, each) for each in (fitted, points[:, 2] - fitted, noise)]
+    notes.update(shape=name, steep_share=float(unseen.mean()))
+    return Background(images[0], images[1], images[2], text, scale_m, not warning, warning, notes)
+
+
+def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
+    """A warning where structure is left that would pass for damage; and what was measured."""
+    share, rms_m, _ = _structure(cells, fit)
+    notes: dict[str, Any] = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": _pixel_noise(cells)}
+    if share < MISFIT_FROM:
+        return "", notes
+    text = (
+        f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
+        f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is"
+        f" {1e3 * notes['local_noise_m']:.2g} mm, on {100 * share:.0f} % of the target; findings there may be its shape"
     )
+    return text, notes
+
+
+def _too_steep(cells: _Cells, points: np.ndarray, fit: Fit) -> np.ndarray:
+    """(n,) bool: the surface turns away from the ray by more than `STEEPEST_DEG`; few pixels are near enough to that
+    to be looked at each."""
+    steep = np.zeros(len(points), dtype=bool)
+    if not cells.central:
+        return steep
+    near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
+    looked = np.flatnonzero((cells.of < 0) | near[cells.of])
+    # a ray that misses the surface beside the pixel gives NaN: not below the limit either
+    steep[looked] = ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
+    return steep
+
+
+def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
+    """(n,) angle between the ray and the surface's normal, from the surface a ``step`` in x/z and in y/z beside it."""
+
+    def on_surface(dx: float, dy: float) -> np.ndarray:
+        rays = points / points[:, 2:] + [dx, dy, 0.0]
+        p = rays * points[:, 2:]
+        for _ in range(2):
+            p = rays * fit(p)[:, None]
+        return p
+
+    here = on_surface(0.0, 0.0)
+    normal = np.cross(on_surface(step, 0.0) - here, on_surface(0.0, step) - here)
+    along = np.abs((normal * here).sum(axis=1))
+    return np.asarray(np.degrees(np.arccos(along / (np.linalg.norm(normal, axis=1) * np.linalg.norm(here, axis=1)))))
+
+
+def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
+    """A sentence where a surface that was stated, not chosen, leaves structure that would pass for damage; else "".
+
+    ``residual_m`` (h, w): of the cloud to the surface, NaN where nothing was judged; ``surface``: its name.
+    """
+    mask = np.isfinite(residual_m)
+    points = cloud.points_m[mask]
+    cells = _cells(points, cloud.projection == "central" and len(points) > 0 and float(points[:, 2].min()) > 0)
+    if cells is None:
+        return ""
+    medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
+    level = replace(cells, points=np.column_stack([cells.points[:, :2], medians]), noise=deviations)
+    return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
 def _noise_map(cells: _Cells) -> np.ndarray:
-    """(c,) a pixel's noise about each cell: the median over 7 x 7 cells, at least the target's median."""
+    """(c,) a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is more
+    than `NOISIER` times as much."""
     image = _image(cells, cells.noise)
     rows, columns = image.shape
     padded = np.pad(image, 3, constant_values=np.nan)
@@ -399,7 +464,7 @@ def _noise_map(cells: _Cells) -> np.ndarray:
     with np.errstate(all="ignore"):
         local = np.nanmedian(around[:, cells.row, cells.column], axis=0)
     pixel = _pixel_noise(cells)
-    return np.fmax(local, pixel)
+    return np.where(local > NOISIER * pixel, local, pixel)
 
 
 def _on(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -409,18 +474,12 @@ def _on(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _unjudged(points: np.ndarray, mask: np.ndarray, config: SurfaceConfig) -> Background:
-    stated = config if config.shape == "polynomial" else config.model_copy(update={"degree": 1})
-    name, fit = _stated(points, stated)
+    """Of too few points: a plane, or the stated polynomial, and a warning that nobody can tell whether it fits."""
+    name, fit = _stated(points, config if config.shape == "polynomial" else SurfaceConfig(degree=1))
     fitted = fit(points)
     residual = points[:, 2] - fitted
-    noise = np.full(len(points), median_size_of(residual) / 0.6745)
-    return Background(
-        _on(mask, fitted),
-        _on(mask, residual),
-        _on(mask, noise),
-        f"{name} (too few points to judge)",
-        None,
-        True,
-        "",
-        {},
-    )
+    noise_m = median_size_of(residual) / 0.6745
+    warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
+    images = [_on(mask, each) for each in (fitted, residual, np.full(len(points), noise_m))]
+    notes = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
+    return Background(images[0], images[1], images[2], name, None, False, warning, notes)

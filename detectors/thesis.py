@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from detectors.background import background
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
 from detectors.median import median_of, median_size_of
@@ -32,6 +33,7 @@ SCRIPT_THRESHOLD = 1.2
 class ThesisConfig(ScoreMapConfig):
     """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
 
+    ``surface``: with a shape other than ``polynomial`` one unit of score is the local noise, whatever ``scale`` says.
     ``scale``: the standard deviation that one unit of score means: ``mad`` (median |residual| / 0.6745),
     ``residual_std`` or ``raw_z_std``. ``use_variance``: where the cloud's maker states each point's variance, as a map
     does, one unit of score is a multiple of each point's own deviation, and the scale is taken of residuals over
@@ -73,6 +75,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         Raises UserError on an empty crop and where the points do not determine the surface.
         """
         mask = crop(cloud, self.settings.crop)
+        if self.settings.surface.shape != "polynomial":
+            return self._before_background(cloud, mask)
         x, y, z = columns_at(cloud.points_m, mask)
         surface = fit_surface(x, y, z, self.settings.surface)
         fitted = surface.evaluate(x, y)
@@ -96,6 +100,26 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             surface_z_m=on_grid(fitted, mask),
             scale_m=float(np.median(scale)),
             notes=notes,
+        )
+
+    def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
+        """As `analyse`, with a surface whose shape is chosen: one unit of score is the noise round about each pixel, so
+        that neither the surface's misfit nor a noisy part of the target sets the scale of all of it."""
+        behind = background(cloud, mask, self.settings.surface)
+        unit = np.maximum(behind.noise_m, rounding_floor(cloud, mask))
+        stated = self._stated_deviation(cloud, mask)
+        if stated is not None:
+            deviation = on_grid(stated, mask)
+            known = np.isfinite(behind.residual_m)
+            spread = median_size_of(behind.residual_m[known] / deviation[known]) / 0.6745
+            unit = np.maximum(unit, spread * deviation)
+        return Evidence(
+            score=np.abs(behind.residual_m) / unit,
+            residual_m=behind.residual_m,
+            surface_z_m=behind.surface_z_m,
+            scale_m=float(np.nanmedian(unit)),
+            notes={"surface": behind.description, **behind.notes},
+            warnings=(behind.warning,) if behind.warning else (),
         )
 
     def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:

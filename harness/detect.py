@@ -132,7 +132,7 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
         printed.print_frames(recording)
     cloud = steps.averaged(arguments, recording)
     choice = choice_by(getattr(detector, "settings", None), cloud)
-    evidence = detector.analyse(cloud)
+    evidence = steps.analysed(detector, cloud)
     threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
     judged = steps.judged(detector, cloud, evidence, threshold)
     printed.print_warnings((*recording.warnings, *(choice.warnings if choice else ()), *evidence.warnings))

@@ -45,6 +45,8 @@ def _prepare() -> int:
         evidence = detector.analyse(cloud)
         for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
             detector.measure(cloud, evidence, detection)
+    for shape in ("auto", "free_form"):
+        load_detector("thesis", {"crop": {"kind": "none"}, "surface": {"shape": shape}}).analyse(cloud)
     _prepare_studies(capture, cloud)
     _prepare_maps(cloud)
     print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")

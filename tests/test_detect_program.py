@@ -286,10 +286,11 @@ def test_fewer_points_than_coefficients(tmp_path: Path, capsys: pytest.CaptureFi
     stored = np.zeros((72, 96), np.uint16)
     stored[10:13, 10:13] = 500
     np.save(tmp_path / "d.npy", stored)
-    message = failed(
-        capsys, tmp_path / "d.npy", "--intrinsics", plane.write_lens(tmp_path / "lens.json"), "--crop", "none"
-    )
+    arguments = (tmp_path / "d.npy", "--intrinsics", plane.write_lens(tmp_path / "lens.json"), "--crop", "none")
+    message = failed(capsys, *arguments, "--set", "surface.degree=3")
     assert "9 valid points" in message and "10 coefficients" in message
+    assert detect.main([*map(str, arguments)]) == 0
+    assert capsys.readouterr().out.startswith("warning: 9 points are too few to tell whether the surface (degree 1")
 
 
 def test_a_folder_that_cannot_be_written_is_refused(
@@ -362,8 +363,11 @@ def test_the_drilled_plate_as_it_stands(shared_data: Path, tmp_path: Path, capsy
     findings = rows_of(tmp_path / "findings.csv")
     # The object on the plate is its largest departure: it stands before the surface and is no hole.
     assert float(findings[0]["depth_mm"]) < -10 and float(findings[0]["points"]) > 30_000
-    # Drilled holes whose dark mouths are seen in the colour picture, in pixels; the camera aligns to some 9 px.
-    holes = np.array([(430, 393), (734, 607), (728, 492), (512, 605), (233, 393), (417, 492), (725, 391), (818, 300)])
+    # Drilled holes whose dark mouths are seen in the colour picture, in pixels; the camera aligns to some 9 px. The one
+    # at (233, 393) is not among them: it touches a tag that lies proud of the plate, and both are one finding.
+    holes = np.array([(430, 393), (734, 607), (728, 492), (512, 605), (417, 492), (725, 391), (818, 300)])
+    more = [(625, 605), (836, 492), (320, 491), (219, 492), (720, 303), (1064, 495), (190, 604), (300, 603), (409, 603)]
+    holes = np.concatenate([holes, more])
     found = np.array([(float(row["u_px"]), float(row["v_px"])) for row in findings[1:]])
     nearest = np.linalg.norm(holes[:, None] - found[None], axis=2).min(axis=1)
     assert (nearest < 13).all()

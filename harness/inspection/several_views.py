@@ -202,7 +202,7 @@ def _judge(
     detector: Detector,
 ) -> Inspection:
     cloud = mapped.merged.cloud
-    evidence = detector.analyse(cloud)
+    evidence = steps.analysed(detector, cloud)
     # a quiet capture was refused before
     threshold, origin = steps.threshold_of(arguments, detector, lambda: (steps.DEFAULT_K, ""))
     judged = steps.judged(detector, cloud, evidence, threshold)

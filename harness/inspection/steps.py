@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 DEFAULT_K = 5.0
 """Robust standard deviations: of a million normal pixels 0.6 lie beyond by chance. Real surfaces are not that kind."""
+STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop", "variant")
+"""Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
 
 
@@ -36,6 +38,8 @@ def detector_of(
         settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
     elif arguments.target is not None:
         raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop that could take it")
+    if "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
+        settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)
     detector = load_detector(arguments.detector, settings)
@@ -136,6 +140,17 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     measures = (measure_missing if one.kind == "no return" else detector.measure for one in found)
     measured = tuple(measure(cloud, evidence, one) for measure, one in zip(measures, found, strict=True))
     return Judged(cloud, evidence, found, measured, missing)
+
+
+def analysed(detector: Detector, cloud: Cloud) -> Evidence:
+    """The detector's evidence, with a warning where it fitted a stated surface that does not fit."""
+    from detectors.background import misfit
+
+    evidence = detector.analyse(cloud)
+    if "misfit_share" in evidence.notes:
+        return evidence
+    doubt = misfit(cloud, evidence.residual_m, "the stated surface")
+    return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
 def threshold_of(
