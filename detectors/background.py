@@ -26,8 +26,9 @@ from detectors.surface_kernels import bisquare_weights
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.units import MM
 
-MOST_CELLS, CELL_POINTS = 3600, 16
-"""Cells at most, and points in each at least: enough of both for shapes with dozens of coefficients."""
+MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS = 3600, 16, 64, 600
+"""Cells at most, and points in each at least; with more than enough cells, points in each that outlast the correlation
+of noise in cameras that filter over 5 x 5 pixels."""
 FEW_CELLS = 40
 """Below this nothing can be chosen or judged: a plane, or what degree is stated, is fitted and not questioned."""
 TILE_CELLS, FOLDS = 3, 5
@@ -36,7 +37,7 @@ DEGREES = (1, 2, 3, 4, 5)
 TUNING = 4.685
 """Tukey's bisquare, 95 % efficient."""
 LEAST_SCALE_M = 0.04
-"""Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows such shapes."""
+"""Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows it."""
 WORTH = 0.1
 """Of the noise of a pixel: a shape whose typical error of prediction is no more than this above the best is as good."""
 NOISIER = 1.25
@@ -75,6 +76,7 @@ class _Cells:
     points: np.ndarray
     weights: np.ndarray
     noise: np.ndarray
+    level_noise: float
     of: np.ndarray
     row: np.ndarray
     column: np.ndarray
@@ -123,7 +125,7 @@ def _cells(points: np.ndarray, central: bool) -> _Cells | None:
         return None
     places = picture_places(points, central)
     low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-12)
-    wanted = max(CELL_POINTS, len(points) / MOST_CELLS)
+    wanted = max(min(max(CELL_POINTS, len(points) / ENOUGH_CELLS), EVEN_CELL_POINTS), len(points) / MOST_CELLS)
     side = float(np.sqrt(extent.prod() * wanted / len(points)))
     for _ in range(3):
         where = np.floor((places - low) / side).astype(np.int64)
@@ -148,7 +150,7 @@ def _cells(points: np.ndarray, central: bool) -> _Cells | None:
     first = np.column_stack([middle * (z[:, None] if central else 1.0), z])
     weights = np.minimum(counts[held] / wanted, 1.0)
     blank = _Cells(
-        first, weights, np.zeros(len(held)), of, row, column, side, side * (level if central else 1.0), central
+        first, weights, np.zeros(len(held)), 0.0, of, row, column, side, side * (level if central else 1.0), central
     )
     return _refreshed(blank, points, lambda p: start(p[:, 0], p[:, 1]))
 
@@ -164,7 +166,8 @@ def _refreshed(cells: _Cells, points: np.ndarray, fit: Fit) -> _Cells:
     # cells that the surface does not reach keep their points and count no more
     moved[~known] = cells.points[~known]
     weights = np.where(known, cells.weights, 0.0)
-    return replace(cells, points=moved, weights=weights, noise=deviations)
+    level_noise = _cell_noise(_image(cells, medians))[0]
+    return replace(cells, points=moved, weights=weights, noise=deviations, level_noise=level_noise)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -295,7 +298,9 @@ def _image(cells: _Cells, values: np.ndarray, empty: float = np.nan) -> np.ndarr
 
 
 def _pixel_noise(cells: _Cells) -> float:
-    return median_of(cells.noise[np.isfinite(cells.noise)])
+    """Standard deviation of a pixel: about its cell's median, and of that median."""
+    within = median_of(cells.noise[np.isfinite(cells.noise)])
+    return float(np.hypot(within, cells.level_noise))
 
 
 def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
@@ -344,7 +349,7 @@ def _structure(cells: _Cells, fit: Fit) -> tuple[float, float, np.ndarray]:
     error = cells.points[:, 2] - fit(cells.points)
     known = np.isfinite(error) & (cells.weights > 0)
     image = _image(cells, np.where(known, error, np.nan))
-    noise = _cell_noise(image)
+    noise, shared = _cell_noise(image)
     pixel = _pixel_noise(cells)
     # compact findings stand out of their neighbourhood's median; structure makes the neighbourhood
     size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
@@ -356,22 +361,31 @@ def _structure(cells: _Cells, fit: Fit) -> tuple[float, float, np.ndarray]:
     smooth = total / np.maximum(count, 1)
     enough = valid & (count >= 9)
     beyond = enough & (
-        np.abs(smooth) > np.maximum(STRUCTURE_SIGMAS * noise / np.sqrt(np.maximum(count, 1)), SEEN * pixel)
+        np.abs(smooth)
+        > np.maximum(STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1)), SEEN * pixel)
     )
     share = float(beyond.sum() / max(enough.sum(), 1))
     rms = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
     return share, rms, smooth[cells.row, cells.column]
 
 
-def _cell_noise(image: np.ndarray) -> float:
-    """Standard deviation of cells' medians, from second differences along rows and columns: blind to slopes."""
-    bends = [
-        (image[2:] - 2 * image[1:-1] + image[:-2]).ravel(),
-        (image[:, 2:] - 2 * image[:, 1:-1] + image[:, :-2]).ravel(),
-    ]
-    finite = np.concatenate(bends)
-    finite = finite[np.isfinite(finite)]
-    return median_size_of(finite) / 0.6745 / np.sqrt(6.0) if len(finite) else 0.0
+def _cell_noise(image: np.ndarray) -> tuple[float, float]:
+    """Standard deviation of cells' medians, from second differences over every other cell along rows and columns, which
+    are blind to slopes; and the correlation of neighbours, from those over neighbours."""
+    near, far = _bend(image, 1), _bend(image, 2)
+    # of cells with variance s^2 and correlation r with their neighbours only: (6 - 8 r) s^2 and 6 s^2
+    deviation = max(near, far) / np.sqrt(6.0)
+    return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
+
+
+def _bend(image: np.ndarray, step: int) -> float:
+    """Robust standard deviation of second differences."""
+    twice = 2 * step
+    down = image[twice:] - 2 * image[step:-step] + image[:-twice]
+    across = image[:, twice:] - 2 * image[:, step:-step] + image[:, :-twice]
+    bends = np.concatenate([down.ravel(), across.ravel()])
+    bends = bends[np.isfinite(bends)]
+    return median_size_of(bends) / 0.6745 if len(bends) else 0.0
 
 
 def _judged(
@@ -450,7 +464,13 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     if cells is None:
         return ""
     medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
-    level = replace(cells, points=np.column_stack([cells.points[:, :2], medians]), noise=deviations)
+    level_noise = _cell_noise(_image(cells, medians))[0]
+    level = replace(
+        cells,
+        points=np.column_stack([cells.points[:, :2], medians]),
+        noise=deviations,
+        level_noise=level_noise,
+    )
     return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
@@ -463,6 +483,7 @@ def _noise_map(cells: _Cells) -> np.ndarray:
     around = np.stack([padded[i : i + rows, j : j + columns] for i in range(7) for j in range(7)])
     with np.errstate(all="ignore"):
         local = np.nanmedian(around[:, cells.row, cells.column], axis=0)
+    local = np.hypot(local, cells.level_noise)
     pixel = _pixel_noise(cells)
     return np.where(local > NOISIER * pixel, local, pixel)
 

@@ -144,7 +144,8 @@ def test_what_is_seen_too_obliquely_is_left_out_and_said() -> None:
     # the ray meets the pipe's normal at asin(centre / radius * sine of the ray's angle to the axis plane)
     sine = np.abs(X) / np.hypot(X, 1) * 0.9 / 0.2
     incidence = np.degrees(np.arcsin(np.minimum(sine, 1)))
-    assert judged[incidence < 73].all() and not judged[(incidence > 77)].any()
+    # to the next pixel the sine grows by 0.03: from 75 to 82 degrees
+    assert judged[incidence < 73].all() and not judged[(incidence > 82)].any()
     share = 1 - judged.sum() / np.isfinite(z).sum()
     assert answer.notes["steep_share"] == pytest.approx(share) and "is not judged" in answer.description
 
