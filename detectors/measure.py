@@ -59,12 +59,14 @@ class HoleModelConfig(Config):
 def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
     """Sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or cells.
 
-    Depth that was upsampled or aligned to a finer camera is blurred over more pixels than the camera's filter has.
+    What the noise of a recording shares counts before ``config.blur_px``: depth that was upsampled or aligned to a
+    finer camera is blurred over more pixels than the camera's filter has, and that of a camera without a filter over
+    its own pixel only, where a model of 5 pixels would make every hole narrower and several times deeper.
     A map adds the linear interpolation of its views' pixels, whose variance is a sixth of a pixel squared, to the
     square's twelfth: as a square of side sqrt(blur^2 + 2) pixels. Cells of more than a pixel take a mean of their own.
     """
     if cloud.map_views is None or not cloud.organised:
-        blur_px = max(float(config.blur_px), cloud.noise_reach_px)
+        blur_px = cloud.noise_reach_px or float(config.blur_px)
         return blur_px, blur_px
     across, down = (np.diff(cloud.points_m[..., k], axis=1 - k) for k in (0, 1))
     cells = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 for steps in (across, down)]
