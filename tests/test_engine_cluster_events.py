@@ -6,6 +6,7 @@ import asyncio
 import platform
 import queue
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,7 @@ class FakeLink:
     def __init__(self) -> None:
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.sent: list[Parcel] = []
+        self.addresses = {FIRST, SECOND}
 
     def send(self, parcel: Parcel, bundle: object, needs: object) -> None:
         self.sent.append(parcel)
@@ -50,7 +52,7 @@ class FakeLink:
 
 def worker(*, can_render: bool) -> Worker:
     renders = source_digest(cache.CODE, cache.PACKAGES) if can_render else None
-    trials = source_digest(plan.CODE, plan.PACKAGES)
+    trials = source_digest(plan.BUILT_IN_CODE, plan.PACKAGES)
     return Worker(platform.python_version(), trials, renders, threads=1, offers_render=False, sees=None)
 
 
@@ -89,6 +91,21 @@ def test_renders_do_not_wait_for_ever_when_the_last_worker_that_renders_dies(tmp
     with pytest.raises(UserError, match="no worker that can render"):
         engine.ended()
     assert capsys.readouterr().err.count("waiting for a worker that can render") == 1
+
+
+def test_a_worker_of_another_version_is_left_out_while_others_are_there(tmp_path, capsys):
+    old = replace(worker(can_render=True), trials="of yesterday")
+    engine, link = engine_with(Joined(FIRST, old), Joined(SECOND, worker(can_render=True)))
+    engine.submit(render(tmp_path))
+    engine._step()
+    engine._hand_out()
+    assert [parcel.address for parcel in link.sent] == [SECOND]
+    assert capsys.readouterr().err.count("runs another version of tofpod") == 1
+    link.addresses.discard(SECOND)
+    link.events.put(Left(SECOND, None))
+    with pytest.raises(UserError, match="runs another version of tofpod"):
+        while True:
+            engine.ended()
 
 
 def test_renders_wait_for_a_worker_that_joins_after_one_that_cannot_render(tmp_path):

@@ -143,3 +143,17 @@ def test_a_process_killed_between_jobs_costs_nothing():
             engine.submit(one)
             states += [ended.state for _, ended in engine.ended()]
     assert states == ["done", "done"]
+
+
+def test_a_process_that_has_loaded_edited_code_is_refused(tmp_path, monkeypatch):
+    source = tmp_path / "edited_plug_in.py"
+    source.write_text("ANSWER = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    code = {"trials": (("edited_plug_in",), ("numpy",))}
+    found = run(LocalEngine(1, Limits(), code), doubles(2))
+    assert [ended.value for ended in found.values()] == [0, 2]
+    engine = LocalEngine(1, Limits(), code)
+    source.write_text("ANSWER = 2\n")
+    with pytest.raises(UserError, match="the code of trials was edited while this sweep ran"):
+        run(engine, doubles(1))

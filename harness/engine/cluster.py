@@ -76,6 +76,8 @@ class ClusterEngine:
         self._probe: Path | None = None
         self._nonce = secrets.token_hex(16)
         self._told: set[str] = set()
+        self._refused: dict[str, UserError] = {}
+        """Workers that would give other numbers than this machine, by address: left out while others are there."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> ClusterEngine:
@@ -83,7 +85,7 @@ class ClusterEngine:
             self._link = stack.enter_context(linked(self._scheduler, self._wanted))
             self._link.watch(lambda: None if self._probe is None else str(self._probe))
             while not self._places:
-                self._step(must_fit=True)
+                self._step()
             self._stack = stack.pop_all()
         return self
 
@@ -187,27 +189,27 @@ class ClusterEngine:
 
     # ---------------------------------------------------------------- what comes in
 
-    def _step(self, *, must_fit: bool = False) -> None:
+    def _step(self) -> None:
         """Take what has happened, waiting for it at most `LOOKS_S`."""
         with contextlib.suppress(queue.Empty):
-            self._heed(self._link.events.get(timeout=LOOKS_S), must_fit)
+            self._heed(self._link.events.get(timeout=LOOKS_S))
             while not self._link.events.empty():
-                self._heed(self._link.events.get(), must_fit)
+                self._heed(self._link.events.get())
         if time.monotonic() - self._looked >= LOOKS_S:
             self._looked = time.monotonic()
             self._look_for_scheduler()
             self._look_for_workers()
             self._look_for_overdue()
 
-    def _heed(self, event: Event, must_fit: bool) -> None:
+    def _heed(self, event: Event) -> None:
         if isinstance(event, Joined):
-            self._joined(event, must_fit)
+            self._joined(event)
         elif isinstance(event, Left):
             self._left(event)
         elif not event.parcel.is_void:
             self._answered(event)
 
-    def _joined(self, event: Joined, must_fit: bool) -> None:
+    def _joined(self, event: Joined) -> None:
         if event.address in self._places:
             return  # it came again before its first look ended: what it has stays with it
         if isinstance(event.said, BaseException) and not isinstance(event.said, ImportError | AttributeError):
@@ -219,8 +221,7 @@ class ClusterEngine:
         try:
             self._places[event.address] = self._place_of(event.address, event.said)
         except UserError as mistake:
-            if must_fit:
-                raise
+            self._refused[event.address] = mistake
             self._tell_once(f"{mistake.message}; it is not used")
 
     def _place_of(self, address: str, said: Worker | BaseException) -> _Place:
@@ -239,7 +240,7 @@ class ClusterEngine:
                 f"{where} runs Python {said.python}, this machine {platform.python_version()}",
                 fix="use the same Python on all",
             )
-        if said.trials != source_digest(plan.CODE, plan.PACKAGES):
+        if said.trials != source_digest(plan.BUILT_IN_CODE, plan.PACKAGES):
             raise UserError(
                 f"{where} runs another version of tofpod, numpy, scipy, numba or OpenCV than this machine",
                 fix="install the same there, and start its workers again: they keep the code that they began with",
@@ -254,6 +255,7 @@ class ClusterEngine:
         return _Place(address, can_render, said.offers_render, shares)
 
     def _left(self, event: Left) -> None:
+        self._refused.pop(event.address, None)
         place = self._places.pop(event.address, None)
         if place is None:
             return
@@ -343,6 +345,8 @@ class ClusterEngine:
         """A batch system's queue is waited for as long as it takes; its jobs are alike, so not for one that renders."""
         renders_wait = self._waiting["renders"] or any(job.stage == "renders" for job in self._suspects)
         lacking, fix = "", ""
+        if not self._places and self._refused and self._link.addresses <= self._refused.keys():
+            raise next(iter(self._refused.values()))
         if not self._places:
             lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads 1`"
         elif renders_wait and not any(place.can_render for place in self._places.values()):

@@ -104,6 +104,11 @@ class Link:
         """Whether the scheduler is there. One that was away has forgotten its jobs."""
         return bool(self.client.status == "running")
 
+    @property
+    def addresses(self) -> frozenset[str]:
+        """Of the workers that are there."""
+        return frozenset(self._known)
+
     def watch(self, probe: Callable[[], str | None]) -> None:
         """Tell of all workers, those that are there and those to come. ``probe``: the file they are to look for."""
 

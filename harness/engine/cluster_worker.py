@@ -89,7 +89,7 @@ def _examined(probe: str | None, dask_worker: Any) -> Worker:
     resources = dask_worker.state.total_resources
     return Worker(
         python=platform.python_version(),
-        trials=_digest(plan.CODE, plan.PACKAGES),
+        trials=_digest(plan.BUILT_IN_CODE, plan.PACKAGES),
         renders=_digest(cache.CODE, cache.PACKAGES),
         threads=dask_worker.state.nthreads,
         offers_render=resources.get("render", 0) > 0,
@@ -109,10 +109,10 @@ def leave() -> None:
     os._exit(1)
 
 
-def _digest(folders: tuple[str, ...], packages: tuple[str, ...]) -> str | None:
+def _digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str | None:
     """Taken once a process, when its modules are loaded: files that change later are not what it runs."""
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        return source_digest(folders, packages)
+        return source_digest(modules, packages)
     return None
 
 

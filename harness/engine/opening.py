@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from harness.engine.shard import WHOLE, Shard
-from harness.engine.work import Engine, Limits
+from harness.engine.work import Code, Engine, Limits, Stage
 
 DEFAULT_TIME_LIMIT_S = 900.0
 """A trial takes seconds at most; a hang should not take a night."""
@@ -28,8 +29,11 @@ class EngineOptions:
     cache_limit_gb: float | None = None
 
 
-def engine_of(options: EngineOptions) -> Engine:
-    """The engine, not yet begun. Raises UserError where it is not installed or does not answer."""
+def engine_of(options: EngineOptions, detectors: Iterable[str] = ()) -> Engine:
+    """The engine, not yet begun, for trials of these ``detectors``.
+
+    Raises UserError where it is not installed or does not answer.
+    """
     if options.scheduler is not None:
         from harness.engine.cluster import ClusterEngine
 
@@ -38,6 +42,13 @@ def engine_of(options: EngineOptions) -> Engine:
         from harness.engine.serial import SerialEngine
 
         return SerialEngine()
+    from harness.engine.plan import PACKAGES, trial_code
     from harness.engine.processes import LocalEngine
+    from scenes.render import cache
 
-    return LocalEngine(options.jobs, options.limits)
+    modules = {module for detector in detectors for module in trial_code(detector)}
+    code: dict[Stage, Code] = {
+        "trials": (tuple(sorted(modules)), PACKAGES),
+        "renders": (cache.CODE, cache.PACKAGES),
+    }
+    return LocalEngine(options.jobs, options.limits, code)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from detectors import BUILT_IN, DETECTORS
 from harness.engine.journal import JOURNAL_VERSION
 from harness.engine.setup import SetUpRef
 from harness.engine.trial import PointTask, Role, TrialTask
@@ -24,9 +26,22 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.wavelength import at_wavelength
 
-CODE = ("detectors", "harness/engine", "harness/evaluation", "harness/vocabulary", "scenes")
-PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless")
-"""What decides a trial's numbers beside its task: a change of any makes stored trials count as not done."""
+CODE = "harness.engine.trial"
+PACKAGES = (
+    "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
+)  # fmt: skip
+"""A trial's numbers are decided, beside its task, by all sources that this module and the detector's reach, and by the
+versions of these packages: a change of any makes stored trials count as not done. Mitsuba's version is part of the
+names of the rendered views."""
+
+
+BUILT_IN_CODE = (CODE, *(target.partition(":")[0] for target in sorted(BUILT_IN.values())))
+"""The same for all built-in detectors."""
+
+
+def trial_code(detector: str) -> tuple[str, ...]:
+    """Modules whose sources decide a trial with a detector, a plug-in's included."""
+    return (CODE, DETECTORS.offer(detector).target.partition(":")[0])
 
 
 @dataclass(frozen=True)
@@ -142,7 +157,7 @@ class Group:
         asked = [[point.digest, point.variant, point.threshold] for point in task.points]
         content = [
             JOURNAL_VERSION,
-            source_digest(CODE, PACKAGES),
+            *(source_digest(trial_code(name), PACKAGES) for name in sorted({each.detector for each in task.points})),
             *(render.path.stem for render in batch.renders),
             None if self.poses is None else self.poses.to_data(),
             task.role,

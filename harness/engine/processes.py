@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import multiprocessing
 import os
 import signal
@@ -16,13 +17,15 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import IO, Any
 
-from harness.engine.work import TRACEBACK_CHARACTERS, Ended, Job, Limits, Stage, attempt
+from harness.engine.work import TRACEBACK_CHARACTERS, Code, Ended, Job, Limits, Stage, attempt
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.sources import source_digest
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """One thread a process: sums are then in one order on every machine, and processes do not fight for cores."""
@@ -45,9 +48,13 @@ FALSE_STARTS = 3
 
 class LocalEngine:
     """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
-    renders have no limit of memory, as Dr.Jit reserves more than it uses."""
+    renders have no limit of memory, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
+    a stage; a process that starts after one of their sources was edited is refused, because its results would be stored
+    as those of the code that this process runs."""
 
-    def __init__(self, jobs: int, limits: Limits) -> None:
+    def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
+        self._code = code or {}
+        self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._most: dict[Stage, int] = {"trials": jobs, "renders": min(jobs, MOST_RENDERERS)}
         self._limits: dict[Stage, Limits] = {"trials": limits, "renders": Limits(limits.seconds, None)}
         self._workers: dict[Stage, list[_Worker]] = {"trials": [], "renders": []}
@@ -91,7 +98,8 @@ class LocalEngine:
     def _started(self, stage: Stage) -> _Worker:
         self._number += 1
         name = f"{stage} process {self._number}"
-        return _Worker(name, stage, self._limits[stage], Path(self._said.name) / str(self._number))
+        said = Path(self._said.name) / str(self._number)
+        return _Worker(name, stage, self._limits[stage], said, self._code.get(stage))
 
     def ended(self) -> list[tuple[Job, Ended]]:
         """Wait for jobs to end, or to reach their time limit."""
@@ -123,7 +131,8 @@ class LocalEngine:
             else:
                 self._start_again(job, words)
             return
-        if said is None:
+        if not isinstance(said, Ended):
+            self._refuse_other_code(worker.stage, said.code)
             self._false_starts = 0
             return
         worker.job = None
@@ -131,6 +140,15 @@ class LocalEngine:
             worker.take(worker.next_job)
             worker.next_job = None
         yield job, said
+
+    def _refuse_other_code(self, stage: Stage, digest: str | None) -> None:
+        """Raise UserError where a process runs other sources than this one."""
+        if digest != self._digests.get(stage):
+            raise UserError(
+                f"the code of {stage} was edited while this sweep ran: a new process has loaded other sources",
+                legal="one version of the code for all trials of a sweep",
+                fix="run the same command again: trials of the old code are kept under its key, the others run anew",
+            )
 
     def _start_again(self, job: Job, words: str) -> None:
         """A process that died before it could begin: another gets the job, unless none seems to be able to start."""
@@ -181,12 +199,20 @@ def _soonest(busy: list[_Worker]) -> float | None:
     return None if left == float("inf") else max(left, 0.0)
 
 
+@dataclass(frozen=True)
+class _Ready:
+    """A process can take jobs. ``code``: digest of the sources that it has loaded, where it was asked for."""
+
+    code: str | None
+
+
 class _Worker:
     """One process with its pipe; ``job`` is what it is at, ``next_job`` what it gets then. ``is_quick``: whether its
     last job was."""
 
-    def __init__(self, name: str, stage: Stage, limits: Limits, said: Path) -> None:
+    def __init__(self, name: str, stage: Stage, limits: Limits, said: Path, code: Code | None) -> None:
         self.name = name
+        self.stage = stage
         self.job: Job | None = None
         self.next_job: Job | None = None
         self.is_quick = False
@@ -198,7 +224,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         with one_thread(), _without_interrupts():
             self._process = context.Process(
-                target=_serve, args=(theirs, name, stage, limits.memory_mb, str(said)), name=name, daemon=True
+                target=_serve, args=(theirs, name, stage, limits.memory_mb, str(said), code), name=name, daemon=True
             )
             self._process.start()
         theirs.close()
@@ -214,10 +240,10 @@ class _Worker:
         with contextlib.suppress(OSError):
             self.pipe.send(job)
 
-    def hear(self) -> Ended | None:
-        """How the job ended; None where the process says that it is ready, from when on time counts."""
-        said = self.pipe.recv()
-        if said is None:
+    def hear(self) -> Ended | _Ready:
+        """How the job ended, or that the process is ready, from when on time counts."""
+        said: Ended | _Ready = self.pipe.recv()
+        if isinstance(said, _Ready):
             self.is_ready = True
         else:
             self.is_quick = said.seconds < SHORT_S
@@ -294,7 +320,9 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: Connection[Any, Any], name: str, stage: Stage, memory_mb: int | None, said: str) -> None:
+def _serve(
+    pipe: Connection[Any, Any], name: str, stage: Stage, memory_mb: int | None, said: str, code: Code | None
+) -> None:
     """Of a worker: jobs one after another until the driver closes the pipe."""
     words = _serve_the_driver(said)
     try:
@@ -302,7 +330,10 @@ def _serve(pipe: Connection[Any, Any], name: str, stage: Stage, memory_mb: int |
             limit_memory(memory_mb)
         if stage == "trials":
             _load_what_trials_need()
-        pipe.send(None)
+        # plug-ins are loaded now, so that the digest is that of what will run
+        for module in code[0] if code and stage == "trials" else ():
+            importlib.import_module(module)
+        pipe.send(_Ready(source_digest(*code) if code else None))
     except BaseException:
         traceback.print_exc(file=words)
         words.flush()

@@ -55,14 +55,16 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     trials did not end well, 130 after Ctrl-C."""
     began = time.monotonic()
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    origin = record(command)  # now: a commit that is made while the sweep runs is not what it ran
     folder = experiment.folder(out)
     _refuse_newer(folder)
+    detectors = {point.config.detector.name for point in experiment.points}
     try:
         plan = plan_of(experiment, _cache(out))
         # The first file written: an unwritable folder shows before any work is done.
         write_text(folder / "experiment.yaml", resolved_yaml(experiment))
         journal = Journal(folder / "journal")
-        with in_use(_cache(out)), locked(folder, options.shard), engine_of(options) as engine:
+        with in_use(_cache(out)), locked(folder, options.shard), engine_of(options, detectors) as engine:
             with progress_display() as show:
                 outcome = run_plan(plan, journal, engine, show, shard=options.shard, retry_failed=options.retry_failed)
             learn(plan, outcome, journal, out / ".cache", 1 if options.serial else options.jobs)
@@ -72,7 +74,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 return _nothing_to_report(experiment, outcome)
             print("writing tables and report", file=sys.stderr)
             tables = tables_of(_records(journal, outcome), experiment)
-            provenance = _provenance(experiment, plan, outcome, tables, command, started)
+            provenance = _provenance(experiment, plan, outcome, tables, origin, started)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
             _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
             if experiment.config.study is None:
@@ -191,7 +193,7 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 
 
 def _provenance(
-    experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, command: str, started: str
+    experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, origin: dict[str, Any], started: str
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
     views = _views_of_set_ups(plan)
@@ -199,7 +201,7 @@ def _provenance(
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     return {
         "results_version": RESULTS_VERSION,
-        **record(command),
+        **origin,
         "experiment": experiment.config.name,
         "digest": experiment.digest,
         "seed": experiment.config.seed,

@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from harness.engine.plan import CODE, PACKAGES, Batch, Group, Plan
+from harness.engine.plan import PACKAGES, Batch, Group, Plan
 from harness.engine.tables import Tables
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.declared import detector_version
@@ -15,8 +15,8 @@ from harness.experiment.points import Experiment, Point
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
 
-SIMULATION = tuple(folder for folder in CODE if folder in ("scenes", "harness/vocabulary"))
-"""Code that decides frames; a change of any makes frames count as different."""
+SIMULATION = ("scenes.sensor.source",)
+"""Modules that decide frames, with all that they import: a change of any makes frames count as different."""
 
 
 def record_of(

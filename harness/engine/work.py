@@ -23,6 +23,9 @@ STATES: tuple[State, ...] = get_args(State)
 Stage = Literal["renders", "trials"]
 """Renders load Mitsuba and some 2 GB; everything else runs where trials run."""
 
+Code = tuple[tuple[str, ...], tuple[str, ...]]
+"""Modules and packages that decide the numbers of a stage: the arguments of `source_digest`."""
+
 TRACEBACK_CHARACTERS = 4000
 """Of a traceback, its end."""
 

@@ -29,17 +29,10 @@ from scenes.target.custom import TargetConfig
 from scenes.target.mesh import build_target
 from scenes.view import NoiseFreeView
 
-CODE = (
-    "scenes/render",
-    "scenes/target",
-    "scenes/optics.py",
-    "scenes/field_of_view.py",
-    "scenes/view.py",
-    "harness/vocabulary",
-)
+CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-"""What decides a render's numbers beside its declaration. The variant (GPU or processor) is left out: it changes them
-by 1e-6."""
+"""A render's numbers are decided, beside its declaration, by these modules with all that they import and by the
+versions of these packages. The variant (GPU or processor) is left out: it changes them by 1e-6."""
 
 VIEW_VERSION = 1
 """Stands in every file. One of another version counts as absent: rendering anew is always possible."""

@@ -1,0 +1,80 @@
+"""Keys change with the sources that a stage reaches, and with no others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness.vocabulary import sources
+from harness.vocabulary.sources import reached_sources, source_digest
+
+FILES = {
+    "harness/__init__.py": "",
+    "harness/trial.py": "import numpy\nfrom harness.engine import (\n    judge,  # why\n)\n",
+    "harness/page.py": "from harness.trial import run\n",
+    "harness/engine/__init__.py": "",
+    "harness/engine/judge.py": "def run():\n    from scenes.board import Board\n    import detectors.thesis as t\n",
+    "harness/engine/other.py": "",
+    "scenes/__init__.py": "",
+    "scenes/board.py": "class Board: ...\n",
+    "detectors/__init__.py": "",
+    "detectors/thesis.py": "",
+    "detectors/blind.py": "",
+}
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    return tmp_path
+
+
+def fresh(*modules: str) -> str:
+    reached_sources.cache_clear()
+    source_digest.cache_clear()
+    try:
+        return source_digest(modules, ("numpy",))
+    finally:
+        reached_sources.cache_clear()
+        source_digest.cache_clear()
+
+
+def test_what_a_module_reaches_counts_and_nothing_else(project: Path) -> None:
+    before = fresh("harness.trial")
+    reached = {path.relative_to(project).as_posix() for path in reached_sources(("harness.trial",))}
+    reached_sources.cache_clear()
+    assert reached == set(FILES) - {"harness/page.py", "harness/engine/other.py", "detectors/blind.py"}
+    for name in FILES:
+        path = project / name
+        path.write_text(FILES[name] + "# a comment\n")
+        assert (fresh("harness.trial") != before) == (name in reached), name
+        path.write_text(FILES[name])
+    assert fresh("harness.trial") == before
+
+
+def test_every_source_of_a_plug_ins_package_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "strange_detector"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    inner = package / "inner.py"
+    inner.write_text("K = 5\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = fresh("strange_detector.main")
+    inner.write_text("K = 6\n")
+    assert fresh("strange_detector.main") != before
+    inner.write_text("K = 5\n")
+    assert fresh("strange_detector.main") == before
+
+
+def test_a_trial_reaches_what_it_runs_and_not_what_evaluates_or_draws() -> None:
+    from harness.engine.plan import trial_code
+
+    names = {path.relative_to(sources.ROOT).as_posix() for path in reached_sources(trial_code("thesis"))}
+    assert {"detectors/thesis.py", "detectors/average.py", "scenes/sensor/amcw/imager.py"} <= names
+    assert {"harness/engine/trial.py", "harness/evaluation/match.py", "detectors/registration/icp.py"} <= names
+    assert not [name for name in names if name.startswith(("harness/report/", "harness/evaluation/pod/"))]
