@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
@@ -64,11 +64,14 @@ def _clean_cache(options: argparse.Namespace) -> int:
         print(f"{folder}: there is no cache")
         return 0
     checked_inside(options.out, folder)
-    with nullcontext() if options.dry_run else alone(folder):
-        wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
-        size = sum(one.size_bytes for one in wanted)
-        if not _agreed(options, f"{_files(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
-            return 0 if options.dry_run or not wanted else 1
+    if not options.dry_run:
+        with alone(folder):  # a sweep that runs is told before anything is asked
+            pass
+    wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
+    size = sum(one.size_bytes for one in wanted)
+    if not _agreed(options, f"{_files(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
+        return 0 if options.dry_run or not wanted else 1
+    with alone(folder):  # not while the question waits for its answer: that would block every sweep
         gone = removed(wanted)
     return _concluded(len(gone), len(wanted), sum(one.size_bytes for one in gone))
 
@@ -78,19 +81,20 @@ def _clean_results(options: argparse.Namespace) -> int:
     from harness.listing.text import size_text
 
     folders = chosen_results(options.out, options.name)
+    if not options.dry_run:
+        for folder in folders:
+            with _held(folder):  # a sweep that runs is told before anything is asked
+                pass
+    files = [one for folder in folders for one in removable(folder, journal_only=options.journal_only)]
+    size = sum(one.size_bytes for one in files)
+    for folder in folders:
+        print(folder)
+    what = "records of trials" if options.journal_only else "files"
+    if not _agreed(options, f"{len(files)} {what} in {_files(len(folders), 'folder')}, {size_text(size)}", len(files)):
+        return 0 if options.dry_run or not files else 1
     with ExitStack() as held:
-        for folder in folders:
-            if not options.dry_run:
-                held.enter_context(_held(folder))
-        files = [one for folder in folders for one in removable(folder, journal_only=options.journal_only)]
-        size = sum(one.size_bytes for one in files)
-        for folder in folders:
-            print(folder)
-        what = "records of trials" if options.journal_only else "files"
-        if not _agreed(
-            options, f"{len(files)} {what} in {_files(len(folders), 'folder')}, {size_text(size)}", len(files)
-        ):
-            return 0 if options.dry_run or not files else 1
+        for folder in folders:  # not while the question waits for its answer: that would block every sweep
+            held.enter_context(_held(folder))
         gone = remove_files(folders, files)
     for folder in folders:
         if not options.journal_only and folder.exists():

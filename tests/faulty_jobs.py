@@ -69,3 +69,9 @@ def commit_a_fault(kind: str) -> None:
 def dies_at_once(*_arguments: object) -> None:
     """In the place of what a worker process does."""
     os._exit(7)
+
+
+def finds_the_disk_full() -> None:
+    from harness.vocabulary.errors import DiskFull
+
+    raise DiskFull("x.npz: the disk is full", fix="free some space")

@@ -157,3 +157,28 @@ def test_a_process_that_has_loaded_edited_code_is_refused(tmp_path, monkeypatch)
     source.write_text("ANSWER = 2\n")
     with pytest.raises(UserError, match="the code of trials was edited while this sweep ran"):
         run(engine, doubles(1))
+
+
+def test_time_in_which_everything_stood_still_is_not_counted(monkeypatch):
+    """As after Ctrl-Z: the wait took an hour where a second was asked for."""
+    from harness.engine import processes
+
+    clock = {"ahead_s": 0.0}
+    real, real_wait = time.monotonic, processes.wait
+    monkeypatch.setattr(processes.time, "monotonic", lambda: real() + clock["ahead_s"])
+
+    def stopped(pipes, timeout):
+        heard = real_wait(pipes, timeout)
+        if not heard and clock["ahead_s"] == 0.0 and engine._busy()[0].is_ready:
+            clock["ahead_s"] = 3600.0
+        return heard
+
+    monkeypatch.setattr(processes, "wait", stopped)
+    engine = LocalEngine(1, Limits(seconds=60.0))
+    found = run(engine, [Job("sleeps", "trials", time.sleep, (3.0,))])
+    assert clock["ahead_s"] == 3600.0 and found["sleeps"].state == "done"
+
+
+def test_a_full_disk_ends_everything(tmp_path, monkeypatch):
+    assert attempt(Job("full", "trials", faulty_jobs.finds_the_disk_full, ()), "x").ends_all
+    assert not attempt(job(faulty_jobs.refuses), "x").ends_all

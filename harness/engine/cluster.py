@@ -100,7 +100,7 @@ class ClusterEngine:
         """Workers that take jobs; as of the last look."""
         with contextlib.suppress(queue.Empty):
             while True:
-                self._heed(self._link.events.get_nowait(), False)
+                self._heed(self._link.events.get_nowait())
         return len(self._places)
 
     def room(self, stage: Stage) -> int:

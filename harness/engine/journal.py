@@ -65,7 +65,7 @@ class Journal:
         text = NOTHING if entry.text is None else entry.text
         said = {name: value for name, value in asdict(entry).items() if name != "text"}
         head = canonical_json({"version": JOURNAL_VERSION, "key": key, "digest": _digest(text), **said})
-        write_text(self._path(key), f"{head}\n{text}\n")
+        write_text(self._path(key), f"{head}\n{text}\n", durable=False)
 
     def entries(self) -> Iterator[tuple[str, Path]]:
         """(key, file) of every entry, in order of keys."""

@@ -1,10 +1,8 @@
-"""One sweep at a time in a folder of results: the lock is the system's, so a process that dies gives it back, and no
-clock is asked."""
+"""One sweep at a time works in a folder of results."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -13,10 +11,9 @@ from typing import IO
 
 from harness.engine.shard import WHOLE, Shard
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.locks import lock, opened_lock
 
 LOCK = ".lock"
-NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS}
-"""What a file system without locks answers."""
 
 
 @contextlib.contextmanager
@@ -37,24 +34,15 @@ def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _held(path: Path, *, shared: bool) -> Iterator[None]:
-    try:
-        import fcntl
-    except ImportError:
-        print(f"{path.parent}: is not locked, as this system cannot: start no second sweep in it", file=sys.stderr)
-        yield
-        return
-    with open(path, "a+") as file:
-        try:
-            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+    with opened_lock(path) as file:
+        answer = lock(file, shared=shared, wait=False)
+        if answer == "busy":
             raise UserError(
                 f"{path.parent}: another sweep is at work in this folder{_who(file)}",
                 fix="wait for it, or name another folder with --out",
-            ) from error
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
-            print(f"{path.parent}: is not locked, as its file system cannot: start no second sweep", file=sys.stderr)
+            )
+        if answer == "no locks":
+            print(f"{path.parent}: is not locked, as this system cannot: start no second sweep in it", file=sys.stderr)
         file.truncate(0)
         if not shared:
             file.write(f"{os.getpid()}\n")

@@ -42,6 +42,8 @@ DUMP_S = 0.3
 SHORT_S = 0.5
 """A process whose jobs are shorter has its next one ready, so that it need not wait while the driver files the last;
 with longer ones the end of a sweep would wait for jobs that are spread unevenly."""
+STOPPED_S = 2.0
+"""A wait of `LOOKS_S` that takes so much longer was not spent waiting: Ctrl-Z, a suspended machine."""
 FALSE_STARTS = 3
 """Processes in a row that died before they could take a job: then none will."""
 
@@ -106,7 +108,13 @@ class LocalEngine:
         ended: list[tuple[Job, Ended]] = []
         while not ended and (busy := self._busy()):
             pipes = {worker.pipe: worker for worker in busy}
-            for pipe in wait(list(pipes), timeout=_soonest(busy)):
+            asked = time.monotonic()
+            heard = wait(list(pipes), timeout=min(_soonest(busy), LOOKS_S))
+            stopped_s = time.monotonic() - asked - LOOKS_S
+            if stopped_s > STOPPED_S:
+                for worker in busy:
+                    worker.forgive(stopped_s)
+            for pipe in heard:
                 ended += self._heard(pipes[pipe])  # type: ignore[index]
             for worker in [one for one in self._busy() if one.left_s() <= 0]:
                 ended += self._overdue(worker)
@@ -193,10 +201,9 @@ class LocalEngine:
                 self._remove(worker)
 
 
-def _soonest(busy: list[_Worker]) -> float | None:
-    """Seconds to the next time limit, None where there is none."""
-    left = min(worker.left_s() for worker in busy)
-    return None if left == float("inf") else max(left, 0.0)
+def _soonest(busy: list[_Worker]) -> float:
+    """Seconds to the next time limit, endless where there is none."""
+    return max(min(worker.left_s() for worker in busy), 0.0)
 
 
 @dataclass(frozen=True)
@@ -253,6 +260,10 @@ class _Worker:
     def spent_s(self) -> float:
         """On this job."""
         return time.monotonic() - self._since
+
+    def forgive(self, seconds: float) -> None:
+        """Do not count time in which everything stood still."""
+        self._since += seconds
 
     def idle_s(self) -> float:
         """Since the last job ended."""

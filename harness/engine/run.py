@@ -22,6 +22,7 @@ from harness.engine.rendering import render_into_cache
 from harness.engine.shard import WHOLE, Shard
 from harness.engine.trial import TrialTask, run_trial
 from harness.engine.work import Ended, Engine, Job
+from harness.vocabulary.errors import DiskFull
 from scenes.render.cache import read_view
 
 AHEAD = 4096
@@ -273,6 +274,8 @@ class _Run:
     def take(self, job: Job, ended: Ended) -> None:
         """A job has ended, one way or another."""
         work = self._under_way.pop(job.name)
+        if ended.ends_all:
+            raise DiskFull(ended.why)
         if isinstance(work, RenderJob):
             self._render_over(work, ended)
         elif isinstance(work, int):

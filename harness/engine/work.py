@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 
-from harness.vocabulary.errors import UserError
+from harness.vocabulary.errors import DiskFull, UserError
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
 """How a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by the time limit;
@@ -45,7 +45,8 @@ class Job:
 @dataclass(frozen=True)
 class Ended:
     """How a job ended. ``why``: of a user's mistake its message, of a bug (``is_bug``) the end of its traceback.
-    ``seconds``: of the work itself; ``peak_mb``: resident memory at most, 0 where unknown; ``worker``: who did it."""
+    ``seconds``: of the work itself; ``peak_mb``: resident memory at most, 0 where unknown; ``worker``: who did it.
+    ``ends_all``: the disk is full, so that no other job can end better."""
 
     state: State
     value: Any = None
@@ -54,6 +55,7 @@ class Ended:
     seconds: float = 0.0
     peak_mb: float = 0.0
     worker: str = ""
+    ends_all: bool = False
 
     def result(self) -> Any:
         """The value; where there is none, the mistake or the bug as an exception here."""
@@ -99,18 +101,18 @@ def attempt(job: Job, worker: str) -> Ended:
     _reset_peak()
     began = time.monotonic()
     state: State = "failed"
-    value, why, is_bug = None, "", False
+    value, why, is_bug, ends_all = None, "", False, False
     try:
         value = job.function(*job.arguments)
         state = "done"
     except UserError as mistake:
-        why = str(mistake)
+        why, ends_all = str(mistake), isinstance(mistake, DiskFull)
     except MemoryError as error:
         where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
         why = f"out of memory ({str(error) or 'no more'}), of what its process may have (--memory-limit)\n{where}"
     except Exception as error:
         why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
-    return Ended(state, value, why, is_bug, time.monotonic() - began, _peak_mb(), worker)
+    return Ended(state, value, why, is_bug, time.monotonic() - began, _peak_mb(), worker, ends_all)
 
 
 def _reset_peak() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
+from harness.vocabulary.locks import lock, opened_lock
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
@@ -114,16 +115,13 @@ def in_use(path: Path) -> bool:
     takes to ask."""
     from harness.engine.lock import LOCK
 
-    try:
-        import fcntl
-
-        with open(path / LOCK) as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except (ImportError, OSError):
+    if not (path / LOCK).is_file():
         return False
-    return False
+    try:
+        with opened_lock(path / LOCK) as file:
+            return lock(file, shared=False, wait=False) == "busy"
+    except (OSError, UserError):
+        return False
 
 
 def _measured(path: Path) -> tuple[int, int]:

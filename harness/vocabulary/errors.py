@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import sys
+import threading
 from collections.abc import Callable
+from typing import Any
 
 CLOSED_PIPE = 141
 """What a shell reports of a program that SIGPIPE ended: 128 + 13."""
@@ -36,13 +39,18 @@ class UserError(Exception):
         return "\n".join(lines)
 
 
+class DiskFull(UserError):
+    """Nothing more can be written: no part of a program's work makes sense before there is room."""
+
+
 def _rebuild(message: str, legal: str | None, fix: str | None) -> UserError:
     return UserError(message, legal=legal, fix=fix)
 
 
 def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
-    that nobody reads to its end (``| head``) ends it silently with 141."""
+    that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C while it ends are not heard."""
+    before = _hear_interrupts_once()
     try:
         code = program()
         sys.stdout.flush()
@@ -57,6 +65,25 @@ def exit_code_of(program: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+
+
+def _hear_interrupts_once() -> Any:
+    """Let the first Ctrl-C raise KeyboardInterrupt and the system drop those after it. Returns the handler to put back;
+    None where somebody else handles Ctrl-C, or in a thread, which cannot."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    ):
+        return None
+
+    def interrupt(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    return signal.signal(signal.SIGINT, interrupt)
 
 
 def _nobody_reads() -> bool:

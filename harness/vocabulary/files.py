@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from harness.vocabulary.errors import UserError
+from harness.vocabulary.errors import DiskFull, UserError
 
 NOT_WRITABLE = {
     getattr(errno, name)
@@ -20,10 +20,12 @@ NOT_WRITABLE = {
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` (same suffix); rename it to ``path`` on success, delete it on failure.
 
-    Raises UserError where the folder cannot be written or the disk is full.
+    ``durable``: the content is on the disk before it has its name, so that a power failure leaves the old file or the
+    new file; what can be made again at no cost may do without. Raises UserError where the folder cannot be written or
+    the disk is full.
     """
     path = Path(path)
     try:
@@ -35,6 +37,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
+        if durable:
+            with open(temporary, "rb") as written:
+                os.fsync(written.fileno())
         _move_shared(temporary, path, 0o666)
     except OSError as error:
         raise _explained(error, path) from error
@@ -93,21 +98,21 @@ def inside(folder: Path, *parts: str) -> Path:
     return path
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes, *, durable: bool = True) -> None:
     """Write ``content`` atomically. Raises UserError as `atomic_path` does."""
-    with atomic_path(path) as temporary:
+    with atomic_path(path, durable=durable) as temporary:
         temporary.write_bytes(content)
 
 
-def write_text(path: Path, content: str) -> None:
+def write_text(path: Path, content: str, *, durable: bool = True) -> None:
     """Write UTF-8 text atomically. Raises UserError as `atomic_path` does."""
-    write_bytes(path, content.encode())
+    write_bytes(path, content.encode(), durable=durable)
 
 
 def _explained(error: OSError, path: Path) -> Exception:
     """The user's mistake behind an OSError of writing, or the error itself where it is none of the known ones."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(
+        return DiskFull(
             f"{path}: the disk is full", fix="free some space and run the same command again; finished work is kept"
         )
     if error.errno is not None and error.errno in NOT_WRITABLE:

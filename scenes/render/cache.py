@@ -20,6 +20,7 @@ import numpy as np
 
 from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import Region
+from harness.vocabulary.locks import one_at_a_time
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
 from scenes.optics import Optics
@@ -36,6 +37,8 @@ versions of these packages. The variant (GPU or processor) is left out: it chang
 
 VIEW_VERSION = 1
 """Stands in every file. One of another version counts as absent: rendering anew is always possible."""
+RENDERING = ".rendering"
+"""The file of which a process locks a byte while it renders a view."""
 FACTS = "facts.json"
 MOST_FACTS_BYTES = 1 << 20
 """They take some 500 bytes; names of ten thousand surfaces would take 200 kB."""
@@ -63,16 +66,24 @@ def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> st
 
 
 def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path) -> tuple[NoiseFreeView, bool]:
-    """The view of a declared target, and whether it came from the cache. A damaged file is rendered again.
+    """The view of a declared target, and whether it came from the cache. A damaged file is rendered again; a view that
+    another process renders is waited for.
 
     Raises UserError as `build_target` and `render_view` do, and where the folder cannot be written.
     """
-    path = folder / f"{render_key(target, optics, config)}.npz"
+    key = render_key(target, optics, config)
+    path = folder / f"{key}.npz"
     found = read_view(path)
     if found is not None:
         return found, True
-    view = render_view(build_target(target), optics, config)
-    write_view(path, view)
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    with one_at_a_time(folder / RENDERING, int(key[:8], 16)):
+        found = read_view(path)
+        if found is not None:
+            return found, True
+        view = render_view(build_target(target), optics, config)
+        write_view(path, view)
     return view, False
 
 
@@ -93,7 +104,7 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
         archive.writestr(zipfile.ZipInfo(FACTS), json.dumps({**facts, "checksum": _checksum(facts, arrays)}))
         for name, array in arrays.items():
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), _header(array.dtype, array.shape) + array.tobytes())
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, buffer.getvalue(), durable=False)
 
 
 def read_view(path: Path) -> NoiseFreeView | None:

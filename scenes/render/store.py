@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.locks import lock, opened_lock
 from scenes.render.cache import stored_view
 
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
@@ -118,8 +119,7 @@ def in_use(folder: Path) -> Iterator[None]:
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            file = held.enter_context(open(folder / LOCK, "a+"))
-            _lock(file.fileno(), shared=True, wait=True)
+            lock(held.enter_context(opened_lock(folder / LOCK)), shared=True, wait=True)
         yield
 
 
@@ -129,30 +129,15 @@ def alone(folder: Path) -> Iterator[None]:
     be written."""
     with contextlib.ExitStack() as held:
         try:
-            file = held.enter_context(open(folder / LOCK, "a+"))
+            file = held.enter_context(opened_lock(folder / LOCK))
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
-        if not _lock(file.fileno(), shared=False, wait=False):
+        if lock(file, shared=False, wait=False) == "busy":
             raise UserError(
                 f"{folder}: a sweep that is running uses these renders",
                 fix="wait until it has ended; nothing was removed",
             )
         yield
-
-
-def _lock(file: int, *, shared: bool, wait: bool) -> bool:
-    """Lock an open file; False where another process holds it. True too where the system knows no such locks."""
-    try:
-        import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True  # a file system without locks
-    return True
 
 
 def _files(folder: Path, names: re.Pattern[str]) -> Iterator[StoredFile]:
