@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from strangers.__main__ import made
 from strangers.kinds import KINDS
 from strangers.recording import recorded
 from strangers.score import scored
@@ -60,3 +61,17 @@ def test_wrong_answers_are_wrong(board):
 def test_a_refusal_is_a_warning_and_a_traceback_is_not(board):
     assert scored(*board, 2, "error: no unit is known\n  fix: pass --unit\n", []).verdict == "warned"
     assert scored(*board, 1, "Traceback ...\nKeyError\n", []).verdict == "wrong"
+
+
+ANSWERED = (
+    ("before_wall", 0), ("on_floor", 0), ("round_board", 0), ("tilted", 0), ("corner", 0), ("small_board", 0),
+    ("object_on_plate", 0), ("no_return", 0), ("saddle", 0), ("slots", 0), ("bumps", 0), ("dents", 0),
+    ("dropouts", 0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "seed"), ANSWERED)
+def test_no_answer_is_wrong_without_a_word(kind, seed, tmp_path):
+    score = made(kind, seed, tmp_path)
+    assert score.verdict != "wrong", (score.why, score.output)
+    assert not score.needless, score.warnings
