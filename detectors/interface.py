@@ -19,7 +19,8 @@ class Evidence:
     (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
     surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score is.
     ``warnings``: full sentences on what makes these numbers unreliable (the surface does not fit, ...); every program
-    shows them before anything else.
+    shows them before anything else. ``behind`` (h, w) bool: whether the score speaks for something behind the surface;
+    None where the residual's own sign says so.
     """
 
     score: np.ndarray
@@ -28,6 +29,7 @@ class Evidence:
     scale_m: float
     notes: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    behind: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,7 @@ class LocalDetector:
                 "filters_px": bank.widths,
             },
             warnings=() if ground.fits else (ground.warning,),
+            behind=on_grid(signed.ravel()[picture.cell], judged) > 0,
             signed=signed,
             cell=cell,
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.inspection import several_arguments, steps
-from harness.inspection.steps import DEFAULT_K, LEGAL_CROP
+from harness.inspection.steps import DEFAULT_FALSE_CALLS, LEGAL_CROP
 from harness.vocabulary.errors import exit_code_of
 
 if TYPE_CHECKING:
@@ -88,7 +88,14 @@ def _parser() -> argparse.ArgumentParser:
         help="how frames are averaged (default: mean)",
     )
     add("--max-frames", type=_number, metavar="N", help="use the first N frames only")
-    add("--threshold", type=float, metavar="K", help=f"threshold in units of score (default {DEFAULT_K:g})")
+    add(
+        "--false-calls",
+        type=float,
+        metavar="N",
+        help="set the threshold so that N false calls are expected in this capture, by the noise that it shows towards"
+        f" the camera (default: {DEFAULT_FALSE_CALLS:g})",
+    )
+    add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
     add(
         "--quiet-capture",
         type=Path,
@@ -126,14 +133,16 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
 
     detector, settings = steps.detector_of(arguments, arguments.crop, arguments.set)
     recording = steps.opened(arguments, arguments.paths)
-    wants_quiet = arguments.quiet_capture is not None and arguments.threshold is None
+    wants_quiet = arguments.quiet_capture is not None and arguments.threshold is arguments.false_calls is None
     quiet = steps.opened(arguments, [arguments.quiet_capture]) if wants_quiet else None
     if arguments.frames_report:
         printed.print_frames(recording)
     cloud = steps.averaged(arguments, recording)
     choice = choice_by(getattr(detector, "settings", None), cloud)
     evidence = steps.analysed(detector, cloud)
-    threshold, origin = steps.threshold_of(arguments, detector, lambda: _quiet_on(quiet, arguments, detector, cloud))
+    threshold, origin, evidence = steps.threshold_of(
+        arguments, detector, cloud, evidence, lambda: _quiet_on(quiet, arguments, detector, cloud)
+    )
     judged = steps.judged(detector, cloud, evidence, threshold)
     printed.print_warnings((*recording.warnings, *(choice.warnings if choice else ()), *evidence.warnings))
     print_choice(choice)

@@ -75,7 +75,7 @@ def before_wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_says_first_what_it_took_and_how_to_take_another(
     before_wall: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert detect.main([str(before_wall), "--out", str(tmp_path / "out")]) == 0
+    assert detect.main([str(before_wall), "--out", str(tmp_path / "out"), "--false-calls", "0.1"]) == 0
     first, second = capsys.readouterr().out.splitlines()[:2]
     assert (
         first.startswith("target 1 of 2: 0.50 m away (0.49 to 0.51 m), 30") and " % of the view, tilted by 6" in first
@@ -107,11 +107,11 @@ def test_it_finds_the_hole_and_writes_everything(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "new" / "found"
-    assert detect.main([str(capture), "--out", str(out), *NO_BLUR]) == 0
+    assert detect.main([str(capture), "--out", str(out), "--false-calls", "0.1", *NO_BLUR]) == 0
     said = capsys.readouterr().out
     assert "4 frames averaged" in said
     assert "left out: depth/00002.png: the whole range jumps by +18" in said
-    assert "not calibrated" in said
+    assert "from this capture's own null: 0.1 false calls expected" in said
     assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, "targets.png"))
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
@@ -153,7 +153,7 @@ def test_the_cloud_has_the_damage_in_magenta(capture: Path, tmp_path: Path) -> N
     import trimesh
 
     out = tmp_path / "out"
-    assert detect.main([str(capture), "--out", str(out)]) == 0
+    assert detect.main([str(capture), "--out", str(out), "--false-calls", "0.1"]) == 0
     content = (out / "cloud.ply").read_bytes()
     assert content.startswith(b"ply\nformat binary_little_endian")
     cloud = trimesh.load(out / "cloud.ply")
@@ -270,6 +270,10 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
         (("--threshold", "0"), "above 0"),
         (("--threshold", "nan"), "above 0"),
         (("--threshold", "3", "--quiet-capture", "x"), "give one of them"),
+        (("--threshold", "3", "--false-calls", "1"), "--threshold and --false-calls both set the threshold"),
+        (("--quiet-capture", "x", "--false-calls", "1"), "--quiet-capture and --false-calls both set"),
+        (("--false-calls", "0"), "above 0"),
+        (("--false-calls", "inf"), "above 0"),
         (("--intrinsics", "no_such_camera"), "azure_kinect_nfov"),
         (("--unit", "m"), "--unit mm"),
         (("--quiet-capture", "nowhere"), "nowhere: no such file"),

@@ -204,7 +204,9 @@ def _judge(
     cloud = mapped.merged.cloud
     evidence = steps.analysed(detector, cloud)
     # a quiet capture was refused before
-    threshold, origin = steps.threshold_of(arguments, detector, lambda: (steps.DEFAULT_K, ""))
+    threshold, origin, evidence = steps.threshold_of(
+        arguments, detector, cloud, evidence, lambda: (steps.DEFAULT_K, "")
+    )
     judged = steps.judged(detector, cloud, evidence, threshold)
     return Inspection(recordings, mapped, choices, checks, detector, judged, threshold, origin)
 

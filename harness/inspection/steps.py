@@ -19,9 +19,14 @@ if TYPE_CHECKING:
     from harness.vocabulary.capture import Cloud
 
 DEFAULT_K = 5.0
-"""Robust standard deviations: of a million normal pixels 0.6 lie beyond by chance. Real surfaces are not that kind."""
+"""Robust standard deviations, where the capture cannot tell better: of a million normal pixels 0.6 lie beyond by
+chance. Real surfaces are not that kind."""
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop", "variant")
 """Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
+DEFAULT_FALSE_CALLS = 1.0
+"""In the capture."""
+THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
+"""Arguments of which each sets the threshold."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
 
 
@@ -154,22 +159,66 @@ def analysed(detector: Detector, cloud: Cloud) -> Evidence:
 
 
 def threshold_of(
-    arguments: argparse.Namespace, detector: Detector, quiet: Callable[[], tuple[float, str]]
-) -> tuple[float, str]:
-    """The threshold and its origin: given, calibrated on a quiet capture (``quiet`` does it), the detector's own, or
-    the default."""
-    if arguments.threshold is not None and arguments.quiet_capture is not None:
-        raise UserError("--threshold and --quiet-capture both set the threshold", fix="give one of them")
+    arguments: argparse.Namespace,
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    quiet: Callable[[], tuple[float, str]],
+) -> tuple[float, str, Evidence]:
+    """The threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture (``quiet``
+    does it), the detector's own, or by the capture's own null, which may leave out a rim that cannot be judged."""
+    given = [name for name in THRESHOLDS if getattr(arguments, name) is not None]
+    if len(given) > 1:
+        flags = [f"--{name.replace('_', '-')}" for name in given]
+        all_set = "both set" if len(given) == 2 else "all set"
+        raise UserError(f"{' and '.join(flags)} {all_set} the threshold", fix="give one of them")
+    for name in ("threshold", "false_calls"):
+        value = getattr(arguments, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise UserError(f"--{name.replace('_', '-')} {value:g}", legal="a number above 0")
     if arguments.threshold is not None:
-        if not 0 < arguments.threshold < float("inf"):
-            raise UserError(f"--threshold {arguments.threshold:g}", legal="a number above 0")
-        return arguments.threshold, "given"
+        return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
-        return quiet()
+        return *quiet(), evidence
     own = getattr(detector, "default_threshold", None)
-    if own is not None:
-        return float(own), "the detector's own"
-    return DEFAULT_K, "default, not calibrated: without an undamaged capture the rate of false calls is unknown"
+    if own is not None and arguments.false_calls is None:
+        return float(own), "the detector's own", evidence
+    return _by_own_null(detector, cloud, evidence, arguments.false_calls or DEFAULT_FALSE_CALLS)
+
+
+def _by_own_null(
+    detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float
+) -> tuple[float, str, Evidence]:
+    """The threshold by the peaks towards the camera; where they cannot be trusted, a fallback with warnings."""
+    import dataclasses
+    import math
+
+    from detectors.null import own_threshold
+
+    own = own_threshold(detector, cloud, evidence, false_calls)
+    names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
+    notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
+    set_aside = f", {own.objects} higher ones set aside as objects" if own.objects else ""
+    told = f"{own.peaks} peaks towards the camera{set_aside}"
+    if own.rim_pixels:
+        told += f"; {own.rim_pixels} pixels along the rim mix in what lies behind it and are not judged"
+    if own.doubts:
+        known = math.isfinite(own.threshold)
+        k = max(DEFAULT_K, own.threshold) if known else DEFAULT_K
+        why = f"the larger of {DEFAULT_K:g} and its own {own.threshold:.3g}" if known else f"{DEFAULT_K:g}"
+        warnings = tuple(f"the capture cannot set its own threshold, {why} is used: {doubt}" for doubt in own.doubts)
+        origin = f"a fallback, {why} units of score: the number of false calls is unknown; {told}"
+        found_in = dataclasses.replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings))
+        return k, origin, found_in
+    origin = (
+        f"from this capture's own null: {_calls(own.expected)} false calls expected, 95 % interval {_calls(own.low)} to"
+        f" {_calls(own.high)}, from {told}"
+    )
+    return own.threshold, origin, dataclasses.replace(own.evidence, notes=notes)
+
+
+def _calls(expected: float) -> str:
+    return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
 def provenance(recordings: Sequence[Recording], *further: Path) -> dict[str, Any]:

@@ -1,0 +1,135 @@
+"""The threshold that a capture sets itself: calls counted against expected, objects, rims, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+
+from detectors import load_detector
+from detectors.interface import Evidence
+from detectors.null import FEWEST_PEAKS, Tail, own_threshold, skew_of
+from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Region
+
+PITCH_M, DISTANCE_M, SIGMA_M = 2e-3, 0.7, 1e-3
+DETECTOR = load_detector("thesis", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
+ALPHA = 1e-3
+BOARDS = 16
+Noise = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
+NOISES: dict[str, Noise] = {
+    "normal": lambda random, shape: random.normal(size=shape),
+    "Laplace": lambda random, shape: random.laplace(size=shape),
+    "Student's t": lambda random, shape: random.standard_t(4, size=shape),
+    "smooth": lambda random, shape: 5.0 * ndimage.gaussian_filter(random.normal(size=shape), 1.5, mode="wrap"),
+}
+
+
+def plane(offset_m: np.ndarray) -> Cloud:
+    """Points of a plane that stand so much behind it, (h, w)."""
+    h, w = offset_m.shape
+    v, u = np.mgrid[:h, :w].astype(float)
+    points = np.stack([(u - w / 2) * PITCH_M, (v - h / 2) * PITCH_M, DISTANCE_M + offset_m], axis=-1)
+    empty = np.zeros((h, w), np.uint8)
+    return Cloud(points, empty, empty + 1, np.full((h, w), np.nan), Region(0, h, 0, w), 0.0, 1)
+
+
+def noise(kind: str, seed: int, shape: tuple[int, int] = (110, 150)) -> np.ndarray:
+    return SIGMA_M * NOISES[kind](np.random.default_rng([13, seed]), shape)
+
+
+def analysed(cloud: Cloud) -> Evidence:
+    return DETECTOR.analyse(cloud)
+
+
+@pytest.mark.parametrize("kind", NOISES)
+def test_as_many_false_calls_as_expected(kind: str) -> None:
+    """Within a factor of 1.5 of the mean, but for chance: counts are Poisson and a little more, as the thresholds
+    scatter (variance of twice the mean). Two sides of four kinds share alpha."""
+    count, wanted = 0, 3.0
+    for seed in range(BOARDS):
+        cloud = plane(noise(kind, seed))
+        own = own_threshold(DETECTOR, cloud, analysed(cloud), wanted)
+        assert not own.doubts and own.low < wanted < own.high
+        assert own.expected == pytest.approx(wanted, rel=1e-6)
+        count += len(DETECTOR.find(cloud, own.evidence, own.threshold))
+    beyond = stats.norm.isf(ALPHA / (2 * len(NOISES)))
+    low, high = (wanted * BOARDS * factor for factor in (1 / 1.5, 1.5))
+    assert low - beyond * np.sqrt(2 * low) < count < high + beyond * np.sqrt(2 * high)
+
+
+def test_the_interval_holds_the_truth() -> None:
+    """Peaks whose tail is known: exponential in the square of the score."""
+    held, expected, captures = 0, [], 300
+    for seed in range(captures):
+        random = np.random.default_rng([5, seed])
+        peaks = np.sqrt(9.0 + 2.0 * random.exponential(size=random.poisson(50)))
+        tail = Tail.of(peaks, 3.0)
+        threshold = tail.threshold(0.5)
+        true = 50.0 * np.exp(-(threshold**2 - 9.0) / 2.0)
+        low, high = tail.interval(threshold)
+        held += low < true < high
+        expected.append(true)
+    # an interval over exponents that are not this one's is wider than it need be
+    assert stats.binom.sf(held, captures, 0.95 - 0.02) < 1.0 and held / captures > 0.90
+    assert 0.5 / 1.5 < np.mean(expected) < 0.5 * 1.5
+
+
+def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() -> None:
+    offset_m = noise("smooth", 1)
+    bare = plane(offset_m)
+    v, u = np.mgrid[: offset_m.shape[0], : offset_m.shape[1]]
+    inside = ndimage.gaussian_filter(((abs(v - 40) < 14) & (abs(u - 60) < 20)).astype(float), 1.0)
+    with_object = plane(offset_m - 15e-3 * inside)
+    alone, beside = (own_threshold(DETECTOR, cloud, analysed(cloud), 1.0) for cloud in (bare, with_object))
+    assert beside.objects == 1 and alone.objects == 0 and not beside.doubts
+    assert beside.threshold == pytest.approx(alone.threshold, rel=0.25)
+    strongest = DETECTOR.find(with_object, beside.evidence, beside.threshold)[0]
+    assert len(strongest.pixels) > 27 * 39 * 0.9
+    assert np.median(beside.evidence.residual_m.ravel()[strongest.pixels]) < -10e-3
+
+
+def test_holes_do_not_raise_the_threshold() -> None:
+    offset_m = noise("smooth", 2)
+    v, u = np.mgrid[: offset_m.shape[0], : offset_m.shape[1]]
+    holes = ((v % 22 - 11) ** 2 + (u % 30 - 15) ** 2 < 9.0) * 10e-3
+    bare, drilled = plane(offset_m), plane(offset_m + holes)
+    alone, beside = (own_threshold(DETECTOR, cloud, analysed(cloud), 1.0) for cloud in (bare, drilled))
+    assert beside.threshold == pytest.approx(alone.threshold, rel=0.15)
+    assert len(DETECTOR.find(drilled, beside.evidence, beside.threshold)) >= 25
+
+
+def test_a_rim_that_mixes_in_the_background_is_not_judged() -> None:
+    offset_m = noise("smooth", 3)
+    offset_m[:10] = offset_m[:, -10:] = np.nan
+    offset_m[10, 20:60] += 12e-3
+    offset_m[10, 80:100] += 12e-3
+    cloud = plane(offset_m)
+    own = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
+    assert own.rim_pixels >= 150
+    assert not np.isfinite(own.evidence.score[10]).any() and np.isfinite(own.evidence.score[-1, :-11]).all()
+    assert len(DETECTOR.find(cloud, own.evidence, own.threshold)) <= 4
+    # a hole at the rim is no rim: it reaches deeper, and it is alone
+    offset_m = noise("smooth", 3)
+    offset_m[:10] = np.nan
+    offset_m[10:16, 60:66] += 12e-3
+    hole = plane(offset_m)
+    own = own_threshold(DETECTOR, hole, analysed(hole), 1.0)
+    assert own.rim_pixels == 0
+    assert DETECTOR.find(hole, own.evidence, own.threshold)[0].score > 5.0
+
+
+def test_it_says_what_it_cannot_know() -> None:
+    few = own_threshold(
+        DETECTOR, plane(noise("smooth", 4)[:12, :12]), analysed(plane(noise("smooth", 4)[:12, :12])), 1.0
+    )
+    assert few.peaks < FEWEST_PEAKS and np.isnan(few.threshold) and "too few" in few.doubts[0]
+    skewed = plane(SIGMA_M * np.random.default_rng(4).exponential(size=(110, 150)))
+    evidence = analysed(skewed)
+    assert skew_of(evidence) > 0.15
+    assert any(
+        "not symmetric" in doubt and "behind" in doubt
+        for doubt in own_threshold(DETECTOR, skewed, evidence, 1.0).doubts
+    )
