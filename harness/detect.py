@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows",
     )
-    add("--detector", default="thesis", help="detector's name (default: thesis)")
+    add("--detector", default="local", help="detector's name (default: local)")
     add(
         "--set",
         action="append",
