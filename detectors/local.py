@@ -61,6 +61,8 @@ SAMPLES_SIDE = 14
 SADDLE, PROMINENCE = 0.75, 1.5
 """Two peaks are one finding where the saddle between them is higher than this share of the lower, or fewer units of
 score below it than that."""
+LEAST_FRAMES, SCATTER_PX = 4, 7
+"""From so many frames on their scatter weighs pixels, averaged over a square: known to 12 % from 49 x 3 differences."""
 CORE = 0.5
 """A finding's size is taken of the pixels with this share of its score or more."""
 
@@ -106,7 +108,7 @@ class LocalDetector:
         mask = crop(cloud, self.settings.crop)
         ground = background(cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
-        picture = _Picture.of(cloud, judged)
+        picture = _Picture.of(cloud, judged, _variances(cloud, judged, ground.residual_m))
         residual = picture.means(ground.residual_m[judged])
         fixed_m2, random_m2 = rounding_variances(cloud, judged)
         bank = _Bank(residual, picture.weights, (fixed_m2, random_m2), ground.scale_m)
@@ -171,10 +173,31 @@ def _findings(evidence: Evidence, threshold: float) -> list[tuple[np.ndarray, np
 
 
 def _centre(cloud: Cloud, pixels: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """(3,) mean of a finding's core."""
-    core = pixels[scores >= CORE * scores.max()]
-    centre: np.ndarray = cloud.points_m.reshape(-1, 3)[core].mean(axis=0)
+    """(3,) mean of a finding's core, each pixel weighted by how far its score exceeds the core's least."""
+    excess = np.maximum(scores - CORE * scores.max(), 0.0)
+    centre: np.ndarray = excess @ cloud.points_m.reshape(-1, 3)[pixels] / excess.sum()
     return centre
+
+
+def _variances(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray | None:
+    """(n,) variance of each judged point, m^2: stated by the cloud's maker, else by the frames' scatter round about and
+    what is fixed in all of them; None where neither is known.
+
+    The frames tell of a louder patch to the pixel, the local noise only to half a window.
+    """
+    if cloud.mean_variance_m2 is not None:
+        return np.maximum(cloud.mean_variance_m2[judged], 1e-18)
+    seen = judged & np.isfinite(cloud.variance_m2)
+    if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * judged.sum():
+        return None
+    side = (SCATTER_PX, SCATTER_PX)
+    known = cv2.blur(seen.astype(np.float64), side, borderType=cv2.BORDER_CONSTANT)
+    scatter = cv2.blur(np.where(seen, cloud.variance_m2, 0.0), side, borderType=cv2.BORDER_CONSTANT)
+    random = np.where(known > 0, scatter / np.maximum(known, 1e-9), np.nan)[judged] / cloud.n_frames
+    typical = median_of(random[np.isfinite(random)])
+    random = np.where(np.isfinite(random), random, typical)
+    fixed = max((median_size_of(residual_m[judged]) / 0.6745) ** 2 - typical, 0.0)
+    return np.maximum(random + fixed, 1e-18)
 
 
 @dataclass(frozen=True)
@@ -187,11 +210,10 @@ class _Picture:
     share: np.ndarray
 
     @classmethod
-    def of(cls, cloud: Cloud, judged: np.ndarray) -> _Picture:
-        """Where the cloud's maker states variances, a point's weight is the median variance over its own."""
+    def of(cls, cloud: Cloud, judged: np.ndarray, variances: np.ndarray | None) -> _Picture:
+        """A point's weight is the median variance over its own of ``variances`` (n,) m^2; 1 where they are None."""
         share = np.ones(int(judged.sum()))
-        if cloud.mean_variance_m2 is not None:
-            variances = np.maximum(cloud.mean_variance_m2[judged], 1e-18)
+        if variances is not None:
             share = np.minimum(median_of(variances) / variances, 4.0)
         if cloud.organised:
             rows, columns = np.nonzero(judged)
@@ -262,9 +284,10 @@ class _Bank:
         return np.where(grown * np.sign(best) > np.abs(best), best + sure * (grown - best), best)
 
     def _mean(self, values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted mean of values, drawn towards 0 where hardly anything is known, and mean weight, both (r, c)."""
+        """Weighted mean of values, drawn towards 0 where hardly anything is known, and what it is worth (`_worth`),
+        both (r, c)."""
         covered = _tent(weights, half)
-        return _tent(values * weights, half) / (covered + FAINT), covered
+        return _tent(values * weights, half) / (covered + FAINT), _worth(weights, covered, half)
 
     def _sigma(self, differences: np.ndarray, quiet: np.ndarray, half: int) -> np.ndarray:
         """(r, c) deviation of a filter's differences, which are brought to the noise of a whole window."""
@@ -296,6 +319,16 @@ def _tent(image: np.ndarray, half: int) -> np.ndarray:
     size = (2 * half + 1, 2 * half + 1)
     once = cv2.blur(np.ascontiguousarray(image, np.float32), size, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT))
+
+
+def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
+    """(r, c) the variance of a tent's mean of white noise where all weights are 1 over that of its mean by ``weights``,
+    whose own mean is ``covered``. Beside a rim or an object single pixels may be all that a narrow filter holds."""
+    side = np.convolve(np.ones(2 * half + 1), np.ones(2 * half + 1)) ** 2
+    side /= side.sum()
+    # in double precision, so that the order of its sums does not tell which way the picture is turned
+    squares = cv2.sepFilter2D(weights.astype(np.float64), -1, side, side, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray((covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)).astype(np.float32))
 
 
 def _local_sigma(values: np.ndarray, half: int, floor: float) -> np.ndarray:

@@ -143,7 +143,8 @@ def _inspect_capture(arguments: argparse.Namespace) -> int:
     threshold, origin, evidence = steps.threshold_of(
         arguments, detector, cloud, evidence, lambda: _quiet_on(quiet, arguments, detector, cloud)
     )
-    judged = steps.judged(detector, cloud, evidence, threshold)
+    judged = steps.with_faint_told(steps.judged(detector, cloud, evidence, threshold), threshold)
+    evidence = judged.evidence
     printed.print_warnings((*recording.warnings, *(choice.warnings if choice else ()), *evidence.warnings))
     print_choice(choice)
     printed.print_capture(recording, cloud, evidence, arguments.crop)

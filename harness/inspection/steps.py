@@ -25,6 +25,8 @@ STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop"
 """Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
 DEFAULT_FALSE_CALLS = 1.0
 """In the capture."""
+FAINT_CALLS = 0.05
+"""Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
@@ -215,6 +217,28 @@ def _by_own_null(
         f" {_calls(own.high)}, from {told}"
     )
     return own.threshold, origin, dataclasses.replace(own.evidence, notes=notes)
+
+
+def with_faint_told(judged: Judged, threshold: float) -> Judged:
+    """The same, with a warning where noise explains more of the findings than false calls are expected, in a capture
+    that set its own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
+    noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
+    import math
+
+    null = judged.evidence.notes.get("own_null")
+    if null is None or threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
+        return judged
+    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
+    sure = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
+    faint = [str(each.id) for each in judged.findings if each.kind != "no return" and each.score < sure]
+    if len(faint) <= max(null["expected"], 1.0) + 1e-6:
+        return judged
+    warning = (
+        f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)}) are so faint that noise explains them:"
+        f" {_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
+    )
+    evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
+    return replace(judged, evidence=evidence)
 
 
 def _calls(expected: float) -> str:

@@ -163,12 +163,14 @@ def _gain(blur_px: float) -> float:
 
 
 def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
-    """Depth averaged over the pixel's footprint: flying pixels at every edge."""
+    """Depth averaged over the pixel's footprint: flying pixels at every edge. Beyond the image it goes on straight."""
+    beyond = 4
+    depth = np.pad(depth, beyond, mode="reflect", reflect_type="odd")
     known = np.isfinite(depth)
     weight = cv2.GaussianBlur(known.astype(float), (0, 0), blur_px)
     total = cv2.GaussianBlur(np.where(known, depth, 0.0), (0, 0), blur_px)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weight > 0.5, total / weight, np.nan)
+        return np.where(weight > 0.5, total / weight, np.nan)[beyond:-beyond, beyond:-beyond]
 
 
 def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
