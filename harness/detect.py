@@ -52,7 +52,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--unit",
-        help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: the format's usual one",
+        help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: what the file, the camera or"
+        " the data say, which is printed",
     )
     add(
         "--intrinsics",
