@@ -294,7 +294,9 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     options += ["--figures", str(figures), "--out", str(out)]
     assert main(options) == 0
     told = capsys.readouterr()
-    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "A quick look" in told.out and not told.err
+    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "A quick look" in told.out
+    # on a slow machine progress is told meanwhile
+    assert all(line.startswith("measured ") for line in told.err.splitlines())
     page = (out / "scorecard.html").read_text()
     assert f'<meta name="generator" content="{GENERATOR}">' in page
     assert page.count("<svg") == 6 and "http" not in page.replace("http://www.w3.org", "")
