@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
+from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 
 THRESHOLD = 5.0
 LOWEST = 3.0
@@ -26,6 +26,15 @@ SIGNAL_PER_MM = 0.8
 OPERATING = np.arange(LOWEST, 12.01, 0.5)
 PIXEL_GRID = np.linspace(-4.0, 9.0, 131)
 FACE_PIXELS = 20_000
+
+CALIBRATED = Calibrated(
+    board=np.arange(4),
+    repeat=np.zeros(4, int),
+    score=np.array([4.1, THRESHOLD, 7.5, 4.4]),
+    x_mm=np.array([1.0, -120.4, np.nan, 3.0]),
+    y_mm=np.array([2.0, 33.2, np.nan, 4.0]),
+)
+"""Hole-free runs of which the second highest set the threshold."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +114,7 @@ def _record(study: Study, one: SetUp) -> SetUpRecord:
         frames_digest=f"{one.frames_digest}-{study.seed}",
         inspected=_inspected(study, one),
         unflawed=Unflawed(board, repeat, np.array(count, int), np.full(len(board), AREA_M2)),
+        calibrated=CALIBRATED,
     )
 
 

@@ -16,6 +16,7 @@ from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.report.study_page import study_html, write_study_report
 from harness.report.study_rows import limit_sentence, unbroken
+from harness.report.study_terminal import study_text
 from harness.vocabulary.errors import UserError
 from scenes.target.thesis import DIAMETERS_IN
 
@@ -167,6 +168,52 @@ def test_false_calls_stand_beside_the_wanted_rate(page: str) -> None:
     text = section(page, "False calls and chance hits")
     assert "Calibrated to 1 false call per m² on hole-free boards of their own" in text
     assert "shuffled positions" in text
+
+
+def test_what_set_each_threshold_is_told_with_its_place_and_rank(page: str) -> None:
+    text = section(page, "False calls and chance hits")
+    assert "depth &lt;near&gt;, 1 frame 5 1 −120, 33 number 2 of 4 7.5 on board 2" in text.replace("\u00a0", " ")
+    assert "warning" not in words(page).partition("Detection limits")[0]
+
+
+def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
+    """In the first lines of the page and of the terminal, with the place; not at ten deviations, not where given."""
+    result = judged(small(SetUp()))
+    (one,) = result.record.set_ups
+
+    def warned(threshold: float, **changed: object) -> StudyResult:
+        assert one.calibrated is not None
+        score = np.array([4.1, threshold, 60.0, 4.4])
+        calibrated = replace(one.calibrated, score=score, **changed)  # type: ignore[arg-type]
+        record = replace(result.record, set_ups=(replace(one, threshold=threshold, calibrated=calibrated),))
+        return evaluate_study(record, study_tables(small(SetUp())), {}, draws=20)
+
+    high = warned(83.0)
+    told = (
+        "1 frame: the threshold is 83 deviations, above 10: something other than noise sets it (calibration board 1, "
+    )
+    assert study_text(high).startswith(f"warning: {told}at x, y = −120, 33 mm)")
+    assert f"warning: {told}" in words(html(high)).replace("\u00a0", " ").partition("is found 90 %")[0]
+    off = np.full(4, np.nan)
+    assert f"warning: {told}off the board)" in study_text(warned(83.0, x_mm=off, y_mm=off))
+    assert "warning" not in study_text(warned(10.0))
+    given = replace(high.record, set_ups=(replace(high.record.set_ups[0], calibrated=None),))
+    told_nothing = evaluate_study(given, study_tables(small(SetUp())), {}, draws=20)
+    assert "warning" not in study_text(told_nothing)
+    assert "What set each threshold" not in html(told_nothing)
+
+
+def test_an_axis_may_hold_mappings() -> None:
+    """Without a limit too, which is told above the figure at the value's place."""
+    shapes = ({"kind": "flat"}, {"kind": "cylinder", "radius_mm": 300.0})
+    set_ups = [
+        SetUp(variant=shape["kind"], axes={"source.target.board.shape": shape}, a50_mm=a50)
+        for shape, a50 in zip(shapes, (6.0, 60.0), strict=True)
+    ]
+    page = html(judged(small(*set_ups)))
+    assert "cylinder" in section(page, "Limits against what was varied")
+    assert '<figure id="axis-1"' in page
+    assert "every target was missed" in words(page)
 
 
 def test_the_drills_of_the_thesis_have_their_chances(whole: StudyResult, page: str) -> None:

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, read_record, record_text
+from harness.evaluation.study.record import (
+    Calibrated,
+    Inspected,
+    SetUpRecord,
+    StudyRecord,
+    Unflawed,
+    read_record,
+    record_text,
+)
 from harness.vocabulary.errors import UserError
 from tests.synthetic_study import SetUp, Study, study_record
 
@@ -62,7 +70,7 @@ def test_written_and_read_it_is_the_same(tmp_path):
     for one, other in zip(study.set_ups, again.set_ups, strict=True):
         for field in fields(SetUpRecord):
             a, b = getattr(one, field.name), getattr(other, field.name)
-            if isinstance(a, Inspected | Unflawed):
+            if isinstance(a, Inspected | Unflawed | Calibrated):
                 for column in fields(a):
                     before, now = getattr(a, column.name), getattr(b, column.name)
                     if before is None:

@@ -40,6 +40,7 @@ from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.table import Table
 
 
@@ -77,6 +78,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             provenance = _provenance(experiment, plan, outcome, tables, origin, started)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
             _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
+            table: RenderableType
             if experiment.config.study is None:
                 _write_report(folder, experiment, outcome, tables, provenance)
                 table, text = _final_table(tables)
@@ -121,7 +123,7 @@ def _write_study(
     tables: Tables,
     provenance: dict[str, Any],
     engine: Engine,
-) -> tuple[Table, str]:
+) -> tuple[RenderableType, str]:
     """A study's record and report; its limits as a table and as text."""
     from harness.engine.study_examples import shown_in, study_examples
     from harness.engine.study_record import failed_by_point, record_of
@@ -280,7 +282,7 @@ def _write_report(
     write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title)
 
 
-def _conclude(folder: Path, table: Table, text: str, outcome: Outcome) -> None:
+def _conclude(folder: Path, table: RenderableType, text: str, outcome: Outcome) -> None:
     """The final table, what did not end well, and where to look."""
     from rich.console import Console
 

@@ -9,7 +9,7 @@ import pandas as pd
 
 from harness.engine.plan import PACKAGES, Batch, Group, Plan
 from harness.engine.tables import Tables
-from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
+from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.declared import detector_version
 from harness.experiment.points import Experiment, Point
 from harness.vocabulary.seeds import digest
@@ -65,6 +65,21 @@ def _set_up(point: Point, group: Group, tables: Tables, failed: int) -> SetUpRec
             area_m2=unflawed["inspected_m2"].to_numpy(float),
             no_return_calls=unflawed["no_return_calls"].to_numpy(int),
         ),
+        calibrated=_calibrated(runs[runs["role"] == "calibration"]),
+    )
+
+
+def _calibrated(runs: pd.DataFrame) -> Calibrated | None:
+    """None where no run set a threshold. Runs that judged no pixel are left out."""
+    runs = runs[runs["quiet_threshold"].notna()]
+    if runs.empty:
+        return None
+    return Calibrated(
+        board=runs["board"].to_numpy(int),
+        repeat=runs["repeat"].to_numpy(int),
+        score=runs["quiet_threshold"].to_numpy(float),
+        x_mm=runs["loudest_x_mm"].to_numpy(float),
+        y_mm=runs["loudest_y_mm"].to_numpy(float),
     )
 
 

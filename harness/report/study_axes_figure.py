@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
@@ -101,7 +101,7 @@ def axis_figure(axis: AxisGroup, name: str) -> str:
             axes.plot([], [], marker="^", ls="none", color=GREY, ms=6, label="goes on beyond")
         if np.isfinite(top_mm):
             axes.axhline(top_mm / ROOM, color=GREY, lw=1.0, ls=":", label="largest size inspected")
-        _missing(axes, dict(zip(axis.values, places, strict=True)), [line for _, line in shown])
+        _missing(axes, list(zip(axis.values, places, strict=True)), [line for _, line in shown])
         if logarithmic:
             axes.set_xscale("log")
             axes.minorticks_off()
@@ -181,10 +181,10 @@ def _arrows(axes: Axes, x: np.ndarray, limits: Sequence[SetUpLimit], colour: str
     return count
 
 
-def _missing(axes: Axes, places: Mapping[Any, float], lines: Sequence[AxisLine]) -> None:
+def _missing(axes: Axes, places: Sequence[tuple[Any, float]], lines: Sequence[AxisLine]) -> None:
     """A word above the figure where no limit lies within the sizes inspected; in two rows where places are close."""
     close = len(places) > MOST_IN_A_ROW
-    for number, (value, x) in enumerate(places.items()):
+    for number, (value, x) in enumerate(places):
         here = [limit for line in lines for at, limit in zip(line.values, line.limits, strict=True) if at == value]
         without = sum(not is_within_sizes(limit) for limit in here)
         if without:

@@ -31,16 +31,19 @@ from harness.report.study_surface_figure import surface_figure
 from harness.report.study_tables import (
     CHANCE_HEADS,
     OPERATING_HEADS,
+    SET_BY_HEADS,
     SIGNAL_HEADS,
     THRESHOLD_HEADS,
     chance_rows,
     operating_notes,
     operating_rows,
+    set_by_rows,
     signal_notes,
     signal_rows,
     signal_tests,
     threshold_note,
     threshold_rows,
+    threshold_warnings,
 )
 from harness.vocabulary.files import write_text
 
@@ -93,6 +96,9 @@ def study_html(
         threshold_heads=THRESHOLD_HEADS,
         threshold_rows=threshold_rows(limits),
         threshold_note=threshold_note(result.record),
+        warnings=[unbroken(text) for text in threshold_warnings(limits)],
+        set_by_heads=SET_BY_HEADS,
+        set_by_rows=set_by_rows(limits),
         signal_heads=SIGNAL_HEADS,
         signal_rows=signal_rows(limits),
         signal_tests=signal_tests(limits),

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from harness.evaluation.study.result import StudyResult
 from harness.report.page_parts import aligned
 from harness.report.study_rows import LimitRow, limit_notes, limit_rows, study_answer
+from harness.report.study_tables import threshold_warnings
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Group
 
 HEADS = (
     "set-up",
@@ -23,8 +24,9 @@ HEADS = (
 )
 
 
-def study_table(result: StudyResult) -> Table:
-    """The limits of every set-up and number of frames in mm, with their rates of false calls."""
+def study_table(result: StudyResult) -> Group:
+    """Warnings, then the limits of every set-up and number of frames in mm, with their rates of false calls."""
+    from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
@@ -37,15 +39,19 @@ def study_table(result: StudyResult) -> Table:
     for row in limit_rows(result.limits):
         colours = {HEADS.index("a90/95 (mm)"): "bold green" if row.demonstrated else "bold red"}
         table.add_row(*(Text(text, style=colours.get(at, "")) for at, text in enumerate(_cells(row))))
-    return table
+    return Group(*(Text(line) for line in _warnings(result)), table)
 
 
 def study_text(result: StudyResult) -> str:
-    """`study_table` as plain lines, then what to know beside it, then the answer."""
+    """Warnings, `study_table` as plain lines, then what to know beside it, then the answer."""
     rows = limit_rows(result.limits)
     table = aligned([list(HEADS), *(list(_cells(row)) for row in rows)])
     notes = limit_notes(rows)
-    return "\n".join([*table, *([""] if notes else []), *notes, "", study_answer(result.limits)])
+    return "\n".join([*_warnings(result), *table, *([""] if notes else []), *notes, "", study_answer(result.limits)])
+
+
+def _warnings(result: StudyResult) -> list[str]:
+    return [f"warning: {text}" for text in threshold_warnings(result.limits)]
 
 
 def _cells(row: LimitRow) -> tuple[str, ...]:

@@ -63,13 +63,26 @@ class Unflawed:
 
 
 @dataclass(frozen=True, eq=False)
+class Calibrated:
+    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int; ``score`` (k,): of the highest pixel, above
+    which the run has no finding; ``x_mm``, ``y_mm`` (k,): where that pixel lies on the board, NaN where off it."""
+
+    board: np.ndarray
+    repeat: np.ndarray
+    score: np.ndarray
+    x_mm: np.ndarray
+    y_mm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class SetUpRecord:
     """One set-up at one number of frames.
 
     ``axes``: its place on the experiment's axes other than frames, by dotted path. ``threshold`` in the detector's
     units, ``threshold_mm`` that times the mean scale; ``calibration_runs`` hole-free runs on boards of their own set
     it (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and damage, ``frames_digest`` those
-    with camera, noise seed and the code that simulates: equal for identical frames.
+    with camera, noise seed and the code that simulates: equal for identical frames. ``calibrated``: what those runs
+    found; None in records that do not keep it.
     """
 
     variant: str
@@ -85,6 +98,7 @@ class SetUpRecord:
     frames_digest: str
     inspected: Inspected
     unflawed: Unflawed
+    calibrated: Calibrated | None = None
 
     @property
     def label(self) -> str:
@@ -145,21 +159,26 @@ def read_record(path: Path) -> StudyRecord:
 def _set_up_data(one: SetUpRecord) -> dict[str, Any]:
     data = {field.name: getattr(one, field.name) for field in fields(one)}
     data["threshold_mm"] = None if np.isnan(one.threshold_mm) else one.threshold_mm
-    return {**data, "inspected": _columns(one.inspected), "unflawed": _columns(one.unflawed)}
+    calibrated = {} if one.calibrated is None else {"calibrated": _columns(one.calibrated)}
+    del data["calibrated"]
+    return {**data, "inspected": _columns(one.inspected), "unflawed": _columns(one.unflawed), **calibrated}
 
 
-def _columns(table: Inspected | Unflawed) -> dict[str, list[Any]]:
+def _columns(table: Inspected | Unflawed | Calibrated) -> dict[str, list[Any]]:
     there = {field.name: getattr(table, field.name) for field in fields(table)}
     columns = {name: column.tolist() for name, column in there.items() if column is not None}
     return {name: [None if value != value else value for value in column] for name, column in columns.items()}
 
 
 def _set_up(data: Mapping[str, Any]) -> SetUpRecord:
-    plain = {f.name: data[f.name] for f in fields(SetUpRecord) if f.name not in ("inspected", "unflawed")}
+    tables = ("inspected", "unflawed", "calibrated")
+    plain = {f.name: data[f.name] for f in fields(SetUpRecord) if f.name not in tables}
     plain["threshold_mm"] = np.nan if plain["threshold_mm"] is None else plain["threshold_mm"]
     inspected = Inspected(**{name: _array(name, column) for name, column in data["inspected"].items()})
     unflawed = Unflawed(**{name: _array(name, column) for name, column in data["unflawed"].items()})
-    return SetUpRecord(**plain, inspected=inspected, unflawed=unflawed)
+    columns = data.get("calibrated")
+    calibrated = columns and Calibrated(**{name: _array(name, column) for name, column in columns.items()})
+    return SetUpRecord(**plain, inspected=inspected, unflawed=unflawed, calibrated=calibrated)
 
 
 def _array(name: str, column: list[Any]) -> np.ndarray:

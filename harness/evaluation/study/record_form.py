@@ -67,6 +67,14 @@ class UnflawedForm(_Columns):
     no_return_calls: tuple[Number, ...] | None = None
 
 
+class CalibratedForm(_Columns):
+    """Of `harness.evaluation.study.record.Calibrated`. A place is null where it is off the board."""
+
+    score: tuple[float, ...]
+    x_mm: tuple[float | None, ...]
+    y_mm: tuple[float | None, ...]
+
+
 class SetUpForm(Config):
     """Of `harness.evaluation.study.record.SetUpRecord`. ``threshold_mm`` is null where the detector has no scale."""
 
@@ -83,6 +91,7 @@ class SetUpForm(Config):
     frames_digest: Name
     inspected: InspectedForm
     unflawed: UnflawedForm
+    calibrated: CalibratedForm | None = None
 
 
 class StudyForm(Config):
