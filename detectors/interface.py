@@ -20,7 +20,8 @@ class Evidence:
     surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score is.
     ``warnings``: full sentences on what makes these numbers unreliable (the surface does not fit, ...); every program
     shows them before anything else. ``behind`` (h, w) bool: whether the score speaks for something behind the surface;
-    None where the residual's own sign says so.
+    None where the residual's own sign says so. ``unit``: what a unit of score is, in words, where scores are not
+    residuals over a deviation; ``scale_m`` is then the least that a unit is at a typical point.
     """
 
     score: np.ndarray
@@ -30,6 +31,7 @@ class Evidence:
     notes: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     behind: np.ndarray | None = None
+    unit: str = ""
 
 
 @dataclass(frozen=True)

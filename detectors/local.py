@@ -128,6 +128,8 @@ class LocalDetector:
             },
             warnings=() if ground.fits else (ground.warning,),
             behind=on_grid(signed.ravel()[picture.cell], judged) > 0,
+            unit=f"the local noise of means over {bank.widths[0]} to {bank.widths[-1]} pixels,"
+            f" {1e3 * bank.typical_m:.3g} mm of the narrowest at a typical point",
             signed=signed,
             cell=cell,
         )

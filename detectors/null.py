@@ -5,12 +5,17 @@ the target are set aside. So the peaks towards the camera are a sample of the nu
 extrapolated to the threshold at which the wanted number of false calls is expected in the capture, bumps and hole-like
 calls together.
 
+Objects are regions that stand before the surface as a whole, and edges in the colour picture or the amplitude: tags,
+print, another material. They and a margin are left out, and so are peaks that reach into them: the expected number is
+of calls beside them.
+
 The tail above a floor is exponential in (s^q - 1) / q of the score s. q = 2 is normal noise, 1 is Laplace's, 0 a power
 law. The data weigh the exponents, starting from `PRIOR`; rates and scales are integrated out, so that the mean of the
 expected number is right although few peaks are known.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core, and damage that is itself towards the
-camera and no larger than the noise.
+camera and no larger than the noise. On clouds without a grid objects are not looked for. Things on the target that are
+neither proud of it nor seen in a picture raise the threshold.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, stats
 
 from detectors.interface import Detection, Detector, Evidence, FindsAtOnce
 from harness.vocabulary.capture import Cloud
@@ -42,20 +47,26 @@ LADDER = 1.06
 LEAST = 3.0
 """Units of score below which no threshold goes, whatever is expected there: errors that are bounded, as those of
 rounded numbers without noise, end so near that a tail extrapolated from one side says nothing of the other."""
-RARE = 0.01
-"""Chance at which a peak is no longer taken for the largest of the noise's."""
-OBJECT_AREA, PLATE_AREA = 4.0, 15.0
-"""An object that lies on the target covers so many times the area of noise's peaks, or, flat and low, so many times
-what a peak of its height covers."""
 OBJECT_MARGIN_PX = 6
-"""Around an object: its edge is mixed over 3 pixels, and its shadow lies beside it."""
-MOST_MASKED = 0.3
+"""Around an object: its edge is mixed over 3 pixels, and its shadow lies beside it. Smoothed depth reaches further, by
+half of the square that it was smoothed over."""
+PATCH_PX = 5
+"""Side of the square that residual and picture are smoothed over before objects are looked for."""
+LEAST_OBJECT_PX = 100
+"""Four such squares: a point that flies alone raises no more than one."""
+PROUD, PROUD_FOOT = 6.0, 3.0
+"""An object stands so many deviations of the smoothed residual before the surface somewhere, and so many everywhere."""
+MARKED = 8.0
+"""An edge in the picture is so many times as steep as half of the picture is: a tag, print, another material."""
+MOST_MASKED = 0.5
 """Share of the judged area that objects may cover before what is left no longer stands for it."""
 RIM_PX = 10
 """Reach of the target's rim into what was judged. Depth aligned to a finer camera mixes the farthest: 8 pixels."""
 RIM_CALLS = 2
 """Calls behind the surface along the rim that chance does not give: where 1 is expected on the whole target, 2 fall on
 a twentieth of it once in 800 captures."""
+CONTRADICTED = 0.1
+"""Chance of so many peaks above the threshold at which a tail no longer holds."""
 MOST_SKEW = 0.15
 """Of the quartiles' distances from the median, over their sum: 0.15 are 1.35 times as far to one side."""
 DRAWS = 4000
@@ -82,12 +93,11 @@ class OwnThreshold:
 
 
 def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float) -> OwnThreshold:
-    """The threshold at which ``false_calls`` (above 0) are expected in this capture, by its own peaks towards the
-    camera, or `LEAST`, with fewer expected. With too few of them, threshold, expected number and interval are NaN, and
-    ``doubts`` says so."""
-    before = _only(evidence, ~behind(evidence))
+    """The threshold at which ``false_calls`` (above 0) are expected beside objects, by the capture's own peaks towards
+    the camera, or `LEAST`, with fewer expected. With too few of them, threshold, expected number and interval are NaN,
+    and ``doubts`` says so."""
     judged = int(np.isfinite(evidence.score).sum())
-    before, floor, peaks, objects = _without_objects(detector, cloud, before)
+    floor, peaks, objects = _without_objects(detector, cloud, evidence)
     doubts = []
     skew = skew_of(evidence)
     if abs(skew) > MOST_SKEW:
@@ -103,7 +113,7 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         )
         unknown = (float("nan"),) * 4
         return OwnThreshold(*unknown, len(peaks), floor, objects.count, 0, evidence, tuple(doubts))
-    tail = Tail.of(peaks, floor)
+    tail = _tail_of(peaks, floor, false_calls / 2.0)
     threshold = max(tail.threshold(false_calls / 2.0), LEAST)
     rim = _mixed_rim(detector, cloud, evidence, threshold) if cloud.organised else np.zeros(evidence.score.shape, bool)
     low, high = (2.0 * bound for bound in tail.interval(threshold))
@@ -117,8 +127,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         expected=2.0 * tail.expected(threshold),
         low=low,
         high=high,
-        peaks=len(peaks),
-        floor=floor,
+        peaks=tail.peaks,
+        floor=tail.floor,
         objects=objects.count,
         rim_pixels=int(rim.sum()),
         evidence=_only(evidence, ~rim),
@@ -194,6 +204,20 @@ class Tail:
         return float(low), float(high)
 
 
+def _tail_of(peaks: np.ndarray, floor: float, number: float) -> Tail:
+    """The tail of all peaks (n,), or of the higher half, and again, while too many lie above the threshold at which
+    ``number`` of them are expected: a few wide waves of a fixed pattern are then higher than the noise of many pixels,
+    and one tail does not hold both."""
+    falling = np.sort(peaks)[::-1]
+    while True:
+        tail = Tail.of(falling, floor)
+        seen = int((falling > tail.threshold(number)).sum())
+        half = len(falling) // 2
+        if half < FEWEST_PEAKS or stats.poisson.sf(seen - 1, number) > CONTRADICTED:
+            return tail
+        falling, floor = falling[:half], float(falling[half])
+
+
 def _excess(ratios: np.ndarray, exponent: float) -> np.ndarray:
     return np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
 
@@ -207,28 +231,69 @@ class _Objects:
     pixels: int
 
 
-def _without_objects(
-    detector: Detector, cloud: Cloud, before: Evidence
-) -> tuple[Evidence, float, np.ndarray, _Objects]:
-    """What is left before the surface when objects are set aside, the floor, the peaks' scores, and the objects."""
-    start = int(np.isfinite(before.score).sum())
-    objects = 0
-    while True:
-        floor, found = _peaks(detector, cloud, before)
-        scores = np.array([each.score for each in found])
-        foreign = _objects(found, floor) if len(found) >= FEWEST_PEAKS else []
-        if not foreign:
-            return before, floor, scores, _Objects(objects, start - int(np.isfinite(before.score).sum()))
-        objects += len(foreign)
-        covered = np.zeros(before.score.shape, bool)
-        covered.reshape(-1)[np.concatenate([each.pixels for each in foreign])] = True
-        if cloud.organised:
-            covered = _grown(covered, OBJECT_MARGIN_PX)
-        before = _only(before, ~covered)
+def _without_objects(detector: Detector, cloud: Cloud, judged: Evidence) -> tuple[float, np.ndarray, _Objects]:
+    """The floor, the scores of the peaks before the surface above it, and the objects that were set aside."""
+    before = _only(judged, ~behind(judged))
+    margin = OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
+    covered = np.zeros(judged.score.shape, bool)
+    if cloud.organised:
+        covered = _grown(_proud(cloud, judged) | _marked(cloud, judged), margin)
+    floor, found = _peaks(detector, cloud, before, covered)
+    pixels = int((covered & np.isfinite(judged.score)).sum())
+    return floor, np.array([each.score for each in found]), _Objects(int(ndimage.label(covered)[1]), pixels)
 
 
-def _peaks(detector: Detector, cloud: Cloud, evidence: Evidence) -> tuple[float, tuple[Detection, ...]]:
-    """A floor with about `WANTED_PEAKS` findings above it, and they; a higher one where they would merge."""
+def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
+    """(h, w) bool: connected regions that stand before the surface as a whole, wider than noise is."""
+    known = np.isfinite(evidence.residual_m)
+    weights = _boxed(known.astype(np.float64))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        smooth = _boxed(np.where(known, evidence.residual_m, 0.0)) / weights
+    smooth[~known | (weights < 0.5)] = np.nan
+    if not np.isfinite(smooth).any():
+        return np.zeros_like(known)
+    before = (np.nanmedian(smooth) - smooth) / max(
+        1.4826 * np.nanmedian(np.abs(smooth - np.nanmedian(smooth))), cloud.z_step_m / PATCH_PX, 1e-9
+    )
+    return _regions(before > PROUD_FOOT, before > PROUD)
+
+
+def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
+    """(h, w) bool: long steep edges of the colour picture or the amplitude: where the material changes, range that
+    depends on brightness steps too. The target's own outline is none."""
+    whole = np.pad(ndimage.binary_fill_holes(np.isfinite(evidence.score)), 1, mode="edge")
+    inside = ndimage.distance_transform_edt(whole)[1:-1, 1:-1] > 2 * PATCH_PX
+    edges = np.zeros(cloud.valid.shape, bool)
+    channels = [] if cloud.rgb is None else list(np.moveaxis(np.asarray(cloud.rgb, np.float64), -1, 0))
+    for channel in (*channels, *(() if cloud.amplitude is None else (cloud.amplitude,))):
+        known = np.isfinite(channel) & inside
+        if not known.any():
+            continue
+        smooth = _boxed(_boxed(np.where(np.isfinite(channel), channel, np.median(channel[known]))))
+        steep = np.hypot(*np.gradient(smooth))
+        edges |= known & (steep > MARKED * max(float(np.median(steep[known])), 1e-9))
+    return _regions(edges, edges)
+
+
+def _boxed(image: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.blur(image, (PATCH_PX, PATCH_PX), borderType=cv2.BORDER_REFLECT))
+
+
+def _regions(where: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Connected parts of ``where`` (h, w) bool with a seed in them and `LEAST_OBJECT_PX` pixels or more."""
+    labels, count = ndimage.label(where, np.ones((3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    chosen = (sizes >= LEAST_OBJECT_PX) & (np.bincount(labels[seeds], minlength=count + 1) > 0)
+    chosen[0] = False
+    return np.asarray(chosen[labels])
+
+
+def _peaks(
+    detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarray
+) -> tuple[float, tuple[Detection, ...]]:
+    """A floor with about `WANTED_PEAKS` findings above it, and they; a higher one where they would merge. What reaches
+    into the ``covered`` (h, w) bool is left out: it may be the flank of a peak there."""
+    evidence = _only(before, ~covered)
     known = evidence.score[np.isfinite(evidence.score)]
     if not (len(known) and known.max() > 0):
         return 1.0, ()
@@ -239,7 +304,8 @@ def _peaks(detector: Detector, cloud: Cloud, evidence: Evidence) -> tuple[float,
     free = [n for n in range(crowd, len(counts)) if counts[n] <= CROWDED * counts[crowd]]
     enough = [n for n in free if counts[n] >= WANTED_PEAKS]
     floor = float(thresholds[enough[-1] if enough else free[0] if free else crowd])
-    return floor, detector.find(cloud, evidence, floor)
+    hidden = covered.reshape(-1)
+    return floor, tuple(each for each in detector.find(cloud, before, floor) if not hidden[each.pixels].any())
 
 
 def _counts(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> np.ndarray:
@@ -247,28 +313,6 @@ def _counts(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Se
     if isinstance(detector, FindsAtOnce):
         return np.array([len(centres) for centres in detector.centres_at(cloud, evidence, thresholds)])
     return np.array([len(detector.find(cloud, evidence, threshold)) for threshold in thresholds])
-
-
-def _objects(found: Sequence[Detection], floor: float) -> list[Detection]:
-    """Findings that are no noise: far too high or too flat for their area, by what the others are.
-
-    A high peak of few pixels stays: it is what heavy tails look like.
-    """
-    scores = np.array([each.score for each in found])
-    areas = np.array([len(each.pixels) for each in found], float)
-    # near its summit a peak of noise is a paraboloid: its area grows with its height above the floor
-    spread = areas / np.maximum(1.0 - floor / scores, 0.05)
-    wide = areas > OBJECT_AREA * np.median(areas)
-    flat = wide & (spread > PLATE_AREA * np.median(spread))
-    # the lowest half is noise for certain; others are tried from the lowest up, against all below
-    order = np.argsort(scores)
-    foreign = [int(n) for n in np.flatnonzero(flat)]
-    for place in range(max(len(order) // 2, FEWEST_PEAKS - 1), len(order)):
-        below = Tail.of(scores[order[:place]], floor)
-        if below.expected(scores[order[place]]) < RARE:
-            foreign += [int(n) for n in order[place:] if wide[n]]
-            break
-    return [found[n] for n in sorted(set(foreign))]
 
 
 # ---- the rim ---------------------------------------------------------------------------------------------------------

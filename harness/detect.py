@@ -188,9 +188,10 @@ def _about(
 ) -> Mapping[str, Any]:
     """What the JSON says beside the findings."""
     evidence = judged.evidence
+    mm = None if evidence.unit else 1e3 * threshold * evidence.scale_m
     return {
         "capture": steps.capture_facts(recording, judged.cloud),
-        "threshold": {"k": threshold, "mm": 1e3 * threshold * evidence.scale_m, "from": origin},
+        "threshold": {"k": threshold, "mm": mm, "from": origin},
         "warnings": evidence.warnings,
         "missing_returns": None if judged.missing is None else judged.missing.facts,
         "surface": {"one_unit_of_score_mm": 1e3 * evidence.scale_m, **evidence.notes},

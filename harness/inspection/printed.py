@@ -80,6 +80,8 @@ def unit_range_m(evidence: Evidence) -> tuple[float, float] | None:
 
 def beyond_text(threshold: float, evidence: Evidence) -> str:
     """The threshold as a length, or in words where it is another length at each point."""
+    if evidence.unit:
+        return f"{threshold:.4g} units of score"
     if unit_range_m(evidence) is None:
         return mm(threshold * evidence.scale_m)
     return f"{threshold:.4g} of each point's own deviations"
@@ -87,6 +89,8 @@ def beyond_text(threshold: float, evidence: Evidence) -> str:
 
 def threshold_text(threshold: float, evidence: Evidence, origin: str) -> str:
     """The threshold, what it is in millimetres, and where it comes from."""
+    if evidence.unit:
+        return f"threshold: {threshold:.4g} units of score ({origin})"
     at = "" if unit_range_m(evidence) is None else " at the median point"
     return f"threshold: {threshold:.4g} x {mm(evidence.scale_m)} = {mm(threshold * evidence.scale_m)}{at} ({origin})"
 
@@ -97,9 +101,10 @@ def surface_text(cloud: Cloud, evidence: Evidence) -> str:
 
     within = cloud.variance_m2[np.isfinite(evidence.residual_m) & np.isfinite(cloud.variance_m2)]
     temporal = f"; one frame's noise {mm(float(np.sqrt(np.median(within))))}" if within.size else ""
-    varied = unit_range_m(evidence)
+    varied = None if evidence.unit else unit_range_m(evidence)
+    unit = evidence.unit or mm(evidence.scale_m)
     own = f" at the median point, each point's own deviation: {mm(varied[0])} to {mm(varied[1])}" if varied else ""
-    return f"surface: {evidence.notes.get('surface', '')}; one unit of score is {mm(evidence.scale_m)}{own}{temporal}"
+    return f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}{own}{temporal}"
 
 
 def _print_frames_used(recording: Recording, cloud: Cloud, name: str) -> None:

@@ -200,8 +200,11 @@ def _by_own_null(
     own = own_threshold(detector, cloud, evidence, false_calls)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
-    set_aside = f", {own.objects} higher ones set aside as objects" if own.objects else ""
-    told = f"{own.peaks} peaks towards the camera{set_aside}"
+    told = f"{own.peaks} peaks towards the camera"
+    if own.objects:
+        told += f"; beside objects, tags and edges in the picture ({own.objects} places), where more are to be expected"
+    if not cloud.organised:
+        told += "; objects on the target were not looked for"
     if own.rim_pixels:
         told += f"; {own.rim_pixels} pixels along the rim mix in what lies behind it and are not judged"
     if own.doubts:
