@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from detectors import load_detector
 from detectors.average import AverageConfig
+from detectors.interface import Detector
 from detectors.null import own_threshold
 from harness.engine.averages import averages_of
 from harness.vocabulary.capture import Cloud
@@ -117,9 +118,8 @@ def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
     return Board(replace(cloud, points_m=points), ndimage.binary_dilation(covered, iterations=margin))
 
 
-def counts(board: Board) -> Iterator[tuple[float, int] | None]:
+def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | None]:
     """For each of `ASKED` what is expected and what is counted; None where the own null is not trusted."""
-    detector = load_detector("thesis", {"crop": {"kind": "auto"}})
     evidence = detector.analyse(board.cloud)
     for asked in ASKED:
         own = own_threshold(detector, board.cloud, evidence, asked)
@@ -140,14 +140,16 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--boards", type=int, default=50, help="of each camera and kind")
     parser.add_argument("--cameras", nargs="+", default=CAMERAS, choices=CAMERAS)
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
+    parser.add_argument("--detector", default="local")
     options = parser.parse_args(arguments)
+    detector = load_detector(options.detector, {"crop": {"kind": "auto"}})
     options.cache.mkdir(parents=True, exist_ok=True)
     print("camera, kind, frames | asked | boards | refused | expected | counted | ratio +- standard error")
     for name in options.cameras:
         for kind in options.kinds:
             every = [boards(name, kind, number, options.cache) for number in range(options.boards)]
             for frames in FRAMES:
-                told = [list(counts(board[frames])) for board in every]
+                told = [list(counts(board[frames], detector)) for board in every]
                 for number, asked in enumerate(ASKED):
                     rows = np.array([row[number] for row in told if row[number] is not None], float).reshape(-1, 2)
                     expected, counted = rows.sum(axis=0)
