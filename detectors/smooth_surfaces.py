@@ -39,6 +39,9 @@ LEAST_SHARED_PX = 10
 """Pixels that the rims of two surfaces must share to be judged as one."""
 CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
 """Surfaces nearer to one another at a common border meet there; noise of a difference widens that."""
+RIM_TURN_DEG = 10.0
+"""A rim turns from the surface inside it by no more, beside what that surface bends by: five times what noise may give
+a slope (`NORMAL_NOISE`, over the way to the rim), and a third of what a blurred step of 25 mm over 5 pixels does."""
 MOST_SURFACES = 8
 WIDE_PART = 0.1
 """Of a surface's pixels: so many must be the middle of a full smoothing window of its own. The smoothing makes a ramp
@@ -95,6 +98,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     local = Smooth(points, smooth, normals, central)
     own = _joined(own, cores, local, max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m), math.radians(crease_deg / 2.0))
     _share_contested(own, cores, local)
+    _trim_rims(own, cores, cloud.valid, local, window, half, max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m))
     filled = np.zeros_like(own)
     for number, each in enumerate(own):
         filled[number] = holes_filled(each)
@@ -135,6 +139,20 @@ class Smooth:
         height = ((self.means_m.reshape(-1, 3)[seeds] - points) * normals).sum(axis=1)
         way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
         return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
+
+    def bend_per_m(self, seeds: np.ndarray, away_from: np.ndarray, reach: int) -> np.ndarray:
+        """(n,) turn of the normals, radians per metre, over ``reach`` pixels from flat indices ``seeds`` on, in the
+        direction away from the pixels ``away_from``."""
+        height, width = self.normals.shape[:2]
+        rows, columns = np.divmod(seeds, width)
+        down, across = rows - away_from // width, columns - away_from % width
+        steps = reach / np.maximum(np.hypot(down, across), 1.0)
+        there = np.clip(np.rint(rows + steps * down), 0, height - 1).astype(np.int64) * width
+        there += np.clip(np.rint(columns + steps * across), 0, width - 1).astype(np.int64)
+        normals, means = self.normals.reshape(-1, 3), self.means_m.reshape(-1, 3)
+        cosine = np.clip((normals[seeds] * normals[there]).sum(axis=1), 0.0, 1.0)
+        bend: np.ndarray = np.arccos(cosine) / np.maximum(np.linalg.norm(means[seeds] - means[there], axis=1), 1e-9)
+        return bend
 
 
 def sees_from_origin(cloud: Cloud) -> bool:
@@ -273,6 +291,38 @@ def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: Smooth) -> None
     winner = misses.argmin(axis=0)
     for number in range(len(own)):
         own[number].reshape(-1)[pixels[winner != number]] = False
+
+
+def _trim_rims(
+    own: np.ndarray, cores: np.ndarray, valid: np.ndarray, smooth: Smooth, window: int, half: int, apart_m: float
+) -> None:
+    """Take off each surface's rim what leaves the surface inside it, and what hangs on that alone.
+
+    A camera's blur spreads a step of 25 mm over five pixels, so that no two neighbours are apart, and behind an edge
+    that is tilted by 30 degrees a narrow strip of background leaves no crease in the smoothed surface either. A rim may
+    be off the plane at the nearest pixel whose smoothing does not feel it by ``apart_m``, or, as seen from there, by
+    `RIM_TURN_DEG` beside the angle that the bend before it leads to: a pipe goes on bending to its limb.
+    """
+    reach = window // 2 + 1 + half
+    for number in range(len(own)):
+        # the picture's edge is a rim too: what is cut off there may be a strip of background
+        whole = np.pad(holes_filled(own[number] & valid), 1).astype(np.uint8)
+        rim = own[number] & (cv2.erode(whole, np.ones((2 * reach + 1,) * 2, np.uint8))[1:-1, 1:-1] == 0)
+        inner = cv2.erode(whole, np.ones((2 * reach + window,) * 2, np.uint8))[1:-1, 1:-1] > 0
+        inner &= cv2.erode((cores == number + 1).astype(np.uint8), np.ones((window, window), np.uint8)) > 0
+        if not inner.any():
+            continue
+        apart, nearest = nearest_pixel(inner)
+        pixels = np.flatnonzero(rim & (apart <= 3 * reach))
+        seeds = nearest.reshape(-1)[pixels]
+        way = smooth.points_m.reshape(-1, 3)[pixels] - smooth.means_m.reshape(-1, 3)[seeds]
+        distance = np.linalg.norm(way, axis=1)
+        off = np.abs((way * smooth.normals.reshape(-1, 3)[seeds]).sum(axis=1))
+        turn = math.radians(RIM_TURN_DEG) + smooth.bend_per_m(seeds, pixels, reach) * distance / 2.0
+        allowed = np.maximum(apart_m, np.sin(np.minimum(turn, np.pi / 2)) * distance)
+        own[number].reshape(-1)[pixels[off > allowed]] = False
+        parts = cv2.connectedComponents(own[number].astype(np.uint8), connectivity=4)[1]
+        own[number] &= np.isin(parts, np.unique(parts[inner]))
 
 
 # ---------------------------------------------------------------- a raster where there is no pixel grid
