@@ -39,12 +39,13 @@ class Detection:
     """One finding. ``score``: the lowest threshold at which it is found no more. ``pixels`` (n,): flat indices into the
     cloud's (h, w) grid, ascending; ``centre_m`` (3,): where it is, in the cloud's frame: what decides which damage it
     counts for. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels inside the
-    target's outline that returned nothing (``pixels`` are then those invalid pixels)."""
+    target's outline that returned nothing (``pixels`` are then those invalid pixels), "object" for a
+    thing that lies on the target."""
 
     score: float
     pixels: np.ndarray
     centre_m: np.ndarray
-    kind: Literal["depth", "no return"] = "depth"
+    kind: Literal["depth", "no return", "object"] = "depth"
 
 
 @dataclass(frozen=True)

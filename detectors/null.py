@@ -28,6 +28,7 @@ import numpy as np
 from scipy import ndimage, optimize, stats
 
 from detectors.interface import Detection, Detector, Evidence, FindsAtOnce
+from detectors.measure import extents
 from harness.vocabulary.capture import Cloud
 
 EXPONENTS = np.array([3.0, 2.0, 1.5, 1.0, 0.5, 0.0])
@@ -136,6 +137,39 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     )
 
 
+def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:
+    """The findings with each object that lies on the target as one of them, strongest first.
+
+    The edges of an object shadow the surface beside it and disturb filters there: findings that reach its margin and
+    are weaker than the object itself are its own. An object with a single finding keeps that finding as it is. Nothing
+    is joined without a pixel grid, or where objects would cover more than `MOST_MASKED` of what was judged.
+    """
+    if not cloud.organised or not found:
+        return found
+    proud, known = _proud(cloud, evidence), np.isfinite(evidence.score)
+    if (proud & known).sum() > MOST_MASKED * known.sum():
+        return found
+    labels, count = ndimage.label(proud, np.ones((3, 3)))
+    kept, margin = list(found), _margin(cloud)
+    for number in range(1, count + 1):
+        region = labels == number
+        near = _grown(region, margin).ravel()
+        bumps = [each for each in kept if region.ravel()[each.pixels].any()]
+        height = max((each.score for each in bumps), default=0.0)
+        own = [each for each in kept if each.score <= height and near[each.pixels].any()]
+        if len(own) < 2:
+            continue
+        pixels = np.flatnonzero(region & cloud.valid)
+        kept = [each for each in kept if not any(each is gone for gone in own)]
+        kept.append(Detection(height, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1], "object"))
+    return tuple(sorted(kept, key=lambda each: -each.score))
+
+
+def _margin(cloud: Cloud) -> int:
+    """Pixels around an object that it disturbs."""
+    return OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
+
+
 def behind(evidence: Evidence) -> np.ndarray:
     """(h, w) bool: pixels whose score speaks for something behind the surface."""
     if evidence.behind is not None:
@@ -234,10 +268,9 @@ class _Objects:
 def _without_objects(detector: Detector, cloud: Cloud, judged: Evidence) -> tuple[float, np.ndarray, _Objects]:
     """The floor, the scores of the peaks before the surface above it, and the objects that were set aside."""
     before = _only(judged, ~behind(judged))
-    margin = OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
     covered = np.zeros(judged.score.shape, bool)
     if cloud.organised:
-        covered = _grown(_proud(cloud, judged) | _marked(cloud, judged), margin)
+        covered = _grown(_proud(cloud, judged) | _marked(cloud, judged), _margin(cloud))
     floor, found = _peaks(detector, cloud, before, covered)
     pixels = int((covered & np.isfinite(judged.score)).sum())
     return floor, np.array([each.score for each in found]), _Objects(int(ndimage.label(covered)[1]), pixels)

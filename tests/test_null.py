@@ -10,7 +10,7 @@ from scipy import ndimage, stats
 
 from detectors import load_detector
 from detectors.interface import Evidence
-from detectors.null import FEWEST_PEAKS, Tail, own_threshold, skew_of
+from detectors.null import FEWEST_PEAKS, Tail, each_object_once, own_threshold, skew_of
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
 
@@ -133,3 +133,35 @@ def test_it_says_what_it_cannot_know() -> None:
         "not symmetric" in doubt and "behind" in doubt
         for doubt in own_threshold(DETECTOR, skewed, evidence, 1.0).doubts
     )
+
+
+def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
+    offset = 0.3 * noise("normal", 3, (160, 200))
+    offset[40:80, 60:110] -= 0.03  # an object of 50 x 40 pixels, 30 mm high
+    offset[80:84, 60:110] += 0.004  # the shadow along its edge
+    v, u = np.mgrid[:160, :200]
+    for at in ((120, 50), (60, 150)):
+        offset[np.hypot(v - at[0], u - at[1]) < 5] += 0.02
+    cloud = plane(offset)
+    detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
+    evidence = detector.analyse(cloud)
+    found = each_object_once(cloud, evidence, detector.find(cloud, evidence, 8.0))
+    assert [each.kind for each in found].count("object") == 1
+    (thing,) = (each for each in found if each.kind == "object")
+    # the square that residuals are smoothed over adds two pixels at each side
+    assert len(thing.pixels) == pytest.approx(54 * 44, rel=0.05)
+    holes = [np.unravel_index(each.pixels, offset.shape) for each in found if each.kind == "depth"]
+    places = [(float(np.mean(rows)), float(np.mean(columns))) for rows, columns in holes]
+    assert len(places) == 2
+    for place in ((120, 50), (60, 150)):
+        assert min(np.hypot(place[0] - r, place[1] - c) for r, c in places) < 3
+
+
+def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
+    offset = 0.3 * noise("normal", 4, (120, 150))
+    v, u = np.mgrid[:120, :150]
+    offset -= 0.006 * np.exp(-0.5 * (np.hypot(v - 60, u - 70) / 5.0) ** 2)
+    cloud = plane(offset)
+    evidence = analysed(cloud)
+    found = DETECTOR.find(cloud, evidence, 8.0)
+    assert len(found) == 1 and each_object_once(cloud, evidence, found) == found

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from harness.vocabulary.errors import UserError
 
 if TYPE_CHECKING:
-    from detectors.interface import Detector, Evidence
+    from detectors.interface import Detection, Detector, Evidence, Measurement
     from detectors.recordings import Recording
     from harness.report.findings import Judged
     from harness.vocabulary.capture import Cloud
@@ -137,15 +137,24 @@ def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Findings beyond a threshold and missing returns, each damage once, with their sizes."""
+    """Findings beyond a threshold and missing returns, each damage and each object once, with their sizes."""
+    from detectors.measure import measure_extents, on_pixels
     from detectors.missing import measure_missing, missing_returns, one_damage_once
+    from detectors.null import each_object_once
     from harness.report.findings import Judged
 
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
-    found = one_damage_once(cloud.valid.shape, detector.find(cloud, evidence, threshold), unseen)
-    measures = (measure_missing if one.kind == "no return" else detector.measure for one in found)
-    measured = tuple(measure(cloud, evidence, one) for measure, one in zip(measures, found, strict=True))
+    searched = detector.find(cloud, evidence, threshold)
+    found = one_damage_once(cloud.valid.shape, each_object_once(cloud, evidence, searched), unseen)
+
+    def measure(one: Detection) -> Measurement:
+        if one.kind == "object":
+            whole = measure_extents(cloud, one, "an object that lies on the target: no model of a hole fits it")
+            return on_pixels(cloud, one, whole)
+        return (measure_missing if one.kind == "no return" else detector.measure)(cloud, evidence, one)
+
+    measured = tuple(measure(one) for one in found)
     return Judged(cloud, evidence, found, measured, missing)
 
 
