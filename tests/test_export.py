@@ -150,6 +150,7 @@ def test_the_program_finds_the_same_in_either_storage(
     for form in ("ros2", "mcap"):
         bag = exports[form] / "view_00"
         more = ["--topic", "points2", "--crop", "box:-60,60,-80,-20,0,1000", "--out", str(tmp_path / f"found_{form}")]
+        more += ["--threshold", "8"]
         assert detect.main([str(bag), *more]) == 0
     first, second = ((tmp_path / f"found_{form}" / "findings.csv").read_text() for form in ("ros2", "mcap"))
     assert first == second and len(first.splitlines()) == 2

@@ -27,6 +27,8 @@ DEFAULT_FALSE_CALLS = 1.0
 """In the capture."""
 FAINT_CALLS = 0.05
 """Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
+FAINT_PEAKS = 20
+"""Fewer peaks than these do not tell how fast their number falls with the score."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
@@ -238,7 +240,12 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     import math
 
     null = judged.evidence.notes.get("own_null")
-    if null is None or threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
+    if (
+        null is None
+        or threshold != null["threshold"]
+        or not FAINT_CALLS < null["high"] < null["peaks"]
+        or null["peaks"] < FAINT_PEAKS
+    ):
         return judged
     rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
     sure = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
