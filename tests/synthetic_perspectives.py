@@ -10,7 +10,7 @@ import pandas as pd
 from synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.views_example import FindingSeen, HoleSeen, MappedExample, PlacedView
+from harness.report.examples import FindingSeen, HoleSeen, MappedExample, PlacedView
 
 MAP_AXES = pd.DataFrame(
     [

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from harness.report.example import ExampleCloud, HoleInView
+from harness.evaluation.profile import HoleInView
+from harness.report.examples import ExampleCloud
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,14 @@ ALLOWED = {
     "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
     "harness/exchange": ("harness.vocabulary", "harness.exchange"),
     "harness/evaluation": ("harness.vocabulary", "harness.evaluation"),
-    "harness/report": ("harness.vocabulary", "harness.evaluation", "harness.report", "detectors.interface"),
+    "harness/thesis": ("harness.vocabulary", "harness.evaluation", "harness.thesis"),
+    "harness/report": (
+        "harness.vocabulary",
+        "harness.evaluation",
+        "harness.thesis",
+        "harness.report",
+        "detectors.interface",
+    ),
     "harness": ("",),
 }
 """Imports inside functions count as well, but for a version number that a leaf may ask for."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from synthetic_tables import World, cameras, joined, placed, set_up_name, tables
 
-from harness.evaluation.claim_cameras import claim_c11
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
+from harness.thesis.cameras import claim_c11
 
 AXES = ["source.camera.name", "source.target.distance_m"]
 

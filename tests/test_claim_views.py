@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from synthetic_perspectives import MapWorld, name_of, perspectives, with_variation
 
-from harness.evaluation.claim_maps import rms_gap
-from harness.evaluation.claim_views import VIEW_CLAIMS, score_views
 from harness.evaluation.map_case import LARGE_MM, map_cases
 from harness.evaluation.summary import summarise_holes
+from harness.thesis.views import VIEW_CLAIMS, rms_gap, score_views
 
 
 def verdict(claim, found):

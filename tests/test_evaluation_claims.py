@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import spearmanr
 from synthetic_tables import World, example, joined, tables
 
-from harness.evaluation.claim_rules import decide, hole_list
-from harness.evaluation.claims import RULES, Verdict, score_claims, verdicts_by_variant
-from harness.evaluation.comparisons import falling_rank, scatter_ratio
 from harness.evaluation.profile import HoleInView, bowl, hole_shape, hole_shapes
-from harness.report.example import ExampleCloud
+from harness.evaluation.summary import hole_list
+from harness.report.examples import ExampleCloud
+from harness.thesis.claims import RULES, falling_rank, scatter_ratio, score_claims, verdicts_by_variant
+from harness.thesis.verdicts import Verdict, claims_table, decide
 
 
 def verdict(claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)) -> Verdict:
@@ -123,12 +123,17 @@ def test_evidence_carries_the_numbers() -> None:
 def test_sensitivity_table() -> None:
     near = tables(World(rate=lambda hole, frames: float(hole >= 3)), frames=(1, 50), variant="distance 700 mm")
     table = verdicts_by_variant(joined(near, tables(frames=(1, 50))), examples=[example(50)])
-    assert list(table["variant"]) == ["main", "distance 700 mm"]
-    assert list(table["found_1"]) == ["5–11", "3–11"]
-    assert list(table["found_50"]) == ["4–11", "3–11"]
-    assert list(table["C1"]) == ["borne out", "not borne out"]
-    assert list(table["C6"]) == ["borne out", "undecided"]
+    assert list(table["variant"]) == ["distance 700 mm", "main"]
+    assert list(table["C1"]) == ["not borne out", "borne out"]
+    assert list(table["C6"]) == ["undecided", "borne out"]
     assert list(table.columns[-len(RULES) :]) == list(RULES)
+
+
+def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:
+    table = claims_table(score_claims(tables(frames=(1, 50))))
+    assert list(table["claim"]) == list(RULES)
+    assert list(table.columns) == ["claim", "text", "verdict", "evidence", "rule"]
+    assert len(claims_table([])) == 0
 
 
 def test_rank_test_is_the_exact_permutation_test() -> None:

@@ -15,12 +15,12 @@ import pandas as pd
 import pytest
 from synthetic_tables import Tables, World, example, joined, provenance, tables
 
-from harness.evaluation.claims import score_claims
 from harness.evaluation.summary import summarise_holes
 from harness.report.clouds import cloud_figure
 from harness.report.measures import inches
 from harness.report.page import answer_sentence, report_html, write_report
 from harness.report.terminal import terminal_table, terminal_text
+from harness.thesis.claims import score_claims
 from harness.vocabulary.errors import UserError
 
 YAML = "name: averaging\nsweep:\n  capture.frames: [1, 50]  # <few> & many\n"

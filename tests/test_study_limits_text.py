@@ -15,9 +15,9 @@ from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.study.axes import FRAMES, axis_lines
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.report.examples import StudyExample
 from harness.report.study_axes_figure import axis_figure, axis_groups
 from harness.report.study_axes_rows import axis_heads, axis_rows
-from harness.report.study_example import StudyExample
 from harness.report.study_examples_figure import examples_figure, framed_pixels
 from harness.report.study_pod_figures import MOST_PANELS, curves_figure, with_room
 from harness.report.study_rows import (

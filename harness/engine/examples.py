@@ -13,7 +13,7 @@ from harness.engine.setup import SetUp, load_set_up
 from harness.engine.sight import sight_of_view
 from harness.evaluation.profile import HoleInView
 from harness.experiment.points import Point
-from harness.report.example import ExampleCloud
+from harness.report.examples import ExampleCloud
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM

@@ -19,7 +19,7 @@ from harness.engine.sight import Sight
 from harness.engine.trial import capture_of
 from harness.evaluation.match import match
 from harness.experiment.points import Point
-from harness.report.views_example import FindingSeen, HoleSeen, MappedExample, PlacedView
+from harness.report.examples import FindingSeen, HoleSeen, MappedExample, PlacedView
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.units import MM

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from harness.engine.work import State
-from harness.report.example import ExampleCloud
-from harness.report.views_example import MappedExample
+from harness.report.examples import ExampleCloud, MappedExample
 
 
 @dataclass(frozen=True)

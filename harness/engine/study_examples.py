@@ -17,7 +17,7 @@ from harness.engine.trial import PointTask, TrialTask, capture_of
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import Inspected
 from harness.experiment.points import Point
-from harness.report.study_example import StudyExample, Where
+from harness.report.examples import StudyExample, Where
 from harness.vocabulary.units import MM
 
 SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}

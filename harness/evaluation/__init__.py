@@ -1,1 +1,1 @@
-"""From result tables to statistics: rates with intervals, noise against frames, verdicts on claims."""
+"""From result tables to statistics: rates with intervals, noise against frames, comparisons of set-ups."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from harness.evaluation.claim_rules import MANY
 from harness.evaluation.maps import MapSetUp, maps_of
 from harness.evaluation.paired import Change, SizeErrors, run_change, run_ratio, size_errors
 from harness.evaluation.summary import HoleState, Measure, ResultTables, found_holes, with_columns
@@ -14,6 +13,8 @@ from harness.evaluation.summary import HoleState, Measure, ResultTables, found_h
 if TYPE_CHECKING:
     import pandas as pd
 
+MANY = 50
+"""Frames a view that maps are compared with, where they have them."""
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
 LARGE_MM = 25.4 * 3 / 8
 """From here on two views are said to size better than one."""

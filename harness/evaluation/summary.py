@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -219,3 +219,17 @@ def bounded(value: float, low: float, high: float, digits: int = 2) -> str:
     if not np.isfinite(value):
         return "–"
     return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def hole_list(names: Iterable[str]) -> str:
+    """Hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
+    numbered = sorted(int(name) for name in names if str(name).isdecimal())
+    others = [str(name) for name in names if not str(name).isdecimal()]
+    runs: list[list[int]] = []
+    for number in numbered:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
+    return ", ".join(parts + others) or "none"

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.claim_rules import RULER_MM
 from harness.evaluation.summary import Measure
 from harness.report.canvas import BLUE, GREY, INK, ORANGE, PALE, RED, SKY, svg
 
@@ -15,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+RULER_MM = 25.4 / 16
+"""One graduation of a ruler in 1/16 in, to compare positions with."""
 MEASURES: tuple[tuple[Measure, str, str], ...] = (
     ("extent", "thesis' measure", ORANGE),
     ("model", "model of the blurred hole", BLUE),

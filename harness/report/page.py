@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.claims import RULES, Verdict, hole_list, score_claims, verdicts_by_variant
 from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.profile import RINGS, hole_shapes
 from harness.evaluation.set_ups import set_ups_of
@@ -18,17 +17,19 @@ from harness.evaluation.summary import (
     false_calls,
     found_holes,
     found_rule,
+    hole_list,
     summarise_holes,
 )
 from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_figure
-from harness.report.example import ExampleCloud
+from harness.report.examples import ExampleCloud, MappedExample
 from harness.report.measures import inches, positions_figure, sizes_figure
 from harness.report.noise import noise_figure
 from harness.report.page_parts import MARKS, call_row, closing, mm, rate_cell, template
 from harness.report.perspectives_page import map_files, map_text, perspectives_html
 from harness.report.set_ups_page import set_ups_html
 from harness.report.view3d import write_view3d
-from harness.report.views_example import MappedExample
+from harness.thesis.claims import RULES, score_claims, verdicts_by_variant
+from harness.thesis.verdicts import FEW, MANY, Verdict
 from harness.vocabulary.files import write_text
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def report_html(
         rings=[f"{ring:g} R" for ring in RINGS],
         verdicts=verdicts,
         claims=list(RULES),
-        variants=_variant_rows(verdicts_by_variant(tables, examples, summary)),
+        variants=_variant_rows(tables, summary, verdicts_by_variant(tables, examples, summary)),
         noise=noise.to_dict("records"),
         calls=[call_row(row) for _, row in calls[calls["variant"] == MAIN].iterrows()],
         **closing(tables, provenance, experiment_yaml_text),
@@ -231,11 +232,18 @@ def _short(label: str) -> str:
     return f"{path.rpartition('.')[2].replace('_', ' ')} = {value}"
 
 
-def _variant_rows(variants: pd.DataFrame) -> list[dict[str, Any]]:
+def _variant_rows(tables: ResultTables, summary: pd.DataFrame, verdicts: pd.DataFrame) -> list[dict[str, Any]]:
     """The sensitivity table's rows; a cell knows whether it differs from the main variant's."""
-    rows = [{str(key): value for key, value in row.items()} for row in variants.to_dict("records")]
+    merged = tables.variants[["variant", "reason", "settings"]].merge(verdicts, "left", "variant")
+    rows = [{str(key): value for key, value in row.items()} for row in merged.to_dict("records")]
+    rows.sort(key=lambda row: row["variant"] != MAIN)
     for row in rows:
         row["shown"] = _short(str(row["variant"]))
+        for frames in (FEW, MANY):
+            status = found_holes(summary, str(row["variant"]), frames)
+            found, open_ = ([h for h, state in status.items() if state == s] for s in ("found", "undecided"))
+            text = hole_list(found) + (f"; undecided {hole_list(open_)}" if open_ else "")
+            row[f"found_{frames}"] = text if status else "not run"
     main = next((row for row in rows if row["variant"] == MAIN), None)
     for row in rows:
         compared = [*RULES, "found_1", "found_50"]

@@ -7,9 +7,6 @@ from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluation.claim_maps import equal_exposures, equal_frames
-from harness.evaluation.claim_rules import Verdict
-from harness.evaluation.claim_views import score_views
 from harness.evaluation.map_case import (
     THESIS_MERGE,
     THESIS_REGISTRATION,
@@ -21,6 +18,7 @@ from harness.evaluation.map_case import (
 from harness.evaluation.maps import compare_maps
 from harness.evaluation.registration import by_views, summarise_registrations
 from harness.evaluation.summary import ResultTables, found_rule, summarise_holes
+from harness.report.examples import MappedExample
 from harness.report.page_parts import closing, template
 from harness.report.perspectives_rows import (
     Ways,
@@ -34,7 +32,6 @@ from harness.report.perspectives_rows import (
     variation_rows,
 )
 from harness.report.registration_figures import BEFORE, fiducials_figure, method_text, tre_figure
-from harness.report.views_example import MappedExample
 from harness.report.views_figures import (
     found_figure,
     merged_figure,
@@ -42,6 +39,8 @@ from harness.report.views_figures import (
     shadow_figure,
     two_views_figure,
 )
+from harness.thesis.verdicts import Verdict
+from harness.thesis.views import duels_of, score_views
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,7 +109,7 @@ def answer_sentence(cases: Sequence[MapCase], verdicts: Sequence[Verdict]) -> st
 
 def _ahead(cases: Sequence[MapCase]) -> str:
     """In what the fused map is ahead of its rivals everywhere, such as ", in size and noise"."""
-    duels = [duel for case in cases for duel in (equal_frames(case), equal_exposures(case)) if duel is not None]
+    duels = [duel for case in cases for duel in duels_of(case)]
     everywhere = [name for name in RESPECTS if all(duel.standings[name] == "ahead" for duel in duels)]
     return f", in {' and '.join(RESPECTS[name] for name in everywhere)}" if everywhere else ""
 
@@ -142,7 +141,7 @@ def map_text(example: MappedExample) -> str:
 
 def _counts(case: MapCase) -> str:
     """Holes found with one view, two by the thesis' way, and the most fused; empty where no single view is there."""
-    one, duel = case.single(), equal_frames(case)
+    one, duel = case.single(), next(iter(duels_of(case)), None)
     if one is None:
         return ""
     shown = {"": one, " (CPD, grid)": case.named(2, THESIS_REGISTRATION, THESIS_MERGE)}

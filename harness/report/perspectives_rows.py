@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.claims import hole_list
 from harness.evaluation.map_case import AgainstOne, MapCase, against_one
 from harness.evaluation.map_text import change_text, ratio_text, span
 from harness.evaluation.maps import MapSetUp, label_of, maps_of
 from harness.evaluation.registration import PARTS, trusted
-from harness.evaluation.summary import ResultTables, bounded
+from harness.evaluation.summary import ResultTables, bounded, hole_list
 from harness.report.page_parts import mm, shade
 from harness.report.set_ups_rows import count_text, found_text, limit_text
 

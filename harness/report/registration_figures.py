@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.evaluation.registration import PARTS, trusted
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY, svg
-from harness.report.views_example import MappedExample, PlacedView
+from harness.report.examples import MappedExample, PlacedView
 
 if TYPE_CHECKING:
     import pandas as pd

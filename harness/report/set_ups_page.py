@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.claim_cameras import claim_c11
-from harness.evaluation.claim_rules import Verdict
 from harness.evaluation.effects import EffectCosts, effect_costs
 from harness.evaluation.limits import LIMIT_RULE
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import ResultTables, false_calls, found_rule, summarise_holes
 from harness.report.clouds import residual_figure
 from harness.report.effects_figure import cost_text, effects_figure
-from harness.report.example import ExampleCloud
+from harness.report.examples import ExampleCloud
 from harness.report.page_parts import closing, template
 from harness.report.set_ups_figures import grain_figure, limits_figure
 from harness.report.set_ups_rows import (
@@ -28,6 +26,8 @@ from harness.report.set_ups_rows import (
     variation_rows,
 )
 from harness.report.sights import one_hole_figure, sights_figure
+from harness.thesis.cameras import claim_c11
+from harness.thesis.verdicts import Verdict
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.claim_cameras import claim_c11
-from harness.evaluation.claims import hole_list
 from harness.evaluation.intervals import wilson
 from harness.evaluation.set_ups import compare_set_ups
-from harness.evaluation.summary import ResultTables
+from harness.evaluation.summary import ResultTables, hole_list
 from harness.report.measures import inches
 from harness.report.page_parts import call_row, mm, shade
+from harness.thesis.cameras import claim_c11
 from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from typing import Any
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import StudyResult
 from harness.evaluation.study.surface import depth_varies
+from harness.report.examples import StudyExample
 from harness.report.page_parts import closing_sections, template
 from harness.report.set_ups_figures import COLOURS
 from harness.report.study_axes_figure import AxisGroup, axis_figure, axis_groups
@@ -22,7 +23,6 @@ from harness.report.study_axes_rows import (
     surface_rows,
 )
 from harness.report.study_calls_figure import calls_figure
-from harness.report.study_example import StudyExample
 from harness.report.study_examples_figure import examples_figure
 from harness.report.study_operating_figure import operating_figure
 from harness.report.study_pod_figures import MOST_PANELS, curves_figure, signals_figure, with_room

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.report.canvas import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
+from harness.report.examples import MappedExample
 from harness.report.page_parts import template
-from harness.report.views_example import MappedExample
 from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000

@@ -1,0 +1,320 @@
+"""The claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an experiment.
+
+Repeats vary the noise and the error of the nominal poses; the poses, the board and the camera's unit stay the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from harness.evaluation.intervals import (
+    CONFIDENCE,
+    RESAMPLES,
+    UNKNOWN,
+    Interval,
+    bootstrap,
+    mean_difference,
+    wilson,
+)
+from harness.evaluation.map_case import THESIS_MERGE, THESIS_REGISTRATION, Map, MapCase, against_one
+from harness.evaluation.map_text import change_text, frames_text, ratio_text, span
+from harness.evaluation.paired import FEWEST_BOTH, run_ratio, size_errors
+from harness.evaluation.registration import of_map, paired_ratio, per_unit, trusted
+from harness.evaluation.summary import hole_list
+from harness.thesis.verdicts import Answer, Rules, Verdict, decide, is_above_zero, rule_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Standing = Literal["ahead", "behind", "level", "open"]
+
+SLAM = ("odometry", "volume")
+"""Registration and merge of the map that stands in for a SLAM system: no marks, no closing of loops."""
+NOISE_REDUCING = "fusion"
+MARKED = ("joint", "marks")
+"""The registrations of H1's map, the first that was tried."""
+VIEW_CLAIMS: Rules[MapCase] = {}
+
+
+def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
+    """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
+    verdicts = []
+    for rule in VIEW_CLAIMS.values():
+        for case in cases:
+            verdict = rule(case)
+            where = f"{case.place}: " if len(cases) > 1 else ""
+            verdicts.append(replace(verdict, evidence=where + verdict.evidence))
+    return verdicts
+
+
+@rule_of(
+    VIEW_CLAIMS,
+    "C7",
+    "ICP and CPD both bring the fiducials of two views into one plane; CPD aligns them better within it.",
+    "Judged on the registration of the second view to the first with 50 frames (else the most). A method brings the "
+    "fiducials into one plane when its median target registration error across the board is at most the noise of a "
+    "single cloud's fitted surface (95 % bootstrap interval over repeats wholly at or below it; wholly above refutes), "
+    "and does not where most of its registrations failed. CPD aligns better when its error in the plane, over ICP's in "
+    "the same repeat, has a geometric mean below 1 (95 % Student interval of the logarithm); above 1 refutes.",
+)
+def claim_c7(case: MapCase) -> tuple[Answer, str]:
+    """Judge whether both methods bring the fiducials into one plane, and whether CPD aligns better within it."""
+    alone = case.single()
+    if alone is None:
+        return "undecided", "Not judged: no single view stands beside the registrations."
+    rows = case.registrations(alone.frames)
+    pairs = {method: of_map(rows, method, 2) for method in dict.fromkeys(rows["method"])}
+    if not {"icp", "cpd"} <= set(pairs):
+        return "undecided", "Not judged: ICP and CPD were not both tried."
+    runs = case.runs(alone)
+    noise_mm = float(runs["surface_noise_mm"][runs["role"] == "damaged"].median())
+    planes = [_is_in_one_plane(pairs[method], noise_mm) for method in ("icp", "cpd")]
+    ratio, low, high, n = paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
+    better = True if high < 1 else (False if low >= 1 else None)
+    said = []
+    for method, part in pairs.items():
+        good = trusted(part)
+        plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
+        said.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
+    evidence = (
+        f"With {frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
+        f"{'; '.join(said)}. A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} "
+        f"times the error of ICP ({span(Interval(low, high))}, {n} pairs). "
+    )
+    views = rows["view"].nunique()
+    if views > 1:  # said but not judged: the thesis had one pair
+        errors = {name: trusted(rows[rows["method"] == name])["tre_in_plane_mm"].median() for name in ("icp", "cpd")}
+        medians = ", ".join(f"{method} {median:.2f}" for method, median in errors.items())
+        evidence += f"Over all {views} further views (not judged): {medians} mm in the plane."
+    return decide([*planes, better]), evidence
+
+
+def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
+    """Whether a method's error across the board is at most the noise of a surface."""
+    if wilson(len(rows) - len(trusted(rows)), len(rows))[0] > 0.5:
+        return False
+    across = per_unit(rows, "tre_across_mm").to_numpy(float)
+    if not len(across):
+        return None
+    interval = bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
+    if interval.known and interval.high <= noise_mm:
+        return True
+    return False if interval.above(noise_mm) else None
+
+
+@rule_of(
+    VIEW_CLAIMS,
+    "C8",
+    "Two merged views size holes of 3/8 in and larger better than one view and smaller ones worse; merging raises the "
+    "threshold.",
+    "By the thesis' measure, with its registration (CPD) and merging (grid), with 50 frames (else the most), paired by "
+    "repeat: the mean of |size error| over the holes of 3/8 in and larger falls, over the smaller holes it grows, and "
+    "the calibrated threshold in mm is higher (95 % Student intervals over repeats). A hole is compared where both "
+    "measure it twice at least; where no smaller hole is compared, the second part holds if one view finds a hole that "
+    "two views miss. One part on the wrong side refutes.",
+)
+def claim_c8(case: MapCase) -> tuple[Answer, str]:
+    """Judge two views against one: better sizes of large holes, worse of small ones, a higher threshold."""
+    found = against_one(case, THESIS_REGISTRATION, THESIS_MERGE)
+    if found is None:
+        why = "one and two views, registered by CPD and merged on the grid, were not both finished"
+        return "undecided", f"Not judged: {why}."
+    small = True if not found.small.n and found.lost else found.small.is_above
+    sizes = found.sizes
+    holes = [f"{hole} {change.mean:+.2f}" for hole, change in zip(sizes.holes, sizes.by_hole(), strict=True)]
+    turn = "The change has no crossing."
+    if np.isfinite(sizes.crossing_mm):
+        turn = f"It turns at {sizes.crossing_mm:.1f} mm ({span(sizes.crossing_interval, 1)})."
+    parts = [
+        f"With {frames_text(found.one.frames)}, two views less one, |size error| of holes from 3/8 in on "
+        f"{change_text(found.large)}, of smaller ones {change_text(found.small)}.",
+        f"By hole (mm): {', '.join(holes)}. {turn}",
+        f"Threshold {change_text(found.threshold)}, surface noise {ratio_text(found.noise)}.",
+    ]
+    parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
+    parts += [f"Found by two views only: {hole_list(found.gained)}."] if found.gained else []
+    return decide([found.large.is_below, small, found.threshold.is_above]), " ".join(parts)
+
+
+@rule_of(
+    VIEW_CLAIMS,
+    "C10",
+    "A SLAM map is noisier and less precise than the single cloud and the merge of two views.",
+    "The map by odometry and volume (as a variation where there is one, with the most views and frames that it has) is "
+    "held against one view and against two merged as the thesis did, both with 50 frames (else the most). Borne out "
+    "when, against both, the noise of its fitted surface is higher (95 % Welch interval) and the root mean square "
+    "errors of size and of position (distance from the largest hole; thesis' measure) over the holes that all three "
+    "measure are larger (95 % bootstrap intervals over repeats). Where it finds no hole and the others do, its "
+    "precision counts as worse. One comparison on the wrong side refutes.",
+)
+def claim_c10(case: MapCase) -> tuple[Answer, str]:
+    """Judge whether the SLAM map is noisier and less precise than one view and than two merged ones."""
+    chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
+    chosen.sort(key=lambda one: (not one.is_variation, -one.views))
+    finished = (Map(one.variant, case.frames(one.variant)[-1], one.views) for one in chosen if case.frames(one.variant))
+    slam, alone, two = next(finished, None), case.single(), case.named(2, THESIS_REGISTRATION, THESIS_MERGE)
+    if slam is None or alone is None or two is None:
+        there = {"SLAM map": slam, "single view": alone, "merge of two": two}
+        missing = ", no ".join(name for name, found in there.items() if not found)
+        return "undecided", f"Not judged: the experiment has no {missing}."
+    maps = (slam, alone, two)
+    # Holes that each map measures often enough.
+    counts = [case.holes(each).groupby("hole", sort=False)["extent_diameter_mm"].count() for each in maps]
+    common = [str(hole) for hole in counts[0].index if all(count.get(hole, 0) >= FEWEST_BOTH for count in counts)]
+
+    def noise(mapped: Map) -> np.ndarray:
+        runs = case.runs(mapped)
+        return runs["surface_noise_mm"][runs["role"] == "damaged"].dropna().to_numpy(float)
+
+    def errors(mapped: Map, measured: str, true: str) -> np.ndarray:
+        """(repeats, h), NaN where not measured; without the hole from which positions count."""
+        rows = case.holes(mapped)
+        rows = rows[rows["hole"].isin(common) & (rows[true] > 0)]
+        rows = rows.assign(_error=rows[measured] - rows[true])
+        return rows.pivot(index="repeat", columns="hole", values="_error").to_numpy(float)
+
+    parts, said = [], []
+    for what, values, size, gap in (
+        ("surface noise", [noise(each) for each in maps], lambda v: float(v.mean()), mean_difference),
+        ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in maps], _rms, rms_gap),
+        ("position error", [errors(each, "extent_offset_mm", "true_offset_mm") for each in maps], _rms, rms_gap),
+    ):
+        if what == "surface noise" or values[0].size:
+            gaps = [gap(values[0], other) for other in values[1:]]
+            parts += [is_above_zero(interval) for interval in gaps]
+            sizes = [size(each) for each in values]
+            more = " and ".join(map(span, gaps))
+            said.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
+    if not common:
+        (_, most), *others = (_bounds(case, each) for each in maps)
+        parts.append(True if most == 0 and all(least > 0 for least, _ in others) else None)
+        said.append("no hole is measured by all three")
+    evidence = (
+        f"{slam.views} views of {_frames(slam)} against one and two of {_frames(alone)}: {'; '.join(said)}. Holes "
+        f"measured by all: {hole_list(common)}. Found: {', '.join(_found_text(case, each) for each in maps)}."
+    )
+    return decide(parts), evidence
+
+
+def rms_gap(first: np.ndarray, second: np.ndarray) -> Interval:
+    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap over the repeats of each,
+    which are independent; unknown below two repeats of either."""
+    if min(len(first), len(second)) < 2 or not (np.isfinite(first).any() and np.isfinite(second).any()):
+        return UNKNOWN
+    rng = np.random.default_rng(0)
+    draws = []
+    for errors in (first, second):
+        weights = rng.multinomial(len(errors), np.full(len(errors), 1 / len(errors)), RESAMPLES)
+        there = np.isfinite(errors)
+        squares = np.where(there, errors, 0.0) ** 2
+        with np.errstate(invalid="ignore"):
+            draws.append(np.sqrt(weights @ squares.sum(axis=1) / (weights @ there.sum(axis=1))))
+    tail = (1 - CONFIDENCE) / 2
+    low, high = np.nanquantile(draws[0] - draws[1], [tail, 1 - tail])
+    return Interval(float(low), float(high))
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+@dataclass(frozen=True)
+class Duel:
+    """A fused map, registered as ``registration`` says, against one view: its standing in each respect, and numbers."""
+
+    mapped: Map
+    registration: str
+    rival: Map
+    standings: dict[str, Standing]
+    text: str
+
+
+@rule_of(
+    VIEW_CLAIMS,
+    "H1",
+    "Mapping with noise reduction beats single clouds.",
+    "The fused map of the most views, registered by marks and surface (else by marks), is held against one view with "
+    "as many frames as each of its views (50, else the most), and against one view with as many exposures in all "
+    "(views times frames; of such pairs that of the most views, then frames) where the experiment has one. Respects: "
+    "holes found (counts, undecided holes leaving room for both), |size error| of the holes that both measure (thesis' "
+    "measure) and noise of the fitted surface (95 % Student intervals over repeats). Borne out when the map is ahead "
+    "of each rival in one respect at least and behind in none; refuted when it is behind any of them in any.",
+)
+def claim_h1(case: MapCase) -> tuple[Answer, str]:
+    """Judge whether a fused map beats one view, with as many frames and with as many exposures in all."""
+    duels = duels_of(case)
+    if not duels:
+        return "undecided", "Not judged: no fused map stands beside a single view."
+    standings = [list(duel.standings.values()) for duel in duels]
+    answers = [False if "behind" in each else True if "ahead" in each else None for each in standings]
+    evidence = " ".join(duel.text for duel in duels)
+    if len(duels) == 1:
+        evidence += " No single view has as many exposures in all: judged without."
+    return decide(answers), evidence
+
+
+def duels_of(case: MapCase) -> list[Duel]:
+    """H1's map against one view with as many frames as each of its views, then against one view with as many exposures
+    in all (see the rule for which); those of the two that the experiment has."""
+    fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
+    registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
+    fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
+    first = case.single()
+    equal_frames = (
+        (Map(one.variant, rival.frames, one.views), rival)
+        for one in fused
+        for frames in [case.common_frames(one.variant, first.variant if first else None)]
+        for rival in [case.single(frames) if frames is not None else None]
+        if rival is not None
+    )
+    lone = [one for one in case.maps if one.views == 1]
+    lone.sort(key=lambda one: (first is None or one.variant != first.variant, one.is_variation))
+    equal_exposures = (
+        (Map(one.variant, frames, one.views), Map(alone.variant, one.views * frames, 1))
+        for one in fused
+        for frames in reversed(case.frames(one.variant))
+        for alone in lone
+        if one.views * frames in case.frames(alone.variant)
+    )
+    pairs = [next(iter(kind), None) for kind in (equal_frames, equal_exposures)]
+    return [_duel(case, *pair, registration or "") for pair in pairs if pair is not None]
+
+
+def _duel(case: MapCase, mapped: Map, rival: Map, registration: str) -> Duel:
+    sizes = size_errors(case.holes(rival), case.holes(mapped)).change()
+    noise = run_ratio(case.runs(rival), case.runs(mapped), "surface_noise_mm")
+    (low, high), (rival_low, rival_high) = _bounds(case, mapped), _bounds(case, rival)
+    sure = low == high == rival_low == rival_high
+    standings: dict[str, Standing] = {
+        "holes": "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
+        "size": "ahead" if sizes.is_below else "behind" if sizes.is_above else "open",
+        "noise": "ahead" if noise.is_below else "behind" if noise.is_above else "open",
+    }
+    said = ", ".join(f"{respect} {standing}" for respect, standing in standings.items())
+    text = (
+        f"{mapped.views} views ({registration}, fusion) of {_frames(mapped)} against one of {_frames(rival)}: {said}. "
+        f"Found {_found_text(case, mapped)} against {_found_text(case, rival)}; |size error| {change_text(sizes)}; "
+        f"surface noise {ratio_text(noise)}."
+    )
+    return Duel(mapped, registration, rival, standings, text)
+
+
+def _frames(mapped: Map) -> str:
+    return f"{mapped.frames} frame{'s' if mapped.frames > 1 else ''}"
+
+
+def _bounds(case: MapCase, mapped: Map) -> tuple[int, int]:
+    """Fewest and most holes that a map finds."""
+    states = list(case.status(mapped).values())
+    found = states.count("found")
+    return found, found + states.count("undecided")
+
+
+def _found_text(case: MapCase, mapped: Map) -> str:
+    low, high = _bounds(case, mapped)
+    total = len(case.status(mapped))
+    return f"{low} of {total}" if low == high else f"{low} to {high} of {total}"
