@@ -1,13 +1,16 @@
-# make sweep: run the averaging experiment and write its report.   make test: run the tests.
-# Both set up .venv from the lock first, once.
+# make sweep: run the averaging experiment and write its report.   make test: run the tests, all but the slow ones.
+# Both set up .venv from the lock first, once.   make test-all: every test, with the long Monte Carlo and fault campaigns.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sweep test lint smoke validate check benchmarks strangers lock clean
+.PHONY: sweep test test-all lint smoke validate check benchmarks strangers lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
 test: .venv/.ready
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-all: .venv/.ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: .venv/.ready
@@ -38,9 +41,12 @@ lock: .venv/.ready
 	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links -o requirements.lock pyproject.toml
 
 .venv/.ready: requirements.lock pyproject.toml
+	@echo "Setting up .venv: install the locked packages (1 of 3, the longest part) ..."
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@echo "Setting up .venv: install tofpod (2 of 3) ..."
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@echo "Setting up .venv: compile the inner loops (3 of 3) ..."
 	$(BIN)/python -m harness.prepare
 	touch $@
 
