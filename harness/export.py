@@ -112,14 +112,13 @@ def _simulated(
     """Every view with its own frames, which are made only when they are written."""
     from harness.exchange.views import in_turn
     from scenes.sensor.camera import camera_of
-    from scenes.target.pose import T_camera_board_of
 
     frames = arguments.frames or experiment.config.capture.frames
     captures = [
         _captured(arguments, experiment, source, target, number, frames) for number, target in enumerate(targets)
     ]
     rate = camera_of(source.camera).unit.frames_per_second.value
-    return in_turn(captures, [T_camera_board_of(target.pose) for target in targets], frames, rate)
+    return in_turn(captures, [target.pose.T_camera_board for target in targets], frames, rate)
 
 
 def _captured(
@@ -196,14 +195,14 @@ def _write_beside(
 
 def _truth(targets: tuple[TargetConfig, ...], views: tuple[ExportedView, ...]) -> dict[str, Any]:
     """Damages in the board's frame and, of the first view, in the camera's; each view's pose."""
-    from scenes.target.truth import to_rows, truth_of
+    from scenes.target.truth import truth_of
 
     return {
         "frames": {
             "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
             "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
         },
-        "damages": to_rows(truth_of(targets[0], views[0].T_camera_board)),
+        "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
         "views": [{"name": view.name, "T_board_camera": _rows(view.T_board_camera)} for view in views],
     }
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from scenes.target.declaration import AnyTargetConfig, TargetConfig
+    from scenes.target.custom import TargetConfig
+    from scenes.target.declaration import AnyTargetConfig
     from scenes.target.mesh import Target
 
 NAMED_TARGETS = ("thesis",)
@@ -73,7 +74,7 @@ def _summary(target: Target) -> str:
 
 
 def _declared(name_or_path: str, board: int) -> TargetConfig:
-    from scenes.target.declaration import DrawnTargetConfig
+    from scenes.target.drawn import DrawnTargetConfig
 
     config = _target(name_or_path)
     if isinstance(config, DrawnTargetConfig):

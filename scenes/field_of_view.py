@@ -8,8 +8,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region, transform_points
 from scenes.optics import Optics
 from scenes.target.custom import TargetConfig
-from scenes.target.face import face_points_board_m, outline_board_m
-from scenes.target.pose import T_camera_board_of
+from scenes.target.face import OUTLINE_STEPS, face_grid_m, outline_board_m
 
 NEAREST_M = 0.05
 """Between the face and the lens' plane, whatever the camera."""
@@ -20,9 +19,9 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
 
     A face partly out of range is legal: its pixels there have no range, as they would have in the real camera.
     """
-    outline = transform_points(T_camera_board_of(config.pose), outline_board_m(config.board))
+    outline = transform_points(config.pose.T_camera_board, outline_board_m(config.board))
     seen_region(outline, optics)
-    face = transform_points(T_camera_board_of(config.pose), face_points_board_m(config.board))
+    face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
     range_m = face[:, 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(

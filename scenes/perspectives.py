@@ -18,7 +18,6 @@ from harness.vocabulary.geometry import invert
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.target.custom import PoseConfig
-from scenes.target.pose import T_camera_board_of
 
 MAX_VIEWS = 200
 
@@ -103,7 +102,7 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
 
 def T_reference_view_of(poses: tuple[PoseConfig, ...], number: int) -> np.ndarray:
     """4x4: a view's camera frame to the first view's, exactly."""
-    return T_camera_board_of(poses[0]) @ invert(T_camera_board_of(poses[number]))
+    return poses[0].T_camera_board @ invert(poses[number].T_camera_board)
 
 
 def guessed_T_reference_view(
@@ -115,7 +114,7 @@ def guessed_T_reference_view(
         return T_reference_view
     rng = random_stream(views.seed, "guess", number, *labels)
     axis, shift = (vector / np.linalg.norm(vector) for vector in rng.standard_normal((2, 3)))
-    centre = T_camera_board_of(poses[0])[:3, 3]
+    centre = poses[0].T_camera_board[:3, 3]
     error = np.eye(4)
     error[:3, :3] = _rotation(axis * np.deg2rad(views.guess_error_deg))
     error[:3, 3] = centre - error[:3, :3] @ centre + shift * views.guess_error_mm * MM

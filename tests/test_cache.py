@@ -24,7 +24,7 @@ from scenes.render.cache import ARRAYS, cached_view, read_view, render_key, stor
 from scenes.render.settings import RenderConfig
 from scenes.render.store import alone, damaged_renders, in_use, leftovers, stored_renders, trim_cache
 from scenes.sensor.camera import load_camera
-from scenes.target.declaration import ThesisTargetConfig
+from scenes.target.thesis import ThesisTargetConfig
 from scenes.view import NoiseFreeView
 
 ROOT = Path(__file__).resolve().parents[1]

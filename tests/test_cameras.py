@@ -15,7 +15,6 @@ from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, came
 from scenes.sensor.facts import unfolded_slope
 from scenes.target.declaration import target_from_data
 from scenes.target.mesh import build_target
-from scenes.target.wavelength import at_wavelength
 
 AZURE = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
 SMOKE = "experiments/smoke.yaml"
@@ -96,24 +95,24 @@ def test_an_experiment_replaces_numbers_of_a_camera():
 def test_albedos_near_850_nm_hold_and_others_must_be_declared():
     target = thesis()
     for wavelength_nm in (830.0, 850.0, 860.0, 870.0):
-        assert at_wavelength(target, wavelength_nm).material.albedo_850 == 0.6
+        assert target.at_wavelength(wavelength_nm).material.albedo_850 == 0.6
     with pytest.raises(UserError, match="no albedo at 940 nm"):
-        at_wavelength(target, 940.0)
+        target.at_wavelength(940.0)
     entry = {"wavelength_nm": 940.0, "board": 0.5, "tape": 0.4, "backing": 0.3, "floor": 0.2, "back_wall": 0.1}
-    other = at_wavelength(thesis(other_wavelengths=[entry]), 945.0)
+    other = thesis(other_wavelengths=[entry]).at_wavelength(945.0)
     albedos = {part.name: part.albedo_850 for part in build_target(other).parts}
     assert albedos["board"] == pytest.approx(0.5, rel=1e-3)
     assert (albedos["tape_1"], albedos["backing"], albedos["floor"], albedos["back_wall"]) == (0.4, 0.3, 0.2, 0.1)
     with pytest.raises(UserError, match="at 940 nm there is no albedo for tape, floor"):
         partial = {key: value for key, value in entry.items() if key not in ("tape", "floor")}
-        at_wavelength(thesis(other_wavelengths=[partial]), 940.0)
+        thesis(other_wavelengths=[partial]).at_wavelength(940.0)
 
 
 def test_the_nearest_declared_albedo_counts():
     entry = {"wavelength_nm": 860.0, "board": 0.2, "tape": 0.4, "backing": 0.3, "floor": 0.2, "back_wall": 0.1}
     target = thesis(other_wavelengths=[entry])
-    assert at_wavelength(target, 860.0).material.albedo_850 == 0.2
-    assert at_wavelength(target, 850.0).material.albedo_850 == 0.6
+    assert target.at_wavelength(860.0).material.albedo_850 == 0.2
+    assert target.at_wavelength(850.0).material.albedo_850 == 0.6
 
 
 def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():

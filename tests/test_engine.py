@@ -29,8 +29,7 @@ from harness.engine.trial import run_trial
 from harness.engine.work import Ended
 from harness.experiment.load import load_experiment
 from harness.vocabulary.versions import RESULTS_VERSION
-from scenes.target.declaration import TargetConfig
-from scenes.target.pose import T_camera_board_of
+from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of
 
 if TYPE_CHECKING:
@@ -381,7 +380,7 @@ def test_matching_places_findings_on_a_curved_face():
         "pose": {"distance_m": 0.6},
     }
     target = TargetConfig.from_data(data)
-    T_camera_board = T_camera_board_of(target.pose)
+    T_camera_board = target.pose.T_camera_board
     (damage,) = truth_of(target, T_camera_board)
     unit = cast("SimulatedUnit", None)
     set_up = SetUp(unit, True, (damage,), target, T_camera_board)

@@ -20,10 +20,8 @@ from harness.engine.sight_kernels import highest_within, pixel_areas
 from harness.evaluation.match import match
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
-from scenes.target.custom import BoardConfig, SphereConfig
-from scenes.target.declaration import TargetConfig
+from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
 from scenes.target.face import face_of
-from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import truth_of
 
 
@@ -46,7 +44,7 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
     region = Region(0, x.shape[0], 0, x.shape[1])
     cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
     places = points[..., :2]
-    truth = truth_of(target, T_camera_board_of(target.pose))
+    truth = truth_of(target, target.pose.T_camera_board)
     outlines = {
         d.id: np.flatnonzero(np.linalg.norm(places - d.centre_board_m[:2], axis=-1) < d.diameter_m / 2) for d in truth
     }

@@ -18,8 +18,7 @@ from harness.engine.setup import SetUp
 from harness.engine.sight import board_places_m, face_errors_m, sight_of_map
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
-from scenes.target.declaration import TargetConfig
-from scenes.target.pose import T_camera_board_of
+from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ TARGET = TargetConfig.from_data(
         "pose": {"distance_m": 0.7, "tilt_x_deg": 5.0, "tilt_y_deg": -8.0},
     }
 )
-T_CAMERA_BOARD = T_camera_board_of(TARGET.pose)
+T_CAMERA_BOARD = TARGET.pose.T_camera_board
 
 
 def map_of(height_m: float, *, step_m: float = 2e-3, missing: bool = False) -> tuple[Cloud, np.ndarray]:

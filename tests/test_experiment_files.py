@@ -15,7 +15,6 @@ from harness.experiment.points import MAIN, Point
 from harness.experiment.schema import SimulatedSource
 from harness.vocabulary.geometry import transform_points
 from harness.vocabulary.units import MM
-from scenes.target.pose import T_camera_board_of
 
 FOLDER = Path(__file__).resolve().parents[1] / "experiments"
 RIM_MM = 5.9
@@ -59,7 +58,7 @@ def test_the_crop_keeps_all_holes_and_leaves_a_rim(name: str) -> None:
         assert isinstance(source, SimulatedSource)
         assert isinstance(crop, BoxCrop)
         target = source.target.declare()
-        to_camera = T_camera_board_of(target.pose)
+        to_camera = target.pose.T_camera_board
         half = np.array([target.board.width_mm, target.board.height_mm]) / 2
         corners = [[x * half[0], y * half[1], 0.0] for x, y in product((-1, 1), repeat=2)]
         board_mm = transform_points(to_camera, np.array(corners) * MM) / MM

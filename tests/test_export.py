@@ -30,7 +30,6 @@ from scenes.closed_form import Plane, layered_view
 from scenes.perspectives import ArcViews, guessed_T_reference_view, poses_of
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
-from scenes.target.pose import T_camera_board_of
 from scenes.target.thesis import ThesisTargetConfig
 from scenes.view import NoiseFreeView
 
@@ -167,7 +166,7 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path])
     pose = got[0][2].transforms[0]
     assert (pose.header.frame_id, pose.child_frame_id) == ("board", "view_01_depth_optical_frame")
     target = ThesisTargetConfig().declare()
-    T_camera_board = T_camera_board_of(poses_of(ArcViews(kind="arc", count=3, spread_deg=40.0), target.pose)[1])
+    T_camera_board = poses_of(ArcViews(kind="arc", count=3, spread_deg=40.0), target.pose)[1].T_camera_board
     place = pose.transform.translation
     np.testing.assert_allclose([place.x, place.y, place.z], invert(T_camera_board)[:3, 3], rtol=1e-14)
     info, cloud = got[1][2], got[2][2]
@@ -190,7 +189,7 @@ def test_the_truth_and_the_nominal_poses_stand_beside(exports: dict[str, Path], 
     views = ArcViews(kind="arc", count=3, spread_deg=40.0)
     poses = poses_of(views, target.pose)
     for number, told in enumerate(truth["views"]):
-        np.testing.assert_array_equal(told["T_board_camera"], invert(T_camera_board_of(poses[number])))
+        np.testing.assert_array_equal(told["T_board_camera"], invert(poses[number].T_camera_board))
     nominal = json.loads((out / "nominal_poses.json").read_text())["T_reference_view"]
     np.testing.assert_allclose(nominal[0], np.eye(4), atol=1e-15)
     np.testing.assert_array_equal(nominal[1], guessed_T_reference_view(views, poses, 1, "damaged", 0))

@@ -23,7 +23,6 @@ from scenes.perspectives import (
     poses_of,
 )
 from scenes.target.custom import PoseConfig
-from scenes.target.pose import T_camera_board_of
 
 POSE = PoseConfig(distance_m=0.7, tilt_x_deg=3.0, tilt_y_deg=4.0)
 
@@ -75,7 +74,7 @@ def test_the_guess_is_wrong_by_what_it_says_about_the_targets_centre():
     for guess in guesses:
         error = guess @ invert(true)
         assert np.rad2deg(Rotation.from_matrix(error[:3, :3]).magnitude()) == pytest.approx(3.0)
-        centre = T_camera_board_of(poses[0])[:3, 3]
+        centre = poses[0].T_camera_board[:3, 3]
         assert np.linalg.norm(transform_points(error, centre) - centre) == pytest.approx(0.010)
     assert np.array_equal(guessed_T_reference_view(views, poses, 0, "damaged", 0), np.eye(4)) or np.allclose(
         guessed_T_reference_view(views, poses, 0, "damaged", 0), np.eye(4), atol=1e-15
@@ -86,9 +85,9 @@ def test_a_view_and_the_reference_see_the_same_board():
     poses = poses_of(ArcViews(kind="arc", count=5, spread_deg=50.0, about="x"), POSE)
     corner_board = np.array([0.1, -0.04, 0.0])
     for number, pose in enumerate(poses):
-        seen = transform_points(T_camera_board_of(pose), corner_board)
+        seen = transform_points(pose.T_camera_board, corner_board)
         assert transform_points(T_reference_view_of(poses, number), seen) == pytest.approx(
-            transform_points(T_camera_board_of(POSE), corner_board), abs=1e-12
+            transform_points(POSE.T_camera_board, corner_board), abs=1e-12
         )
 
 

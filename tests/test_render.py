@@ -25,8 +25,9 @@ from scenes.render.variant import load_mitsuba
 from scenes.render.view import indirect_light, render_view, target_region
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import load_camera
-from scenes.target.declaration import TargetConfig, ThesisTargetConfig
-from scenes.target.mesh import Part, build_target
+from scenes.target.custom import TargetConfig
+from scenes.target.mesh import TargetPart, build_target
+from scenes.target.thesis import ThesisTargetConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = load_camera("azure_kinect_nfov")
@@ -34,14 +35,14 @@ EMITTER = CAMERA.emitter_position_m
 WAVE = 2 * np.pi * np.array(CAMERA.frequencies_hz) / SPEED_OF_LIGHT_AIR
 
 
-def quad(corners: list[list[float]], name: str = "plane", albedo: float = 0.5) -> Part:
+def quad(corners: list[list[float]], name: str = "plane", albedo: float = 0.5) -> TargetPart:
     mesh = trimesh.Trimesh(np.array(corners), [[0, 1, 2], [0, 2, 3]], process=False)
-    return Part(
+    return TargetPart(
         name=name, mesh=mesh, uv=None, albedo_850=albedo, texture_850=None, rgb=(0.5, 0.5, 0.5), texture_rgb=None
     )
 
 
-def frontal(z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo: float = 0.5) -> Part:
+def frontal(z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo: float = 0.5) -> TargetPart:
     return quad([[x0, -2, z], [x1, -2, z], [x1, 2, z], [x0, 2, z]], name, albedo)
 
 
@@ -56,7 +57,7 @@ def whole_pixels(lens, region, rows, cols):
     return OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
 
 
-def scene_of(*parts: Part, camera=CAMERA):
+def scene_of(*parts: TargetPart, camera=CAMERA):
     return lit_scene(load_mitsuba(), parts, camera.optics)
 
 

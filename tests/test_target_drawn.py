@@ -21,11 +21,10 @@ from harness.vocabulary.geometry import invert, transform_points
 from scenes.field_of_view import check_in_view
 from scenes.sensor.camera import load_camera
 from scenes.target.checks import check_target
-from scenes.target.declaration import DrawnTargetConfig, TargetConfig, target_from_data
-from scenes.target.drawn import Purpose
-from scenes.target.face import outline_board_m
-from scenes.target.pose import T_camera_board_of
-from scenes.target.surroundings import backing_corners_board_m
+from scenes.target.custom import TargetConfig
+from scenes.target.declaration import target_from_data
+from scenes.target.drawn import DrawnTargetConfig, Purpose
+from scenes.target.face import backing_corners_board_m, outline_board_m
 
 ALPHA = 1e-3
 """Of each statistical test; seeds are fixed, so a test that passes once always does."""
@@ -243,7 +242,7 @@ def test_backing_fills_every_hole_in_every_pose() -> None:
     outline = outline_board_m(drawn.board)
     seen = []
     for pose in drawn.extreme_poses():
-        lens = transform_points(invert(T_camera_board_of(pose)), np.zeros(3))
+        lens = transform_points(invert(pose.T_camera_board), np.zeros(3))
         share = (corners[0, 2] - lens[2]) / (outline[:, 2] - lens[2])
         seen.append(np.abs(lens + share[:, None] * (outline - lens))[:, :2].max(axis=0) / half)
     assert np.max(seen, axis=0) == pytest.approx([1.0, 1.0], abs=1e-9)
@@ -265,7 +264,7 @@ def test_what_is_in_view_in_the_extreme_poses_always_is() -> None:
 
 def _reach_px(drawn: DrawnTargetConfig, pose: Any, optics: Any) -> np.ndarray:
     """(4,) how far the board's outline reaches left, up, right and down."""
-    pixels = optics.lens.project(transform_points(T_camera_board_of(pose), outline_board_m(drawn.board)))
+    pixels = optics.lens.project(transform_points(pose.T_camera_board, outline_board_m(drawn.board)))
     return np.concatenate([-pixels.min(axis=0), pixels.max(axis=0)])
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
-from scenes.target.declaration import (
+from scenes.target.custom import (
     BackingConfig,
     BoardConfig,
     CylinderConfig,
@@ -26,12 +26,11 @@ from scenes.target.declaration import (
     TapeConfig,
     TargetConfig,
     TermConfig,
-    ThesisTargetConfig,
 )
 from scenes.target.face import face_of
-from scenes.target.mesh import Target, board_solid, build_target
-from scenes.target.solid import cutter, sheet, subtract
+from scenes.target.mesh import Target, board_solid, build_target, cutter, sheet, subtract
 from scenes.target.texture import grain, look_up, reflectance
+from scenes.target.thesis import ThesisTargetConfig
 
 WAVY = PolynomialConfig(
     kind="polynomial",
@@ -64,7 +63,7 @@ def removed_m3(config: TargetConfig, sagitta_m: float) -> list[float]:
     body = sheet(face, size_m, top_m=0.0, bottom_m=-config.board.thickness_mm * 1e-3, sagitta_m=sagitta_m)
     removed = []
     for damage, item in zip(build_target(config).truth, config.damages, strict=True):
-        left = subtract(body, [cutter(damage, item.diameter_mm * 0.5e-3)])
+        left = subtract(body, [cutter(damage, item)])
         assert left.is_watertight
         removed.append(float(body.volume - left.volume))
     return removed

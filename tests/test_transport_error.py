@@ -10,8 +10,8 @@ from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
 from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
-from scenes.target.declaration import ThesisTargetConfig
 from scenes.target.mesh import build_target
+from scenes.target.thesis import ThesisTargetConfig
 
 
 def test_holes_before_a_backing_are_right_within_a_fifth_of_a_millimetre():

@@ -23,7 +23,7 @@ from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
 from scenes.render.view import render_view
 from scenes.target.custom import TargetConfig
-from scenes.target.mesh import Part, build_target
+from scenes.target.mesh import TargetPart, build_target
 
 LENS = Lens(width=400, height=300, fx=800.0, fy=800.0, cx=199.5, cy=149.5)
 DEVIATION_RAD = 1.2e-3
@@ -42,12 +42,12 @@ OPTICS = Optics(
 )
 
 
-def part(name: str, corners: list[list[float]], albedo: float = 0.5) -> Part:
+def part(name: str, corners: list[list[float]], albedo: float = 0.5) -> TargetPart:
     mesh = trimesh.Trimesh(np.array(corners), [[0, 1, 2], [0, 2, 3]], process=False)
-    return Part(name, mesh, None, albedo, None, np.full(3, 0.5), None)
+    return TargetPart(name, mesh, None, albedo, None, np.full(3, 0.5), None)
 
 
-def half_plane(angle_rad: float, edge: float) -> Part:
+def half_plane(angle_rad: float, edge: float) -> TargetPart:
     """At z = 1, all slopes s with s . (cos, sin) < edge."""
     along = np.array([np.cos(angle_rad), np.sin(angle_rad)])
     across = np.array([-along[1], along[0]])

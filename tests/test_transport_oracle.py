@@ -20,8 +20,8 @@ from scenes.render.variant import load_mitsuba
 from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
-from scenes.target.declaration import ThesisTargetConfig
-from scenes.target.mesh import Part, build_target
+from scenes.target.mesh import TargetPart, build_target
+from scenes.target.thesis import ThesisTargetConfig
 
 CAMERA = load_camera("azure_kinect_nfov")
 FREQUENCIES = CAMERA.frequencies_hz
@@ -63,7 +63,7 @@ def assert_agree(ours, theirs, here, largest_error):
 def test_a_corner(histogram):
     def quad(name, corners, albedo):
         mesh = trimesh.Trimesh(np.array(corners, float), [[0, 1, 2], [0, 2, 3]], process=False)
-        return Part(name, mesh, None, albedo, None, np.full(3, 0.5), None)
+        return TargetPart(name, mesh, None, albedo, None, np.full(3, 0.5), None)
 
     wall = quad("wall", [[-1, -1, 1], [1, -1, 1], [1, 0.2, 1], [-1, 0.2, 1]], 0.8)
     floor = quad("floor", [[-1, 0.2, 0], [1, 0.2, 0], [1, 0.2, 1], [-1, 0.2, 1]], 0.6)

@@ -22,7 +22,6 @@ from scenes.render.cache import view_bytes
 from scenes.render.view import RIM_PX
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.face import outline_board_m
-from scenes.target.pose import T_camera_board_of
 
 REFERENCE = "another machine (2 cores, November 2026)"
 """Where the numbers below were measured; `tests/validation/cost_rates.py` measures them anew."""
@@ -145,14 +144,14 @@ def _vertices(most: int) -> float:
 def _region(job: RenderJob) -> Region:
     """What `scenes.render.view.target_region` finds, without building the target's mesh."""
     optics = camera_of(job.camera).optics
-    outline = transform_points(T_camera_board_of(job.target.pose), outline_board_m(job.target.board))
+    outline = transform_points(job.target.pose.T_camera_board, outline_board_m(job.target.board))
     return seen_region(outline, optics).grown(RIM_PX + optics.margin_px, optics.lens.height, optics.lens.width)
 
 
 def _damaged_pixels(job: RenderJob) -> float:
     """Pixels of damage and, one wide, of its rims."""
     lens = camera_of(job.camera).optics.lens
-    pitch_mm = float(T_camera_board_of(job.target.pose)[2, 3]) / sqrt(lens.fx * lens.fy) / MM
+    pitch_mm = float(job.target.pose.T_camera_board[2, 3]) / sqrt(lens.fx * lens.fy) / MM
     diameters = [damage.diameter_mm / pitch_mm for damage in job.target.damages]
     return sum(pi / 4 * d**2 + pi * d for d in diameters)
 

@@ -24,7 +24,6 @@ from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.wavelength import at_wavelength
 
 CODE = "harness.engine.trial"
 PACKAGES = (
@@ -239,7 +238,7 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
 
 
 def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None) -> Batch:
-    target = at_wavelength(declared, camera_of(source.camera).optics.wavelength_nm)
+    target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
     placed = [target.model_copy(update={"pose": pose}) for pose in poses]
     return Batch(role, tuple(_view(one, role == "damaged", source, cache) for one in placed), board)

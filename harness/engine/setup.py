@@ -20,7 +20,6 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.face import Face, face_of
-from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import Damage, truth_of
 from scenes.view import NoiseFreeView
 
@@ -176,7 +175,7 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
 def load_set_up(ref: SetUpRef) -> SetUp:
     """The set-up behind a reference, kept for the worker's next trials."""
     camera = camera_of(ref.camera)
-    T_camera_board = T_camera_board_of(ref.target.pose)
+    T_camera_board = ref.target.pose.T_camera_board
     return SetUp(
         unit=SimulatedUnit(camera, ref.camera, _stored_view(ref.view_path)),
         damaged=ref.damaged,

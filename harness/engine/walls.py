@@ -11,7 +11,6 @@ from harness.experiment.schema import SimulatedSource
 from harness.vocabulary.geometry import invert, transform_points
 from scenes.perspectives import poses_of
 from scenes.sensor.camera import camera_of
-from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import truth_of
 
 
@@ -25,7 +24,7 @@ def wall_rows(experiment: Experiment) -> pd.DataFrame:
     assert isinstance(source, SimulatedSource)
     assert source.views is not None
     target = source.target.declare()
-    boards = [invert(T_camera_board_of(pose)) for pose in poses_of(source.views, target.pose)]
+    boards = [invert(pose.T_camera_board) for pose in poses_of(source.views, target.pose)]
     emitter_m = camera_of(source.camera).optics.emitter_m
     mappings = (point.config.mapping for point in set_ups)
     counts = sorted({mapping.views or len(boards) for mapping in mappings if mapping is not None})

@@ -24,9 +24,8 @@ from scenes.field_of_view import check_in_view
 from scenes.perspectives import AnyViews, poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
-from scenes.target.declaration import TargetConfig
+from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.wavelength import at_wavelength
 
 CAMERA_NAME = ("source", "camera", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
@@ -204,7 +203,7 @@ def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[tuple[s
     except UserError as error:
         return (CAMERA_NUMBERS if config.numbers else CAMERA_NAME), error
     try:
-        at_wavelength(target, optics.wavelength_nm)
+        target.at_wavelength(optics.wavelength_nm)
         check_in_view(target, optics)
     except UserError as error:
         return ("source", "target"), error

@@ -10,7 +10,7 @@ from harness.vocabulary.units import MM
 from scenes.render.direct import DirectLight
 from scenes.render.indirect import Work, gather_at_points, noise_lines
 from scenes.render.scene import LitScene
-from scenes.target.mesh import Part, Target
+from scenes.target.mesh import Target, TargetPart
 
 FACE_WITHIN_M = 0.001 * MM
 """The board's vertices so near its undamaged face lie on it: Booleans in double precision leave them within 1 nm."""
@@ -23,7 +23,7 @@ def face_triangles(target: Target) -> list[np.ndarray]:
     return [_of_face(target, part) for part in target.parts]
 
 
-def _of_face(target: Target, part: Part) -> np.ndarray:
+def _of_face(target: Target, part: TargetPart) -> np.ndarray:
     if part.name != "board":
         return np.full(len(part.mesh.faces), part.name.startswith("tape"))
     board = transform_points(invert(target.T_camera_board), part.mesh.vertices)

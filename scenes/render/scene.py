@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes.optics import Optics
-from scenes.target.mesh import Part
+from scenes.target.mesh import TargetPart
 
 LIFT_M = 1e-5
 """How far off a surface a ray starts. float32 places hits within 1e-6 m in a room of metres; Mitsuba's own lift,
@@ -88,7 +88,9 @@ class LitScene:
         return self.scene.ray_test(ray, active)
 
 
-def lit_scene(mi: Any, parts: Sequence[Part], optics: Optics, on_face: Sequence[np.ndarray] | None = None) -> LitScene:
+def lit_scene(
+    mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
+) -> LitScene:
     """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo.
 
     ``on_face``: for each part which of its triangles (n,) lie on the undamaged face; None means none.
@@ -120,7 +122,7 @@ def lit_scene(mi: Any, parts: Sequence[Part], optics: Optics, on_face: Sequence[
     )
 
 
-def _mesh(mi: Any, part: Part) -> Any:
+def _mesh(mi: Any, part: TargetPart) -> Any:
     """One part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
     material = mi.load_dict(
         {"type": "twosided", "material": {"type": "diffuse", "reflectance": _reflectance(mi, part)}}
@@ -146,7 +148,7 @@ def _mesh(mi: Any, part: Part) -> Any:
     return mesh
 
 
-def _reflectance(mi: Any, part: Part) -> dict[str, Any]:
+def _reflectance(mi: Any, part: TargetPart) -> dict[str, Any]:
     if part.texture_850 is None:
         return {"type": "uniform", "value": float(part.albedo_850)}
     bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))

@@ -1,4 +1,4 @@
-"""Whether the parts of a declaration fit together. Every problem is found and named; nothing is built."""
+"""Checks of a declaration as a whole: every part that does not fit is found and named; nothing is built."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ from scenes.target.custom import (
     TapeConfig,
     TargetConfig,
 )
-from scenes.target.face import Face, face_of
-from scenes.target.pose import T_camera_board_of
-from scenes.target.surroundings import backing_corners_board_m, face_grid_m
-from scenes.target.truth import ball_radius_m, widest_rim_m
+from scenes.target.face import Face, backing_corners_board_m, face_grid_m, face_of
+from scenes.target.truth import widest_rim_m
 
 STEEPEST_SLOPE = 4 / 3
 """dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius. Steeper, the size in plan misleads."""
@@ -32,24 +30,21 @@ WIDEST_BEND = 0.25
 SHALLOWEST_BEND = 0.5
 """The radius of a dent's ball over that: at 1 a face that bends away from the camera has no rim."""
 LEAST_WEB_MM = 0.01
-"""Between two damages, and between a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in."""
+"""Web between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in."""
 NEAREST_M = 0.05
-"""Between board and lens plane."""
-
-Damage = HoleConfig | DentConfig
+"""Least distance of the board from the lens plane."""
 
 
 def check_target(config: TargetConfig) -> None:
     """Raise UserError that names every part that does not fit, with the numbers; return where all fits."""
-    problems = _board_problems(config.board)
+    board = config.board
+    problems = _board_problems(board)
     if not problems:
-        face = face_of(config.board)
-        found = {damage.id: _damage_problems(damage, config.board, face) for damage in config.damages}
+        face = face_of(board)
+        found = {damage.id: _damage_problems(damage, board, face) for damage in config.damages}
         problems += [problem for each in found.values() for problem in each]
-        problems += _overlap_problems([damage for damage in config.damages if not found[damage.id]], config.board, face)
-        for number, tape in enumerate(config.tapes, start=1):
-            problems += _tape_problems(number, tape, config)
-        problems += _stacked_tape_problems(config.tapes) + _pose_problems(config)
+        problems += _overlap_problems([damage for damage in config.damages if not found[damage.id]], board, face)
+        problems += _tape_problems(config) + _pose_problems(config)
     if problems:
         raise UserError(
             "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems),
@@ -58,8 +53,8 @@ def check_target(config: TargetConfig) -> None:
         )
 
 
-def _name(damage: Damage) -> str:
-    kind = "dent" if isinstance(damage, DentConfig) else "hole"
+def _name(damage: HoleConfig | DentConfig) -> str:
+    kind = "dent" if damage.kind == "dent" else "hole"
     x, y = damage.centre_mm
     return f"{kind} {damage.id} (diameter {damage.diameter_mm:g} mm at ({x:g}, {y:g}) mm)"
 
@@ -69,7 +64,7 @@ def _size(board: BoardConfig) -> str:
 
 
 def _board_problems(board: BoardConfig) -> list[str]:
-    """A face too steep or too tightly bent for its size."""
+    """Find a face too steep or too tightly bent for its size."""
     shape, half_x, half_y = board.shape, board.width_mm / 2, board.height_mm / 2
     if isinstance(shape, CylinderConfig | SphereConfig):
         reach = float(np.hypot(half_x, half_y))
@@ -95,84 +90,58 @@ def _board_problems(board: BoardConfig) -> list[str]:
     return []
 
 
-def _damage_problems(damage: Damage, board: BoardConfig, face: Face) -> list[str]:
-    """Too deep, off the board, or on a face too bent for it."""
+def _damage_problems(damage: HoleConfig | DentConfig, board: BoardConfig, face: Face) -> list[str]:
+    """Find damage that is too deep, off the board, or on a face too bent for it."""
+    name, problems = _name(damage), []
     if not (abs(damage.centre_mm[0]) < board.width_mm / 2 and abs(damage.centre_mm[1]) < board.height_mm / 2):
-        return [f"{_name(damage)}: its centre is off {_size(board)}"]
-    bent = _bend_problems(damage, face)
-    if bent:
-        return bent
-    problems, over_mm = _depth_problems(damage, board), _over_the_edge_mm(damage, board, face)
-    if over_mm > -LEAST_WEB_MM:
-        problems.append(f"{_name(damage)}: leaves {_size(board)} by {max(round(over_mm, 3), 0.0) + 0.0:g} mm")
-    return problems
-
-
-def _bend_problems(damage: Damage, face: Face) -> list[str]:
-    tightest = float(np.abs(face.curvatures(*(np.asarray(value * MM) for value in damage.centre_mm))).max())
+        return [f"{name}: its centre is off {_size(board)}"]
+    tightest = float(np.abs(face.curvatures(*damage.centre_m)).max())
     if damage.diameter_mm / 2 * MM * tightest > WIDEST_BEND:
-        return [f"{_name(damage)}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
-    if isinstance(damage, DentConfig):
-        ball_m = ball_radius_m(damage.diameter_mm * MM / 2, damage.depth_mm * MM)
-        if ball_m * tightest > SHALLOWEST_BEND:
-            return [
-                f"{_name(damage)}: too shallow ({damage.depth_mm:g} mm, a ball of radius {ball_m / MM:.3g} mm) for a "
-                f"face bent to a radius of {1 / tightest / MM:.3g} mm there"
-            ]
-    return []
-
-
-def _depth_problems(damage: Damage, board: BoardConfig) -> list[str]:
-    problems = []
+        return [f"{name}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
+    if isinstance(damage, DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
+        return [
+            f"{name}: too shallow ({damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm) for a "
+            f"face bent to a radius of {1 / tightest / MM:.3g} mm there"
+        ]
     if damage.depth_mm is not None and damage.depth_mm >= board.thickness_mm:
         problems.append(
-            f"{_name(damage)}: depth {damage.depth_mm:g} mm is not less than the board's thickness "
-            f"{board.thickness_mm:g} mm"
+            f"{name}: depth {damage.depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
         )
     if isinstance(damage, DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
         problems.append(
-            f"{_name(damage)}: depth {damage.depth_mm:g} mm is more than its radius {damage.diameter_mm / 2:g} mm, "
+            f"{name}: depth {damage.depth_mm:g} mm is more than its radius {damage.diameter_mm / 2:g} mm, "
             "which no spherical cap has"
         )
-    return problems
-
-
-def _over_the_edge_mm(damage: Damage, board: BoardConfig, face: Face) -> float:
-    """How far the rim, at the face or at the bottom of the damage, is beyond the board's edge in plan; < 0 if within.
-
-    The side walls follow the normals of the edge, so at the back the limits move by the depth times the normal there.
-    """
-    x, y = (value * MM for value in damage.centre_mm)
-    centre, axis = face.point(np.asarray(x), np.asarray(y)), face.normal(np.asarray(x), np.asarray(y))
-    rim = widest_rim_m(damage, face) * _circle(axis)
+    # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
+    # normals of the edge, so below the face the limits move by the depth times the normal there.
+    x, y = damage.centre_m
+    centre, axis = face.point(x, y), face.normal(x, y)
+    across = np.cross(axis, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
+    rim = widest_rim_m(damage, face) * (np.cos(angle) * across + np.sin(angle) * np.cross(axis, across))
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    edges = ((0, 1.0, half_x, y), (0, -1.0, -half_x, y), (1, 1.0, x, half_y), (1, -1.0, x, -half_y))
+    edges = ((0, 1.0, (half_x, y)), (0, -1.0, (-half_x, y)), (1, 1.0, (x, half_y)), (1, -1.0, (x, -half_y)))
     over = []
     for depth_m in (0.0, _reach_m(damage, board)):
         points = centre - depth_m * axis + rim
-        for along, side, edge_x, edge_y in edges:
-            limit = (face.point(edge_x, edge_y) - depth_m * face.normal(edge_x, edge_y))[along]
-            over.append(float((side * (points[:, along] - limit)).max()))
-    return max(over) / MM
+        for along, side, edge in edges:
+            limit = (face.point(*edge) - depth_m * face.normal(*edge))[along]
+            over.append(float((side * (points[:, along] - limit)).max()) / MM)
+    if max(over) > -LEAST_WEB_MM:
+        problems.append(f"{name}: leaves {_size(board)} by {max(round(max(over), 3), 0.0) + 0.0:g} mm")
+    return problems
 
 
-def _reach_m(damage: Damage, board: BoardConfig) -> float:
-    """How deep a damage keeps its full width: a dent narrows from the face on."""
-    if isinstance(damage, DentConfig):
+def _reach_m(damage: HoleConfig | DentConfig, board: BoardConfig) -> float:
+    """Return the depth to which a damage keeps its full width: a dent narrows from the face on."""
+    if damage.kind == "dent":
         return 0.0
     return (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM
 
 
-def _circle(axis: np.ndarray) -> np.ndarray:
-    """(64, 3) unit vectors across an axis."""
-    across = np.cross(axis, [0.0, 1.0, 0.0])
-    across /= np.linalg.norm(across)
-    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
-    return np.cos(angle) * across + np.sin(angle) * np.cross(axis, across)
-
-
-def _overlap_problems(damages: list[Damage], board: BoardConfig, face: Face) -> list[str]:
-    """Pairs without a web between them, at the face or at the depth that both reach."""
+def _overlap_problems(damages: list[HoleConfig | DentConfig], board: BoardConfig, face: Face) -> list[str]:
+    """Find pairs without a web between them, at the face or at the depth that both reach."""
     places = np.array([damage.centre_mm for damage in damages]).reshape(-1, 2) * MM
     centres, axes = face.point(places[:, 0], places[:, 1]), face.normal(places[:, 0], places[:, 1])
     rims_m = np.array([widest_rim_m(damage, face) for damage in damages])
@@ -189,48 +158,50 @@ def _overlap_problems(damages: list[Damage], board: BoardConfig, face: Face) -> 
     ]
 
 
-def _tape_problems(number: int, tape: TapeConfig, config: TargetConfig) -> list[str]:
-    """A strip off the board or over a damage, both in plan."""
-    (width, height), (x, y) = tape.size_mm, tape.centre_mm
-    name = f"tape {number} ({width:g} x {height:g} mm at ({x:g}, {y:g}) mm)"
+def off_tape_mm(tape: TapeConfig, places_mm: np.ndarray) -> np.ndarray:
+    """Return the distance in plan of places (n, 2) from a strip, mm; 0 on it."""
     angle = np.deg2rad(tape.angle_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    half = np.array(tape.size_mm) / 2
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn.T + tape.centre_mm
-    over = float((np.abs(corners) - np.array([config.board.width_mm, config.board.height_mm]) / 2).max())
-    problems = []
-    if over > 0:
-        problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")
-    for damage in config.damages:
-        local = turn.T @ np.subtract(damage.centre_mm, tape.centre_mm)
-        gap = float(np.linalg.norm(np.maximum(np.abs(local) - half, 0))) - damage.diameter_mm / 2
-        if gap <= 0:
-            problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
-    return problems
+    beyond = np.abs((places_mm - tape.centre_mm) @ turn) - np.array(tape.size_mm) / 2
+    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=-1))
 
 
-def _stacked_tape_problems(tapes: tuple[TapeConfig, ...]) -> list[str]:
-    """Strips that share more than an edge: their upper sides would lie in one another."""
+def _tape_problems(config: TargetConfig) -> list[str]:
+    """Find strips off the board, over a damage, or over one another (their upper sides would coincide); in plan."""
     import cv2
 
-    boxes = [(tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in tapes]
     problems = []
-    for (first, box), (second, other) in combinations(enumerate(boxes, start=1), 2):
-        _, corners = cv2.rotatedRectangleIntersection(box, other)
-        shared_mm2 = 0.0 if corners is None else cv2.contourArea(cv2.convexHull(corners))
+    for number, tape in enumerate(config.tapes, start=1):
+        (width, height), (x, y) = tape.size_mm, tape.centre_mm
+        name = f"tape {number} ({width:g} x {height:g} mm at ({x:g}, {y:g}) mm)"
+        angle = np.deg2rad(tape.angle_deg)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2) @ turn.T + (x, y)
+        over = float((np.abs(corners) - np.array([config.board.width_mm, config.board.height_mm]) / 2).max())
+        if over > 0:
+            problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")
+        for damage in config.damages:
+            gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.diameter_mm / 2
+            if gap <= 0:
+                problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
+    for (first, strip), (second, other) in combinations(enumerate(config.tapes, start=1), 2):
+        first_box, second_box = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (strip, other))
+        _, shared = cv2.rotatedRectangleIntersection(first_box, second_box)
+        shared_mm2 = 0.0 if shared is None else cv2.contourArea(cv2.convexHull(shared))
         if shared_mm2 > 1e-3:
             problems.append(f"tape {first} and tape {second} lie on each other over {shared_mm2:.3g} mm2")
     return problems
 
 
 def _pose_problems(config: TargetConfig) -> list[str]:
-    """A board that reaches behind the lens, through the floor or, with its backing, into the wall."""
-    T_camera_board = T_camera_board_of(config.pose)
-    solid = [face_grid_m(config, depth_m).reshape(-1, 3) for depth_m in (0.0, config.board.thickness_mm * MM)]
-    nearest_m, lowest_m, farthest_m = _extremes_m(T_camera_board, np.concatenate(solid))
+    """Find a board that reaches behind the lens, through the floor or, with its backing, into the wall."""
+    T_camera_board, board = config.pose.T_camera_board, config.board
+    solid = [face_grid_m(board, depth_m).reshape(-1, 3) for depth_m in (0.0, board.thickness_mm * MM)]
+    points = transform_points(T_camera_board, np.concatenate(solid))
+    nearest_m, lowest_m, farthest_m = points[:, 2].min(), points[:, 1].max(), points[:, 2].max()
     if config.backing is not None:
-        backing = backing_corners_board_m(config, config.backing)
-        farthest_m = max(farthest_m, _extremes_m(T_camera_board, backing)[2])
+        backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
+        farthest_m = max(farthest_m, backing[:, 2].max())
     problems = []
     if nearest_m < NEAREST_M:
         problems.append(
@@ -243,9 +214,3 @@ def _pose_problems(config: TargetConfig) -> list[str]:
     if wall_m is not None and farthest_m >= wall_m:
         problems.append(f"room: board and backing reach {farthest_m:.3g} m, beyond the back wall at {wall_m:g} m")
     return problems
-
-
-def _extremes_m(T_camera_board: np.ndarray, points_board_m: np.ndarray) -> tuple[float, float, float]:
-    """Smallest z, largest y (lowest) and largest z in the camera's frame."""
-    points = transform_points(T_camera_board, points_board_m)
-    return float(points[:, 2].min()), float(points[:, 1].max()), float(points[:, 2].max())

@@ -1,4 +1,4 @@
-"""What a user may say about a target: board, damage, tape, material, backing, room and pose.
+"""Declaration of a target: board, damage, tape, material, backing, room and pose.
 
 Frames. ``board``: x along the row, y up the face, z out of the face towards the camera, origin on the face's centre.
 ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
@@ -8,11 +8,19 @@ fields are checked here; what concerns several together (a hole that leaves the 
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import rotation_xyz_deg
+from harness.vocabulary.units import MM
+
+NEAR_NM = 20.0
+"""An albedo holds this far around its wavelength: reflectances of wood and paint change by a per cent or two over it in
+the near infrared (a guess), less than what the albedo itself is known to."""
 
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
@@ -29,21 +37,22 @@ class FlatConfig(Config):
     kind: Literal["flat"] = "flat"
 
 
-class CylinderConfig(Config):
+class _RoundConfig(Config):
+    radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
+    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
+
+
+class CylinderConfig(_RoundConfig):
     """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), s the co-ordinate across the straight direction."""
 
     kind: Literal["cylinder"]
-    radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
     straight_along: Literal["x", "y"] = "y"
-    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
 
 
-class SphereConfig(Config):
+class SphereConfig(_RoundConfig):
     """A face that is part of a sphere: z = +-(sqrt(R^2 - x^2 - y^2) - R)."""
 
     kind: Literal["sphere"]
-    radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
-    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
 
 
 class TermConfig(Config):
@@ -86,12 +95,27 @@ class BoardConfig(Config):
     shape: ShapeConfig
 
 
-class HoleConfig(Config):
-    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
+class DamageConfig(Config):
+    """What holes and dents have in common."""
 
     id: DamageId
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     centre_mm: PlaceMm
+
+    @property
+    def centre_m(self) -> tuple[float, float]:
+        """Place in plan, metres."""
+        return self.centre_mm[0] * MM, self.centre_mm[1] * MM
+
+    @property
+    def radius_m(self) -> float:
+        """Declared radius in metres: of the drill, or of a dent's rim on a flat face."""
+        return self.diameter_mm * MM / 2
+
+
+class HoleConfig(DamageConfig):
+    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
+
     kind: Literal["through", "blind"] = "through"
     depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
 
@@ -104,13 +128,21 @@ class HoleConfig(Config):
         return self
 
 
-class DentConfig(Config):
+class DentConfig(DamageConfig):
     """A spherical cap: rim diameter and depth as a ball would leave them on a flat face."""
 
-    id: DamageId
-    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     depth_mm: Annotated[float, Field(ge=0.04, le=500.0)]
-    centre_mm: PlaceMm
+
+    @property
+    def kind(self) -> Literal["dent"]:
+        """Kind of damage, as `HoleConfig` has it."""
+        return "dent"
+
+    @property
+    def ball_m(self) -> float:
+        """Radius of the ball whose cap on a flat face has this rim and depth."""
+        depth_m = self.depth_mm * MM
+        return (self.radius_m**2 + depth_m**2) / (2 * depth_m)
 
 
 class TapeConfig(Config):
@@ -177,7 +209,7 @@ class WavelengthConfig(Config):
 
 
 class PoseConfig(Config):
-    """Where the face's centre is (camera axes), and how the board is turned: about its x, then y, then z."""
+    """Place of the face's centre (camera axes) and turns of the board: about its x, then y, then z."""
 
     distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(default=0.7, description="along the optical axis")
     offset_x_mm: Coordinate = 0.0
@@ -185,6 +217,19 @@ class PoseConfig(Config):
     tilt_x_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
     tilt_y_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
     roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
+
+    @property
+    def T_camera_board(self) -> np.ndarray:
+        """4x4: board to camera. The board is turned in its own axes (x, then y, then z), then set before the lens.
+
+        Positive ``tilt_x_deg`` brings the upper edge nearer, positive ``tilt_y_deg`` the -x edge, positive ``roll_deg``
+        lifts the +x edge.
+        """
+        T_camera_board = np.eye(4)
+        turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
+        T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
+        T_camera_board[:3, 3] = self.offset_x_mm * MM, self.offset_y_mm * MM, self.distance_m
+        return T_camera_board
 
 
 class TargetConfig(Config):
@@ -217,9 +262,49 @@ class TargetConfig(Config):
         return self.holes + self.dents
 
     def declare(self) -> TargetConfig:
-        """Itself: every kind of target answers ``declare()`` with the full declaration."""
+        """Return itself: every kind of target answers ``declare()`` with the full declaration."""
         return self
 
     def hole_free(self) -> TargetConfig:
-        """The same set-up with neither holes nor dents: what a threshold is calibrated on."""
+        """Return the same set-up with neither holes nor dents; a threshold is calibrated on it."""
         return self.model_copy(update={"holes": (), "dents": ()})
+
+    def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
+        """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
+
+        Raises UserError where the declaration has none for it, or lacks the albedo of one of its surfaces.
+        """
+        near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
+        from_850 = abs(wavelength_nm - 850.0)
+        if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):
+            return self.model_copy(update={"other_wavelengths": ()})
+        if not near:
+            known = sorted({850.0, *(albedos.wavelength_nm for albedos in self.other_wavelengths)})
+            raise UserError(
+                f"the target has no albedo at {wavelength_nm:g} nm",
+                legal=f"a camera within {NEAR_NM:g} nm of {', '.join(f'{nm:g}' for nm in known)} nm",
+                fix=f"declare other_wavelengths: [{{wavelength_nm: {wavelength_nm:g}, board: ..., tape: ..., ...}}]",
+            )
+        albedos = min(near, key=lambda albedos: abs(albedos.wavelength_nm - wavelength_nm))
+        room, lacking = self.room, []
+        changed: dict[str, Any] = {
+            "other_wavelengths": (),
+            "material": self.material.model_copy(update={"albedo_850": albedos.board}),
+        }
+        if self.tapes:
+            lacking += ["tape"] * (albedos.tape is None)
+            changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
+        if self.backing is not None:
+            lacking += ["backing"] * (albedos.backing is None)
+            changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
+        if room is not None:
+            lacking += ["floor"] * (room.floor_below_lens_m is not None and albedos.floor is None)
+            lacking += ["back_wall"] * (room.back_wall_distance_m is not None and albedos.back_wall is None)
+            named = {"floor_albedo_850": albedos.floor, "back_wall_albedo_850": albedos.back_wall}
+            changed["room"] = room.model_copy(update={key: value for key, value in named.items() if value is not None})
+        if lacking:
+            raise UserError(
+                f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}",
+                legal="an albedo for every surface that the target has",
+            )
+        return self.model_copy(update=changed)

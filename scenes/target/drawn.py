@@ -1,8 +1,8 @@
-"""A family of boards, drawn at random: what a detection limit is measured on.
+"""A family of boards, drawn at random, on which a detection limit is measured.
 
 Each board has so many holes or dents of random size, depth and place, its own grain, and stands before the camera in a
-random pose. Every quantity of every board has a random stream of its own, named by the family's seed, what the board
-is for and its number. So a board is the same however many others there are, and what is changed for an axis changes
+random pose. Every quantity of every board has a random stream of its own, named by the family's seed, the board's
+purpose and its number. So a board is the same however many others there are, and what is changed for an axis changes
 nothing else: at another distance, albedo, kind of hole or depth the boards keep their places, sizes and tilts, and
 their results are paired.
 
@@ -17,13 +17,14 @@ from itertools import product
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
-from scenes.target.checks import LEAST_WEB_MM, WIDEST_BEND
+from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.custom import (
     Albedo,
     BackingConfig,
@@ -39,22 +40,100 @@ from scenes.target.custom import (
     TargetConfig,
     WavelengthConfig,
 )
-from scenes.target.drawn_damage import DrawnDamage, damages_of, depth_problems
-from scenes.target.face import face_of, face_points_board_m, outline_board_m
-from scenes.target.places import free_half_mm, random_places_mm
-from scenes.target.pose import T_camera_board_of
-from scenes.target.surroundings import backing_corners_board_m
+from scenes.target.face import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
 Purpose = Literal["calibration", "hole_free", "damaged"]
-"""What boards are for: to set a threshold, to count false calls, to be inspected; each has boards of its own."""
+"""Purpose of boards: to set a threshold, to count false calls, to be inspected; each has boards of its own."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
-"""Of a pose's distance, jitter included."""
+"""Limits of a pose's distance, jitter included."""
 WIDEST_BACKING_MM = 1e4
-"""What a declaration of a backing allows."""
+"""Widest backing that a declaration allows."""
+ATTEMPTS, TRIES = 50, 400
+"""Boards begun anew, and places tried for each damage of one: with discs of the diameter ``apart_mm`` over 40 % of the
+free area (the most that random placement reaches is 54.7 %) one attempt in three or more fills a board."""
+
+
+def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError(f"the lower limit {limits[0]:g} is above the upper limit {limits[1]:g}")
+    return limits
+
+
+Diameter = Annotated[float, Field(ge=0.2, le=1e3)]
+Diameters = Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
+Depth = Annotated[float, Field(ge=0.04, le=500.0)]
+Depths = Annotated[tuple[Depth, Depth], AfterValidator(_ascending)]
+
+
+class DrawnThrough(Config):
+    """Holes drilled through: number and sizes, as of every kind of drawn damage.
+
+    The range of sizes is parted into ``per_board`` equal parts, and every board has one size from each, uniform within
+    it: over all boards sizes are uniform, and each board covers the range evenly.
+    """
+
+    kind: Literal["through"]
+    per_board: Annotated[int, Field(ge=1, le=100)]
+    diameter_mm: Diameters
+    sizes: Literal["uniform", "log"] = Field(
+        default="uniform",
+        description="uniform in the diameter, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
+    )
+
+    def diameters_mm(self, rng: np.random.Generator) -> list[float]:
+        """Draw a size from each part of the range, ascending."""
+        low, high = self.diameter_mm
+        quantiles = (np.arange(self.per_board) + rng.random(self.per_board)) / self.per_board
+        sizes = low * (high / low) ** quantiles if self.sizes == "log" else low + (high - low) * quantiles
+        drawn: list[float] = np.clip(sizes, low, high).tolist()
+        return drawn
+
+    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float] | None:
+        """Return the declared depths that damage of this size can have on a face of this curvature.
+
+        There is none if low > high; None for damage without a depth of its own.
+        """
+        return None
+
+
+class DrawnBlind(DrawnThrough):
+    """Holes with a flat bottom. Depths are uniform, one from each of ``per_board`` equal parts of their range, in
+    random order: size and depth are independent."""
+
+    kind: Literal["blind"]  # type: ignore[assignment]
+    depth_mm: Depths
+
+    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
+        """See `DrawnThrough`."""
+        return self.depth_mm
+
+
+class DrawnDents(DrawnThrough):
+    """Spherical caps. Depths as of blind holes, but of that part of the range which is legal for the dent's size: no
+    deeper than its radius, and on a bent face no shallower than its ball allows (`scenes.target.checks`)."""
+
+    kind: Literal["dent"]  # type: ignore[assignment]
+    depth_mm: Depths
+
+    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
+        """See `DrawnThrough`."""
+        return max(self.depth_mm[0], shallowest_mm(diameter_mm, bend_per_mm)), min(self.depth_mm[1], diameter_mm / 2)
+
+
+DrawnDamage = Annotated[DrawnThrough | DrawnBlind | DrawnDents, Field(discriminator="kind")]
+
+
+def shallowest_mm(diameter_mm: float, bend_per_mm: float) -> float:
+    """Return the depth of a dent whose ball's radius is `SHALLOWEST_BEND` of a face's radius of curvature; 0 on a flat
+    face."""
+    reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
+    if reach >= 1:
+        return diameter_mm / 2
+    return diameter_mm / 2 * reach / (1 + math.sqrt(1 - reach**2))
 
 
 class DrawnMaterialConfig(Config):
-    """As MaterialConfig, but every board has a grain of its own."""
+    """Reflectance of the boards, as in MaterialConfig, but every board has a grain of its own."""
 
     albedo_850: Albedo = Field(default=0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
     rgb: Rgb = (0.55, 0.42, 0.28)
@@ -64,13 +143,9 @@ class DrawnMaterialConfig(Config):
     )
 
 
-def _default_board() -> BoardConfig:
-    return BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=FlatConfig())
-
-
 class DrawnTargetConfig(Config):
-    """A family of boards. ``drawn`` gives the full declaration of any of them, ``declare`` that of the first damaged
-    one. Limits named ``..._mm`` and ``..._deg`` of the pose are the ends of uniform distributions about 0."""
+    """A family of boards. ``drawn`` gives the full declaration of any board, ``declare`` that of the first damaged
+    board. Limits named ``..._mm`` and ``..._deg`` of the pose are the ends of uniform distributions about 0."""
 
     name: Literal["drawn"] = "drawn"
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
@@ -78,7 +153,7 @@ class DrawnTargetConfig(Config):
     )
     damage: DrawnDamage
     board: BoardConfig = Field(
-        default_factory=_default_board,
+        default_factory=lambda: BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=FlatConfig()),
         description="the thesis' half an inch of plywood, of 12 x 8 in: its face has as many pixels as the thesis' "
         "board of 24 x 4.5 in, and less of it lies near the edge",
     )
@@ -122,20 +197,39 @@ class DrawnTargetConfig(Config):
         default=(), description="for cameras that do not work near 850 nm"
     )
 
-    # ---- what fits together -----------------------------------------------------------------------------------------
-
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        problems = depth_problems(self.damage, self.board.thickness_mm, self._bend_per_mm) + self._bend_problems()
+        damage, board, bend_per_mm, problems = self.damage, self.board, self._bend_per_mm, []
+        if isinstance(damage, DrawnBlind | DrawnDents) and damage.depth_mm[1] >= board.thickness_mm:
+            problems.append(
+                f"damage.depth_mm: {damage.depth_mm[1]:g} mm is not less than the board's thickness, "
+                f"{board.thickness_mm:g} mm"
+            )
+        if isinstance(damage, DrawnDents):
+            # Both limits of a depth grow with the diameter, so the ends of the sizes tell for all.
+            for diameter_mm in sorted(set(damage.diameter_mm)):
+                least_mm, most_mm = damage.legal_depths_mm(diameter_mm, bend_per_mm)
+                if least_mm > most_mm:
+                    problems.append(
+                        f"damage.depth_mm: a dent {diameter_mm:g} mm wide on this face can be "
+                        f"{shallowest_mm(diameter_mm, bend_per_mm):.3g} to {diameter_mm / 2:g} mm deep, not "
+                        f"{damage.depth_mm[0]:g} to {damage.depth_mm[1]:g} mm"
+                    )
+        widest_mm = damage.diameter_mm[1]
+        if widest_mm / 2 * bend_per_mm > WIDEST_BEND:
+            problems.append(
+                f"damage.diameter_mm: {widest_mm:g} mm is too wide for a face bent to a radius of "
+                f"{1 / bend_per_mm:.3g} mm"
+            )
         needed_mm = 2 * self._rim_mm * self._shrinkage + LEAST_WEB_MM
         if self.apart_mm < needed_mm:
             problems.append(
-                f"apart_mm: {self.apart_mm:g} mm lets holes of {self.damage.diameter_mm[1]:g} mm meet; it must be "
+                f"apart_mm: {self.apart_mm:g} mm lets holes of {widest_mm:g} mm meet; it must be "
                 f"{needed_mm:.4g} mm or more"
             )
-        if free_half_mm(self.board, self._margin_mm).min() < 0:
+        if self._free_half_mm.min() < 0:
             problems.append(
-                f"board: {self.board.width_mm:g} x {self.board.height_mm:g} mm leaves no place for a centre that is "
+                f"board: {board.width_mm:g} x {board.height_mm:g} mm leaves no place for a centre that is "
                 f"{self._margin_mm:.4g} mm off every edge"
             )
         jitter_m = self.distance_jitter_mm * MM
@@ -148,107 +242,125 @@ class DrawnTargetConfig(Config):
             raise ValueError("; ".join(problems))
         return self
 
-    def _bend_problems(self) -> list[str]:
-        widest_mm = self.damage.diameter_mm[1]
-        if widest_mm / 2 * self._bend_per_mm > WIDEST_BEND:
-            radius_mm = 1 / self._bend_per_mm
-            return [
-                f"damage.diameter_mm: {widest_mm:g} mm is too wide for a face bent to a radius of {radius_mm:.3g} mm"
-            ]
-        return []
-
     @property
     def _bend_per_mm(self) -> float:
         return _tightest_per_mm(self.board)
 
     @property
     def _shrinkage(self) -> float:
-        """How much wider apart, in plan, axes along a bent face's normals must start so as not to meet within the
-        board: parallel surfaces at a depth t shrink by 1 - t / radius of curvature."""
+        """Factor by which axes along a bent face's normals must start farther apart, in plan, so as not to meet within
+        the board: parallel surfaces at a depth t shrink by 1 - t / radius of curvature."""
         return 1 / (1 - min(self.board.thickness_mm * self._bend_per_mm, 0.5))
 
     @property
     def _rim_mm(self) -> float:
-        """The largest radius of a rim. A dent's on a face that bends away is up to sqrt 2 larger than on a flat one;
+        """Largest radius of a rim. A dent's on a face that bends away is up to sqrt 2 larger than on a flat one;
         allowed for with holes too, so that the kind of damage does not change its places."""
         return self.damage.diameter_mm[1] / 2 * (math.sqrt(2) if self._bend_per_mm > 0 else 1.0)
 
     @property
     def _margin_mm(self) -> float:
-        """Of centres from the edge: the same for all sizes, so that size and place are independent."""
+        """Least distance of centres from the edge: the same for all sizes, so that size and place are independent."""
         return (self.edge_mm + self._rim_mm) * self._shrinkage
+
+    @property
+    def _free_half_mm(self) -> np.ndarray:
+        """Half the width and height (2,) of the rectangle in which centres may lie; negative where there is none."""
+        return np.array([self.board.width_mm, self.board.height_mm]) / 2 - self._margin_mm
 
     # ---- boards -----------------------------------------------------------------------------------------------------
 
     def declare(self) -> TargetConfig:
-        """The first damaged board: what programs see that look at one target."""
+        """Return the first damaged board, for programs that look at one target."""
         return self.drawn("damaged", 0)
 
     def drawn(self, purpose: Purpose, number: int) -> TargetConfig:
-        """One board of the family, with its damage; ids count from 1 in the order of size.
+        """Return a board of the family, with its damage; ids count from 1 in the order of size.
 
         Boards that are to be hole-free have damage too: call ``hole_free()`` on the answer, and what was left out
         are unflawed sites, placed as damage is. Raises UserError where the board is too full for the damage.
         """
-        holes, dents = self._damages(purpose, number)
-        grain_seed = int(self._stream(purpose, number, "grain").integers(2**32))
-        config = TargetConfig(
-            board=self.board,
-            holes=holes,
-            dents=dents,
-            tapes=self.tapes,
-            material=MaterialConfig(**self.material.model_dump(), grain_seed=grain_seed),
-            backing=self.backing,
-            room=self.room,
-            pose=self._pose(purpose, number),
-            other_wavelengths=self.other_wavelengths,
-        )
-        return self._filled(config)
 
-    def extreme_poses(self) -> tuple[PoseConfig, ...]:
-        """The corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways and
-        upwards: what is in view in all of these is in view in every pose."""
-        diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
-        rolls = [self.roll_deg, *(one for one in (diagonal_deg, 90 - diagonal_deg) if one < self.roll_deg)]
-        corners = product(
-            _both_signs(self.distance_jitter_mm),
-            _both_signs(self.offset_mm),
-            _both_signs(self.offset_mm),
-            _both_signs(self.tilt_deg),
-            _both_signs(self.tilt_deg),
-            [signed for roll in rolls for signed in _both_signs(roll)],
-        )
-        return tuple(self._posed(*corner) for corner in corners)
+        def stream(quantity: str) -> np.random.Generator:
+            return random_stream(self.seed, "drawn board", purpose, number, quantity)
 
-    def _stream(self, purpose: Purpose, number: int, quantity: str) -> np.random.Generator:
-        return random_stream(self.seed, "drawn board", purpose, number, quantity)
-
-    def _damages(self, purpose: Purpose, number: int) -> tuple[tuple[HoleConfig, ...], tuple[DentConfig, ...]]:
-        count, depths = self.damage.per_board, self._stream(purpose, number, "depths")
-        diameters = self.damage.diameters_mm(self._stream(purpose, number, "diameters"))
-        quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
-        # What is placed first has the freest choice: which size that is, is drawn too.
-        places = self._stream(purpose, number, "order of places").permutation(self._places_mm(purpose, number))
-        return damages_of(self.damage, diameters, quantiles, places, self._bend_per_mm)
-
-    def _places_mm(self, purpose: Purpose, number: int) -> np.ndarray:
-        return random_places_mm(
-            self.board,
-            self.tapes,
-            self.damage.per_board,
-            apart_mm=self.apart_mm,
-            margin_mm=self._margin_mm,
-            rim_mm=self._rim_mm,
-            rng=self._stream(purpose, number, "places"),
-        )
-
-    def _pose(self, purpose: Purpose, number: int) -> PoseConfig:
         def within(quantity: str, limit: float, count: int) -> list[float]:
-            drawn: list[float] = (limit * self._stream(purpose, number, quantity).uniform(-1.0, 1.0, count)).tolist()
+            drawn: list[float] = (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
             return drawn
 
-        jitter, offsets = within("distance", self.distance_jitter_mm, 1), within("offset", self.offset_mm, 2)
-        return self._posed(*jitter, *offsets, *within("tilt", self.tilt_deg, 2), *within("roll", self.roll_deg, 1))
+        count, depths = self.damage.per_board, stream("depths")
+        quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
+        # What is placed first has the freest choice: which size that is, is drawn too.
+        places_mm = stream("order of places").permutation(self._places_mm(stream("places"))).tolist()
+        holes: list[HoleConfig] = []
+        dents: list[DentConfig] = []
+        rows = zip(self.damage.diameters_mm(stream("diameters")), quantiles, places_mm, strict=True)
+        for place, (size, quantile, (x, y)) in enumerate(rows, start=1):
+            legal, depth = self.damage.legal_depths_mm(size, self._bend_per_mm), None
+            if legal is not None:
+                depth = float(min(legal[0] + (legal[1] - legal[0]) * quantile, legal[1]))
+            if self.damage.kind == "dent":
+                assert depth is not None
+                dents.append(DentConfig(id=place, diameter_mm=size, depth_mm=depth, centre_mm=(x, y)))
+            else:
+                holes.append(
+                    HoleConfig(id=place, diameter_mm=size, centre_mm=(x, y), kind=self.damage.kind, depth_mm=depth)
+                )
+        pose = (
+            *within("distance", self.distance_jitter_mm, 1),
+            *within("offset", self.offset_mm, 2),
+            *within("tilt", self.tilt_deg, 2),
+            *within("roll", self.roll_deg, 1),
+        )
+        config = TargetConfig(
+            board=self.board,
+            holes=tuple(holes),
+            dents=tuple(dents),
+            tapes=self.tapes,
+            material=MaterialConfig(**self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))),
+            backing=self.backing,
+            room=self.room,
+            pose=self._posed(*pose),
+            other_wavelengths=self.other_wavelengths,
+        )
+        if self.backing is None or self.backing.size_mm is not None:
+            return config
+        # a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses
+        size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
+        return config.model_copy(update={"backing": self.backing.model_copy(update={"size_mm": size_mm})})
+
+    def extreme_poses(self) -> tuple[PoseConfig, ...]:
+        """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways
+        and upwards: what is in view in all of these is in view in every pose."""
+        diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
+        rolls = [self.roll_deg, *(roll for roll in (diagonal_deg, 90 - diagonal_deg) if roll < self.roll_deg)]
+        limits = (self.distance_jitter_mm, self.offset_mm, self.offset_mm, self.tilt_deg, self.tilt_deg)
+        signed = [signed for roll in rolls for signed in _both_signs(roll)]
+        return tuple(self._posed(*corner) for corner in product(*map(_both_signs, limits), signed))
+
+    def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free: apart from one
+        another, off the board's edge and off any tape."""
+        half, count, best = self._free_half_mm, self.damage.per_board, 0
+        for _ in range(ATTEMPTS):
+            places = np.empty((0, 2))
+            while len(places) < count:
+                tried = half * rng.uniform(-1.0, 1.0, (TRIES, 2))
+                free = np.all([off_tape_mm(tape, tried) > self._rim_mm for tape in self.tapes], axis=0)
+                free = free & (np.linalg.norm(tried[:, None] - places, axis=-1) >= self.apart_mm).all(axis=1)
+                if not free.any():
+                    break
+                places = np.vstack([places, tried[np.argmax(free)]])
+            best = max(best, len(places))
+            if best == count:
+                return places
+        raise UserError(
+            f"a board of {self.board.width_mm:g} x {self.board.height_mm:g} mm is too full for {count} damages whose "
+            f"centres are {self.apart_mm:g} mm apart and {self._margin_mm:.4g} mm off its edge: {best} found a place "
+            f"on the {2 * half[0]:g} x {2 * half[1]:g} mm that are left",
+            legal=f"fewer than {best} damages on this board" if best > 1 else None,
+            fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board",
+        )
 
     def _posed(
         self, jitter_mm: float, x_mm: float, y_mm: float, tilt_x: float, tilt_y: float, roll: float
@@ -262,29 +374,21 @@ class DrawnTargetConfig(Config):
             roll_deg=roll,
         )
 
-    def _filled(self, config: TargetConfig) -> TargetConfig:
-        """With a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses."""
-        backing = config.backing
-        if backing is None or backing.size_mm is not None:
-            return config
-        size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, backing)[0, 2]))
-        return config.model_copy(update={"backing": backing.model_copy(update={"size_mm": size_mm})})
-
 
 @lru_cache(maxsize=256)
 def _tightest_per_mm(board: BoardConfig) -> float:
-    """A face's largest curvature; 0 where its shape does not reach, which `check_target` tells."""
-    x_m, y_m = face_points_board_m(board)[:, :2].T
+    """Return a face's largest curvature; 0 where its shape does not reach, which `check_target` tells."""
+    x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T
     tightest = float(np.abs(face_of(board).curvatures(x_m, y_m)).max()) * MM
     return tightest if math.isfinite(tightest) else 0.0
 
 
 @lru_cache(maxsize=256)
 def _backing_size_mm(family: DrawnTargetConfig, z_m: float) -> tuple[float, float]:
-    """Width and height of the face's shadows from the lens, in all extreme poses, on a plane at this board z."""
+    """Return width and height of the face's shadows from the lens, in all extreme poses, on a plane at this board z."""
     outline, half_m = outline_board_m(family.board), np.zeros(2)
     for pose in family.extreme_poses():
-        lens = invert(T_camera_board_of(pose))[:3, 3]
+        lens = invert(pose.T_camera_board)[:3, 3]
         steps = (z_m - lens[2]) / (outline[:, 2] - lens[2])
         half_m = np.maximum(half_m, np.abs(lens + steps[:, None] * (outline - lens))[:, :2].max(axis=0))
     width, height = np.minimum(2 * half_m / MM, WIDEST_BACKING_MM).tolist()

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
 from harness.vocabulary.versions import RESULTS_VERSION
-from scenes.target.mesh import Part, Target
-from scenes.target.truth import to_rows
-
-if TYPE_CHECKING:
-    import trimesh
+from scenes.target.mesh import Target
 
 MESH_SUFFIXES = (".glb", ".ply")
 
@@ -36,17 +31,13 @@ def write_mesh(target: Target, path: Path) -> None:
 def write_truth(target: Target, path: Path) -> None:
     """Write the truth as JSON: the version, the declaration, ``T_camera_board`` (metres) and one row in millimetres per
     damage."""
-    write_text(path, json.dumps(truth_data(target), indent=2) + "\n")
-
-
-def truth_data(target: Target) -> dict[str, Any]:
-    """The truth as plain data."""
-    return {
+    data = {
         "results_version": RESULTS_VERSION,
         "target": target.config.to_data(),
         "T_camera_board": target.T_camera_board.tolist(),
-        "damages": to_rows(target.truth),
+        "damages": [damage.to_row() for damage in target.truth],
     }
+    write_text(path, json.dumps(data, indent=2) + "\n")
 
 
 def _ply(target: Target) -> bytes:
@@ -61,33 +52,28 @@ def _ply(target: Target) -> bytes:
 
 def _glb(target: Target) -> bytes:
     import trimesh
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
 
     scene = trimesh.Scene()
     upright = np.diag([1.0, -1.0, -1.0, 1.0])
     for part in target.parts:
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "name": part.name}
+        if part.uv is None or part.texture_rgb is None:
+            material = PBRMaterial(baseColorFactor=[*part.rgb, 1.0], **rough)
+            visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(part.mesh.vertices), 2)), material=material)
+        else:
+            material = PBRMaterial(baseColorTexture=Image.fromarray(_srgb_bytes(part.texture_rgb)), **rough)
+            # trimesh counts v upwards from the image's lower edge.
+            visual = trimesh.visual.TextureVisuals(uv=part.uv * (1, -1) + (0, 1), material=material)
+        mesh = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
         # No normals: glTF viewers then shade each facet flat, which keeps the rims of holes sharp.
-        scene.add_geometry(_gltf_mesh(part), node_name=part.name, geom_name=part.name, transform=upright)
+        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name, transform=upright)
     return scene.export(file_type="glb", include_normals=False)
 
 
-def _gltf_mesh(part: Part) -> trimesh.Trimesh:
-    import trimesh
-    from PIL import Image
-    from trimesh.visual.material import PBRMaterial
-
-    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "name": part.name}
-    if part.uv is None or part.texture_rgb is None:
-        material = PBRMaterial(baseColorFactor=[*part.rgb, 1.0], **rough)
-        visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(part.mesh.vertices), 2)), material=material)
-    else:
-        material = PBRMaterial(baseColorTexture=Image.fromarray(_srgb_bytes(part.texture_rgb)), **rough)
-        # trimesh counts v upwards from the image's lower edge.
-        visual = trimesh.visual.TextureVisuals(uv=part.uv * (1, -1) + (0, 1), material=material)
-    return trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
-
-
 def _srgb_bytes(linear: np.ndarray) -> np.ndarray:
-    """Linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
+    """Return linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
     linear = np.asarray(linear, dtype=float)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
     return np.round(255 * encoded).astype(np.uint8)

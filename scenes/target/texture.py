@@ -1,9 +1,4 @@
-"""Wood grain: a seeded pattern of dark lines and fibres along x, and the look-up of a texture.
-
-Convention. A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x),
-v = 1/2 - y / height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is
-at u = (column + 1/2) / columns, v = (row + 1/2) / rows; between centres bilinear, beyond the outermost constant.
-"""
+"""Wood grain: a seeded pattern of dark lines and fibres along x; look-up of a texture (see `scenes.target.mesh`)."""
 
 from __future__ import annotations
 
@@ -17,17 +12,17 @@ from scenes.target.custom import MaterialConfig
 TEXEL_MM = 0.6
 """Finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera in view), coarse enough to make in 40 ms."""
 MAX_TEXELS = 4096
-"""Along one side: a board of metres gets coarser texels instead of gigabytes."""
+"""Most texels along a side: a board of metres gets coarser texels instead of gigabytes."""
 LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6
 """Amplitudes of growth lines and fibres in the pattern (their squares add to 1). A guess."""
 WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0
-"""How far growth lines wander (standard deviation), and over what lengths across and along x. A guess."""
+"""Wander of growth lines (standard deviation), and its lengths across and along x. A guess."""
 FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5
 """Correlation lengths of the fibres along and across x. A guess."""
 
 
 def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
-    """The grain of a board's face: (rows, columns) float64 with mean 0 and standard deviation 1.
+    """Return the grain of a board's face: (rows, columns) float64 with mean 0 and standard deviation 1.
 
     Not modelled: knots, seams of the veneer, gloss, a contrast that depends on the wavelength.
     """
@@ -44,7 +39,7 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
 
 
 def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray:
-    """Albedo (rows, columns) float32 with exactly this mean: mean (1 + contrast pattern), clipped to 0..1.
+    """Return albedo (rows, columns) float32 with exactly this mean: mean (1 + contrast pattern), clipped to 0..1.
 
     Where clipping would move the mean, the pattern is lifted to bring it back; the contrast then falls short.
     """
@@ -58,7 +53,7 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
 
 
 def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear values (...[, channels]) of a texture (rows, columns[, channels]) at ``uv`` (..., 2)."""
+    """Return bilinear values (...[, channels]) of a texture (rows, columns[, channels]) at ``uv`` (..., 2)."""
     rows, columns = texture.shape[:2]
     places = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
     channels = texture.reshape(rows, columns, -1)
@@ -67,7 +62,7 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def _wander(stream: np.random.Generator, shape: tuple[int, int], texel_mm: float) -> np.ndarray:
-    """A slow random field, mean 0 and deviation 1: coarse noise through a cubic spline."""
+    """Draw a slow random field, mean 0 and deviation 1: coarse noise through a cubic spline."""
     knots = [2 + round(n * texel_mm / s) for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)]
     coarse = stream.standard_normal(knots)
     return _normalised(zoom(coarse, [n / k for n, k in zip(shape, knots, strict=True)], order=3, mode="nearest"))
@@ -76,7 +71,7 @@ def _wander(stream: np.random.Generator, shape: tuple[int, int], texel_mm: float
 def _smooth_noise(
     stream: np.random.Generator, shape: tuple[int, int], texel_mm: float, across_mm: float, along_mm: float
 ) -> np.ndarray:
-    """Gaussian noise filtered to correlation lengths across (rows) and along (columns), mean 0 and deviation 1."""
+    """Draw Gaussian noise filtered to correlation lengths across (rows) and along (columns), mean 0 and deviation 1."""
     noise = stream.standard_normal(shape, dtype=np.float32)
     return _normalised(
         gaussian_filter(noise, (across_mm / texel_mm, along_mm / texel_mm), mode="reflect", truncate=3.0)

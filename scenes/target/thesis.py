@@ -8,8 +8,7 @@ reason, fixed before any claim was scored, and a range over which it is plausibl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -39,7 +38,7 @@ DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 
 
 
 def _open(default: Any, plausible: list[Any], reason: str) -> Any:
-    """A field for an open fact: its default, the values over which a verdict should be tried, and the reason."""
+    """Declare an open fact: its default, the values over which a verdict should be tried, and the reason."""
     return Field(default=default, description=reason, json_schema_extra={"plausible": plausible})
 
 
@@ -133,7 +132,18 @@ class ThesisTargetConfig(Config):
     )
 
     def declare(self) -> TargetConfig:
-        """The full declaration. Whether the parts fit together is checked when it is built."""
+        """Return the full declaration. Whether the parts fit together is checked when it is built."""
+        middle = (len(DIAMETERS_IN) - 1) / 2
+        backing = room = None
+        if self.backing_distance_mm is not None:
+            backing = BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
+        if self.floor_below_lens_m is not None or self.back_wall_distance_m is not None:
+            room = RoomConfig(
+                floor_below_lens_m=self.floor_below_lens_m,
+                floor_albedo_850=self.floor_albedo_850,
+                back_wall_distance_m=self.back_wall_distance_m,
+                back_wall_albedo_850=self.back_wall_albedo_850,
+            )
         return TargetConfig(
             board=BoardConfig(
                 width_mm=self.board_width_mm,
@@ -141,8 +151,28 @@ class ThesisTargetConfig(Config):
                 thickness_mm=THICKNESS_MM,
                 shape=FlatConfig(),
             ),
-            holes=self._holes(),
-            tapes=self._tapes(),
+            # hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle
+            holes=tuple(
+                HoleConfig(
+                    id=number,
+                    diameter_mm=round(diameter_in * INCH / MM, 6),
+                    centre_mm=(round((number - 1 - middle) * self.hole_spacing_mm, 6), self.row_offset_y_mm),
+                    kind=self.hole_kind,
+                    depth_mm=self.blind_depth_mm if self.hole_kind == "blind" else None,
+                )
+                for number, diameter_in in enumerate(DIAMETERS_IN, start=1)
+            ),
+            tapes=tuple(
+                TapeConfig(
+                    centre_mm=(side_x * self.tape_x_mm, side_y * self.tape_y_mm),
+                    size_mm=(self.tape_length_mm, self.tape_width_mm),
+                    rgb=self.tape_rgb,
+                    albedo_850=self.tape_albedo_850,
+                    thickness_mm=self.tape_thickness_mm,
+                )
+                for side_y in (1, -1)
+                for side_x in (-1, 1)
+            ),
             material=MaterialConfig(
                 albedo_850=self.plywood_albedo_850,
                 rgb=self.plywood_rgb,
@@ -150,78 +180,8 @@ class ThesisTargetConfig(Config):
                 grain_period_mm=self.grain_period_mm,
                 grain_seed=self.grain_seed,
             ),
-            backing=self._backing(),
-            room=self._room(),
-            pose=PoseConfig(
-                distance_m=self.distance_m,
-                offset_x_mm=self.offset_x_mm,
-                offset_y_mm=self.offset_y_mm,
-                tilt_x_deg=self.tilt_x_deg,
-                tilt_y_deg=self.tilt_y_deg,
-                roll_deg=self.roll_deg,
-            ),
+            backing=backing,
+            room=room,
+            pose=PoseConfig(**{key: getattr(self, key) for key in PoseConfig.model_fields}),
             other_wavelengths=self.other_wavelengths,
         )
-
-    def _holes(self) -> tuple[HoleConfig, ...]:
-        """Hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle."""
-        middle = (len(DIAMETERS_IN) - 1) / 2
-        return tuple(
-            HoleConfig(
-                id=number,
-                diameter_mm=round(diameter_in * INCH / MM, 6),
-                centre_mm=(round((number - 1 - middle) * self.hole_spacing_mm, 6), self.row_offset_y_mm),
-                kind=self.hole_kind,
-                depth_mm=self.blind_depth_mm if self.hole_kind == "blind" else None,
-            )
-            for number, diameter_in in enumerate(DIAMETERS_IN, start=1)
-        )
-
-    def _tapes(self) -> tuple[TapeConfig, ...]:
-        return tuple(
-            TapeConfig(
-                centre_mm=(side_x * self.tape_x_mm, side_y * self.tape_y_mm),
-                size_mm=(self.tape_length_mm, self.tape_width_mm),
-                rgb=self.tape_rgb,
-                albedo_850=self.tape_albedo_850,
-                thickness_mm=self.tape_thickness_mm,
-            )
-            for side_y in (1, -1)
-            for side_x in (-1, 1)
-        )
-
-    def _backing(self) -> BackingConfig | None:
-        if self.backing_distance_mm is None:
-            return None
-        return BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
-
-    def _room(self) -> RoomConfig | None:
-        if self.floor_below_lens_m is None and self.back_wall_distance_m is None:
-            return None
-        return RoomConfig(
-            floor_below_lens_m=self.floor_below_lens_m,
-            floor_albedo_850=self.floor_albedo_850,
-            back_wall_distance_m=self.back_wall_distance_m,
-            back_wall_albedo_850=self.back_wall_albedo_850,
-        )
-
-
-@dataclass(frozen=True)
-class OpenFact:
-    """A fact that the source leaves open: the field that holds it, its default, the values to try, and why."""
-
-    field: str
-    default: Any
-    plausible: tuple[Any, ...]
-    reason: str
-
-
-def open_facts() -> tuple[OpenFact, ...]:
-    """Every open fact of the thesis' target, for a report that shows how verdicts depend on them."""
-    return tuple(
-        OpenFact(
-            name, field.default, tuple(cast("list[Any]", field.json_schema_extra["plausible"])), field.description or ""
-        )
-        for name, field in ThesisTargetConfig.model_fields.items()
-        if isinstance(field.json_schema_extra, dict)
-    )

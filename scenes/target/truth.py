@@ -1,4 +1,4 @@
-"""The truth: what was taken out of the board, where, and how much."""
+"""The truth: which material was taken out of the board, its place and its volume."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scenes.target.face import Face, face_of
 
 @dataclass(frozen=True)
 class Damage:
-    """One hole or dent.
+    """A hole or dent.
 
     ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's unit normal there, out of the board.
     ``depth_m``: of the material removed, along the axis; for a through-hole the board's thickness, so the gap to a
@@ -35,7 +35,7 @@ class Damage:
     axis_camera: np.ndarray
 
     def to_row(self) -> dict[str, Any]:
-        """Plain data in millimetres, one flat row for JSON or a table."""
+        """Return plain data in millimetres, one flat row for JSON or a table."""
         row: dict[str, Any] = {
             "id": self.id,
             "kind": self.kind,
@@ -43,81 +43,54 @@ class Damage:
             "depth_mm": self.depth_m / MM,
             "volume_mm3": self.volume_m3 / MM**3,
         }
-        for frame, centre_m, axis in (
-            ("board", self.centre_board_m, self.axis_board),
-            ("camera", self.centre_camera_m, self.axis_camera),
-        ):
+        places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
+        for frame, (centre_m, axis) in places.items():
             row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
             row |= {f"axis_{a}_{frame}": float(value) for a, value in zip("xyz", axis, strict=True)}
         return row
 
 
-def to_rows(truth: tuple[Damage, ...]) -> list[dict[str, Any]]:
-    """One row per damage, in millimetres."""
-    return [damage.to_row() for damage in truth]
-
-
 def truth_of(config: TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
-    """The truth of a declaration: holes, then dents, in the order of their declaration."""
-    face = face_of(config.board)
-    thickness_m = config.board.thickness_mm * MM
-    return tuple(_damage(item, face, thickness_m, T_camera_board) for item in config.damages)
-
-
-def _damage(item: HoleConfig | DentConfig, face: Face, thickness_m: float, T_camera_board: np.ndarray) -> Damage:
-    x_m, y_m = (np.asarray(value * MM) for value in item.centre_mm)
-    bends = face.curvatures(x_m, y_m)
-    kind: Literal["through", "blind", "dent"] = "dent" if isinstance(item, DentConfig) else item.kind
-    radius_m = item.diameter_mm * MM / 2
-    depth_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
-    if kind == "dent":
-        radius_m, volume_m3 = _dent_on_face(radius_m, depth_m, bends)
-    else:
-        volume_m3 = (
-            math.pi * radius_m**2 * (depth_m + _mean_lift_m(radius_m, bends, depth_m if kind == "through" else None))
+    """Return the truth of a declaration: holes, then dents, in the order of their declaration."""
+    face, truth = face_of(config.board), []
+    for item in config.damages:
+        centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.normal, face.curvatures))
+        radius_m = item.radius_m
+        depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
+        if isinstance(item, DentConfig):
+            # The sphere's curvature gives paraboloids of the two principal curvatures the same volume as the face;
+            # exact on flat and spherical faces.
+            bend = (math.sqrt(float(np.prod(1 + item.ball_m * bends))) - 1) / item.ball_m
+            radius_m, volume_m3 = _lens(item, bend)
+        else:
+            # Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) / 8 lower
+            # on average than at the centre. The back of a through-hole is a parallel surface, curvatures k / (1 - t k).
+            back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
+            lift_m = radius_m**2 / 8 * (back - float(bends.sum()))
+            volume_m3 = math.pi * radius_m**2 * (depth_m + lift_m)
+        truth.append(
+            Damage(
+                item.id,
+                item.kind,
+                2 * radius_m,
+                depth_m,
+                volume_m3,
+                centre,
+                axis,
+                transform_points(T_camera_board, centre),
+                rotate_vectors(T_camera_board, axis),
+            )
         )
-    centre, axis = face.point(x_m, y_m), face.normal(x_m, y_m)
-    return Damage(
-        id=item.id,
-        kind=kind,
-        diameter_m=2 * radius_m,
-        depth_m=depth_m,
-        volume_m3=volume_m3,
-        centre_board_m=centre,
-        axis_board=axis,
-        centre_camera_m=transform_points(T_camera_board, centre),
-        axis_camera=rotate_vectors(T_camera_board, axis),
-    )
+    return tuple(truth)
 
 
-def _mean_lift_m(radius_m: float, bends: np.ndarray, thickness_m: float | None) -> float:
-    """How much longer than at its centre a hole is on average, to second order in the face's curvature.
-
-    Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) / 8 lower on average
-    than at the centre. The back face of a through-hole is a parallel surface with curvatures k / (1 - t k).
-    """
-    front = float(bends.sum())
-    back = 0.0 if thickness_m is None else float((bends / (1 - thickness_m * bends)).sum())
-    return radius_m**2 / 8 * (back - front)
-
-
-def _dent_on_face(radius_m: float, depth_m: float, bends: np.ndarray) -> tuple[float, float]:
-    """Rim radius (by equal area) and volume of a ball's dent: what the ball shares with a sphere in place of the face.
-
-    The sphere's curvature gives paraboloids of the two principal curvatures the same volume; exact on flat and
-    spherical faces.
-    """
-    ball_m = ball_radius_m(radius_m, depth_m)
-    return _lens(radius_m, depth_m, (math.sqrt(float(np.prod(1 + ball_m * bends))) - 1) / ball_m)
-
-
-def _lens(radius_m: float, depth_m: float, bend: float) -> tuple[float, float]:
-    """Rim radius and volume that a ball (on a flat: a cap of radius, depth) shares with a sphere of curvature ``bend``.
+def _lens(dent: DentConfig, bend: float) -> tuple[float, float]:
+    """Return rim radius and volume that a dent's ball shares with a sphere of curvature ``bend``.
 
     Two caps on one rim circle, each pi h (3 r^2 + h^2) / 6; the sphere's counts against where it bends away (bend < 0).
     """
-    ball_m = ball_radius_m(radius_m, depth_m)
-    half_square = radius_m**2 / (2 * (1 + bend * (ball_m - depth_m)))
+    depth_m = dent.depth_mm * MM
+    half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
     sphere_cap_m = bend * half_square
     rim_square = 2 * half_square - sphere_cap_m**2
     caps = [math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)]
@@ -125,14 +98,7 @@ def _lens(radius_m: float, depth_m: float, bend: float) -> tuple[float, float]:
 
 
 def widest_rim_m(item: HoleConfig | DentConfig, face: Face) -> float:
-    """The largest radius of a damage's rim: a dent's in the direction in which the face bends towards the ball most."""
-    radius_m = item.diameter_mm * MM / 2
+    """Return the largest radius of a rim: a dent's in the direction in which the face bends towards the ball most."""
     if isinstance(item, HoleConfig):
-        return radius_m
-    bends = face.curvatures(*(np.asarray(value * MM) for value in item.centre_mm))
-    return _lens(radius_m, item.depth_mm * MM, float(bends.min()))[0]
-
-
-def ball_radius_m(radius_m: float, depth_m: float) -> float:
-    """Radius of the ball whose cap has this rim radius and depth."""
-    return (radius_m**2 + depth_m**2) / (2 * depth_m)
+        return item.radius_m
+    return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]

@@ -24,8 +24,8 @@ from scenes.sensor.amcw.linear_frames import EVEN, UNEVEN
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.effects import EffectsConfig
 from scenes.sensor.source import SimulatedUnit
-from scenes.target.declaration import ThesisTargetConfig
 from scenes.target.mesh import build_target
+from scenes.target.thesis import ThesisTargetConfig
 
 RENDER = RenderConfig(bounces=2, face_samples=4096, hole_noise_mm=0.5, hole_samples=1024)
 """Light enough that a view takes seconds; both ways see the same."""

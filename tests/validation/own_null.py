@@ -36,9 +36,7 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
-from scenes.target.pose import T_camera_board_of
 from scenes.target.truth import truth_of
-from scenes.target.wavelength import at_wavelength
 
 CAMERAS = ("azure_kinect_nfov", "kinect_v2", "realsense_l515")
 KINDS = ("hole-free", "objects", "drilled")
@@ -76,7 +74,7 @@ def boards(camera_name: str, kind: str, number: int, cache: Path) -> dict[int, B
     """One board by the number of frames."""
     camera = camera_of(CameraConfig(name=camera_name))
     role: Purpose = "damaged" if kind == "drilled" else "hole_free"
-    target = at_wavelength(family(number).drawn(role, number), camera.optics.wavelength_nm)
+    target = family(number).drawn(role, number).at_wavelength(camera.optics.wavelength_nm)
     view, _ = cached_view(target if kind == "drilled" else target.hole_free(), camera.optics, RENDER, cache)
     unit = SimulatedUnit(camera, CameraConfig(name=camera_name, unit_seed=FIRST_UNIT + number), view)
     clouds = averages_of(unit.capture(max(FRAMES), 7, role, number), FRAMES, AverageConfig(), exact=False)
@@ -90,7 +88,7 @@ def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
     """(h, w) bool: within `HIT_M` of a hole's centre, across the line of sight."""
     near = np.zeros(cloud.valid.shape, bool)
     for damage in truth_of(target):
-        centre = transform_points(T_camera_board_of(target.pose), damage.centre_board_m)
+        centre = transform_points(target.pose.T_camera_board, damage.centre_board_m)
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
         with np.errstate(invalid="ignore"):
             near |= np.hypot(*np.moveaxis(slopes * centre[2] - centre[:2], -1, 0)) < HIT_M

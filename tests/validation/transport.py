@@ -36,8 +36,8 @@ from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
 from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
-from scenes.target.declaration import ThesisTargetConfig
 from scenes.target.mesh import Target, build_target
+from scenes.target.thesis import ThesisTargetConfig
 from scenes.view import NoiseFreeView
 
 SIDE = 32
