@@ -88,7 +88,7 @@ def test_points_count_as_fewer_than_they_are():
 
 
 def test_the_gate_of_marks_is_the_quantile_it_says():
-    from detectors.registration.joint_surface import MARK_GATE
+    from detectors.registration.joint import MARK_GATE
 
     assert chi2.sf(MARK_GATE, 3) == pytest.approx(1e-3, rel=0.02)
 

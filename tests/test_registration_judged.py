@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from board_views import TAPES_M, board_view, pose, target_error_m, usual_error, views
 
-from detectors.registration.failure import still_moving
-from detectors.registration.loops import loop_errors
-from detectors.registration.register import register
+from detectors.registration.judged import still_moving
+from detectors.registration.register import loop_errors, register
 from detectors.registration.registered import Registration, displacement_jacobian, predicted_error_m
 from detectors.registration.sampling import sampling_of
 from detectors.registration.settings import (
@@ -159,8 +158,7 @@ def test_a_wrong_guess_turns_the_board_about():
     turned = register([reference.prepared, replace_guess(other.prepared, half_turn)], CpdRegistration())[1]
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is believed
     assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
-    from detectors.registration.agreement import ReferenceTarget
-    from detectors.registration.failure import judge
+    from detectors.registration.judged import ReferenceTarget, judge
 
     judged = judge(turned, ReferenceTarget(reference.prepared), other.prepared)
     assert judged.failure.startswith("stands 180 degrees and ")
@@ -171,8 +169,7 @@ def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:
 
 
 def test_points_on_a_line_leave_a_turn_open():
-    from detectors.registration.agreement import ReferenceTarget
-    from detectors.registration.failure import judge
+    from detectors.registration.judged import ReferenceTarget, judge
 
     made = views(POSES[:2], noise_m=NOISE_M)
     found = register(prepared(made), MarksRegistration())[1]
@@ -186,8 +183,7 @@ def test_points_on_a_line_leave_a_turn_open():
 
 @pytest.mark.parametrize("broken", [np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)])
 def test_a_mirror_image_or_nothing_is_no_registration(broken):
-    from detectors.registration.agreement import ReferenceTarget
-    from detectors.registration.failure import judge
+    from detectors.registration.judged import ReferenceTarget, judge
 
     made = views(POSES[:2])
     found = register(prepared(made), MarksRegistration())[1]

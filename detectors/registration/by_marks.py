@@ -8,20 +8,18 @@ disagree by more than chance allows (Birge's ratio).
 
 from __future__ import annotations
 
-from time import perf_counter
-
 import numpy as np
 
 from detectors.marks.mark import Mark
 from detectors.marks.pairing import SHARED_M, Pairing, pair_marks
 from detectors.marks.placing import Placement, place
 from detectors.marks.sufficient import off_line_problem
-from detectors.registration.points import guess_of, unplaced
-from detectors.registration.registered import Registration
+from detectors.registration.registered import Registration, failed, guess_of
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import transform_points
 from harness.vocabulary.units import MM
 
+Marks = tuple[Mark, ...]
 WIDEN_BELOW = 0.01
 """Chance of marks that disagree so much by their noise alone, below which the covariance is widened."""
 REFUSE_BELOW = 1e-4
@@ -29,28 +27,53 @@ REFUSE_BELOW = 1e-4
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> Registration:
-    """Where a view stands to the reference, from their trusted marks. ``overlap`` is left NaN: marks do not tell it.
+    """Return the pose of a view relative to the reference, from their trusted marks. ``overlap`` stays NaN.
 
-    ``covariance`` is the closed form of the weighted fit. Never raises for what the views show: too few marks, marks
-    on a line, marks that fit nowhere, in several ways, or badly, are its ``failure``; with one, the transform is the
+    ``covariance`` is the closed form of the weighted fit. Never raises for the content of the views: too few marks,
+    marks on a line, marks that fit nowhere, in several ways, or badly, are its ``failure``; the transform is then the
     best known, or else the guess, or else the identity.
     """
-    started = perf_counter()
+    from scipy.special import gammaincc
+
     guess = guess_of(reference, view)
     problem = _problem_of_sets(reference, view)
     if problem:
-        return unplaced(view.view.name, "marks", guess, problem, started)
-    ours, theirs = reference.marks.trusted, view.marks.trusted
-    pairing = pair_marks(ours, theirs, guess)
+        return failed(view, "marks", guess, problem)
+    pairing = pair_marks(reference.marks.trusted, view.marks.trusted, guess)
+    notes = pairing.notes
     if len(pairing.pairs) < 3:
-        return unplaced(view.view.name, "marks", guess, pairing.problem, started, *pairing.notes)
-    ours, theirs = _matched(ours, theirs, pairing)
+        return failed(view, "marks", guess, pairing.problem, *notes)
+    ours, theirs = _matched(reference, view, pairing)
     problem = pairing.problem or off_line_problem(ours) or off_line_problem(theirs)
     try:
         placement = _placed(ours, theirs, 0.0)
     except np.linalg.LinAlgError:
-        return unplaced(view.view.name, "marks", guess, problem or "the matched marks do not fix a turn", started)
-    return _registration(view, ours, theirs, placement, pairing, problem, started)
+        return failed(view, "marks", guess, problem or "the matched marks do not determine the rotation")
+    freedom = 3 * len(ours) - 6
+    residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
+    if not problem and gammaincc(freedom / 2, _placed(ours, theirs, SHARED_M).chi2 / 2) < REFUSE_BELOW:
+        problem = (
+            f"the marks do not fit: {residual / MM:.1f} mm left over {len(ours)} marks, more than noise and"
+            f" {SHARED_M / MM:.0f} mm of each view's own error explain; other targets, or a mark that moved"
+        )
+    covariance = placement.covariance
+    if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
+        ratio = float(np.sqrt(placement.chi2 / freedom))
+        covariance = covariance * ratio**2
+        notes += (f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",)
+    return Registration(
+        view=view.view.name,
+        method="marks",
+        T_reference_view=placement.T_to_from,
+        covariance=covariance,
+        centre_m=placement.centre_m,
+        residual_m=residual,
+        pairs=len(ours),
+        iterations=placement.iterations,
+        converged=placement.converged,
+        failure=problem,
+        notes=notes,
+    )
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
@@ -63,7 +86,7 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
     pairing = pair_marks(reference.marks.trusted, view.marks.trusted, guess_of(reference, view))
     if pairing.problem or len(pairing.pairs) < 4:
         return None
-    ours, theirs = _matched(reference.marks.trusted, view.marks.trusted, pairing)
+    ours, theirs = _matched(reference, view, pairing)
     squares = []
     for left_out in range(len(ours)):
         kept = [i for i in range(len(ours)) if i != left_out]
@@ -77,62 +100,17 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
 
 
 def _problem_of_sets(reference: PreparedView, view: PreparedView) -> str:
-    problems = [
-        f"{prepared.view.name}: {prepared.marks.problem}" for prepared in (reference, view) if prepared.marks.problem
-    ]
-    return "; ".join(problems)
+    return "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
 
 
-def _matched(
-    ours: tuple[Mark, ...], theirs: tuple[Mark, ...], pairing: Pairing
-) -> tuple[tuple[Mark, ...], tuple[Mark, ...]]:
+def _matched(reference: PreparedView, view: PreparedView, pairing: Pairing) -> tuple[Marks, Marks]:
+    ours, theirs = reference.marks.trusted, view.marks.trusted
     return tuple(ours[i] for i, _ in pairing.pairs), tuple(theirs[j] for _, j in pairing.pairs)
 
 
-def _placed(ours: tuple[Mark, ...], theirs: tuple[Mark, ...], shared_m: float) -> Placement:
-    """The view's marks placed on the reference's, each axis of each mark allowed so much more than its covariance."""
+def _placed(ours: Marks, theirs: Marks, shared_m: float) -> Placement:
+    """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis of each mark."""
     extra = shared_m**2 * np.eye(3)
     our_places, their_places = (np.stack([mark.centre_m for mark in marks]) for marks in (ours, theirs))
     our_spread, their_spread = (np.stack([mark.covariance_m2 for mark in marks]) for marks in (ours, theirs))
     return place(their_places, their_spread + extra, our_places, our_spread + extra)
-
-
-def _registration(
-    view: PreparedView,
-    ours: tuple[Mark, ...],
-    theirs: tuple[Mark, ...],
-    placement: Placement,
-    pairing: Pairing,
-    problem: str,
-    started: float,
-) -> Registration:
-    from scipy.special import gammaincc
-
-    freedom = 3 * len(ours) - 6
-    allowed = _placed(ours, theirs, SHARED_M)
-    residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
-    if not problem and gammaincc(freedom / 2, allowed.chi2 / 2) < REFUSE_BELOW:
-        problem = (
-            f"the marks do not fit: {residual / MM:.1f} mm left over {len(ours)} marks, more than noise and"
-            f" {SHARED_M / MM:.0f} mm of each view's own error explain; other targets, or a mark that moved"
-        )
-    covariance, notes = placement.covariance, pairing.notes
-    if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
-        ratio = float(np.sqrt(placement.chi2 / freedom))
-        covariance = covariance * ratio**2
-        notes += (f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",)
-    return Registration(
-        view=view.view.name,
-        method="marks",
-        T_reference_view=placement.T_to_from,
-        covariance=covariance,
-        centre_m=placement.centre_m,
-        residual_m=residual,
-        overlap=float("nan"),
-        pairs=len(ours),
-        iterations=placement.iterations,
-        converged=placement.converged,
-        seconds=perf_counter() - started,
-        failure=problem,
-        notes=notes,
-    )

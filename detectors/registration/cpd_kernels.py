@@ -12,7 +12,7 @@ FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "
 SQUARINGS = 6
 """exp(x) = exp(x / 64)^64: the polynomial then sees -1 to 0 only."""
 LEAST_EXPONENT = -64.0
-"""Below exp(-64) of the nearest component's weight nothing counts: 10,000 of them add 2e-24."""
+"""Weights below exp(-64) of the nearest component's are negligible: 10,000 of them add 2e-24."""
 GREATEST_EXPONENT = 700.0
 """exp(700) is still a double; a point whose nearest Gaussian is farther is an outlier to 304 digits."""
 # 1 / k!, degree 13: truncation below 2e-11 / 64 of the least value, rounding dominates

@@ -6,8 +6,6 @@ Point to point is what MATLAB's `pcregistericp` does by default; Open3D's pairs 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -15,10 +13,16 @@ import numpy as np
 from detectors.average import CORRELATED_PIXELS
 from detectors.marks.placing import kabsch
 from detectors.open3d_library import open3d_on_one_thread
-from detectors.registration.covariance import clustered_sandwich
-from detectors.registration.failure import moved_m, still_moving, too_few_points
-from detectors.registration.points import NO_GUESS, cloud_of, guess_of, unplaced
-from detectors.registration.registered import Registration, displacement_jacobian
+from detectors.registration.judged import moved_m, still_moving, too_few_points
+from detectors.registration.registered import (
+    NO_GUESS,
+    Registration,
+    cloud_of,
+    clustered_sandwich,
+    displacement_jacobian,
+    failed,
+    guess_of,
+)
 from detectors.registration.sampling import local_normals, sampling_of, thinned
 from detectors.registration.settings import IcpRegistration
 from detectors.surface import SurfaceConfig, fit_surface
@@ -27,16 +31,20 @@ from harness.vocabulary.geometry import transform_points
 from harness.vocabulary.units import MM
 
 GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
-"""What a nominal pose is usually wrong by; first pairs may lie twice as far apart as it moves the outermost point."""
+"""Usual error of a nominal pose; first pairs may lie twice as far apart as it moves the outermost point."""
 FINEST_PITCHES = 3.0
-"""Of the last stage: the rim of a mark is known to a pixel in either view, and noise and shared errors add one."""
+"""Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
 STAGE_ITERATIONS, CALL_ITERATIONS = 100, 10
 """Most of a stage, and of one call: Open3D does not tell how many it took."""
 LEAST_CHANGE = 1e-8
-"""Of fitness and residual, relative: below it Open3D stops a stage."""
+"""Relative change of fitness and residual below which Open3D stops a stage."""
 CONVERGED_PITCHES = 0.05
 MAX_POINTS = 10_000
 SLOPE_STEP_M = 1 * MM
+SLIDES = (
+    "not determined: the points can slide or turn without lying farther apart (flat marks hold nothing along their"
+    " plane when distances are taken across it)"
+)
 
 
 @dataclass(frozen=True)
@@ -51,14 +59,12 @@ class _Cost:
     tree: Any
     limit_m: float
 
-    def pairs(self, moved_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which points (n,) bool have a partner, and the partners' indices (n,)."""
-        distances, nearest = self.tree.query(moved_m, distance_upper_bound=self.limit_m)
-        return np.isfinite(distances), np.where(np.isfinite(distances), nearest, 0)
-
     def residuals(self, moved_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(n, 3) vectors to the partner that the method makes small, zero without one; `pairs`."""
-        paired, nearest = self.pairs(moved_m)
+        """Return the vectors (n, 3) to the partners that the method minimises (zero without a partner), the mask (n,)
+        of points that have a partner, and the partners' indices (n,)."""
+        distances, nearest = self.tree.query(moved_m, distance_upper_bound=self.limit_m)
+        paired = np.isfinite(distances)
+        nearest = np.where(paired, nearest, 0)
         apart = np.where(paired[:, None], moved_m - self.fixed_m[nearest], 0.0)
         if self.normals is not None:
             normals = self.normals[nearest]
@@ -66,24 +72,28 @@ class _Cost:
         return apart, paired, nearest
 
     def value(self, moved_m: np.ndarray) -> float:
-        """The sum itself; a point without a partner counts as one at the limit."""
+        """Return the sum; a point without a partner counts as if it were at the limit."""
         apart, paired, _ = self.residuals(moved_m)
         return float(np.sum(apart**2) + self.limit_m**2 * np.sum(~paired))
 
 
 def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> Registration:
-    """One view to the reference by ICP of their fiducial clouds or targets; ``covariance``: see `icp_covariance`."""
-    started = perf_counter()
+    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets.
+
+    ``covariance``: see `icp_covariance`.
+    """
+    from scipy.spatial import cKDTree
+
     fixed, moving = (thinned(cloud_of(each, config.points), MAX_POINTS) for each in (reference, view))
     start = guess_of(reference, view)
     notes: tuple[str, ...] = () if start is not None else (NO_GUESS,)
     few = too_few_points(len(moving), len(fixed), config.points)
     if few:
-        return unplaced(view.view.name, "icp", start, few, started, *notes)
+        return failed(view, "icp", start, few, *notes)
     sampling = sampling_of(view)
     limits = stages_m(sampling.pitch_m, sampling.extent_m)
     normals = _normals(reference, fixed) if config.estimation == "point_to_plane" else None
-    cost = _cost(fixed, None if normals is None else normals.local, limits[-1])
+    cost = _Cost(fixed, None if normals is None else normals.local, cKDTree(fixed), limits[-1])
     T_start = np.eye(4) if start is None else start
     T_coarse, iterations = _open3d_icp(fixed, cost.normals, moving, T_start, limits)
     T_reference_view, step_m = _last_step(cost, moving, T_coarse)
@@ -91,7 +101,7 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
     apart, paired, _ = cost.residuals(moved)
     if paired.sum() < 3:
         failure = f"no pairs: {paired.sum()} points lie within {limits[-1] / MM:.1f} mm of the reference's"
-        return unplaced(view.view.name, "icp", start, failure, started, *notes)
+        return failed(view, "icp", start, failure, *notes)
     real = replace(cost, normals=None if normals is None else normals.real)
     covariance = icp_covariance(real, moved, sampling.pitch_m)
     return Registration(
@@ -101,25 +111,17 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
         covariance=covariance,
         centre_m=moved.mean(axis=0),
         residual_m=float(np.sqrt(np.sum(apart**2) / paired.sum())),
-        overlap=float("nan"),
         pairs=int(paired.sum()),
         iterations=iterations + 1,
         converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
-        seconds=perf_counter() - started,
         failure=still_moving(step_m, sampling.pitch_m) or ("" if np.isfinite(covariance).all() else SLIDES),
         notes=notes,
     )
 
 
-SLIDES = (
-    "not determined: the points can slide or turn without lying farther apart (flat marks hold nothing along their"
-    " plane when distances are taken across it)"
-)
-
-
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
-    """Greatest distance of a pair in each stage: from twice a usual guess error at the target's end, halved down to
-    three pitches."""
+    """Return the greatest distance of a pair in each stage: from twice a usual guess error at the target's end, halved
+    down to three pitches."""
     finest = FINEST_PITCHES * pitch_m
     limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
     while limits[-1] > finest:
@@ -128,7 +130,7 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
 
 
 def icp_covariance(cost: _Cost, moved_m: np.ndarray, pitch_m: float) -> np.ndarray:
-    """(6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid.
+    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid.
 
     H^-1 S H^-1. Point to point: H is the cost's curvature with pairs found anew, by differences over one pitch
     (Bengtsson & Baerveldt, Robotics and Autonomous Systems 44:29, 2003), because with pairs held fixed the inside of a
@@ -142,15 +144,11 @@ def icp_covariance(cost: _Cost, moved_m: np.ndarray, pitch_m: float) -> np.ndarr
     apart, paired, nearest = cost.residuals(moved_m)
     scores = np.einsum("nij,ni->nj", jacobian, apart)
     if cost.normals is None:
-        curvature = _curvature(partial(_cost_after, cost, moved_m, jacobian), moved_m - centre, pitch_m) / 2
+        curvature = _curvature(lambda motion: cost.value(moved_m + jacobian @ motion), moved_m - centre, pitch_m) / 2
     else:
         rows = np.einsum("ni,nij->nj", cost.normals[nearest[paired]], jacobian[paired])
         curvature = rows.T @ rows
     return clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
-
-
-def _cost_after(cost: _Cost, moved_m: np.ndarray, jacobian: np.ndarray, motion: np.ndarray) -> float:
-    return cost.value(moved_m + jacobian @ motion)
 
 
 def _curvature(value: Any, arm_m: np.ndarray, pitch_m: float) -> np.ndarray:
@@ -169,12 +167,6 @@ def _curvature(value: Any, arm_m: np.ndarray, pitch_m: float) -> np.ndarray:
             mixed = value(both) + value(-both) - value(across) - value(-across)
             curvature[i, j] = curvature[j, i] = mixed / (4 * sizes[i] * sizes[j])
     return curvature
-
-
-def _cost(fixed_m: np.ndarray, normals: np.ndarray | None, limit_m: float) -> _Cost:
-    from scipy.spatial import cKDTree
-
-    return _Cost(fixed_m, normals, cKDTree(fixed_m), limit_m)
 
 
 @dataclass(frozen=True)

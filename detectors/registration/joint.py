@@ -22,22 +22,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 
+from detectors.marks.mark import Mark
+from detectors.marks.pairing import SHARED_M
 from detectors.registration.by_marks import register_by_marks
-from detectors.registration.joint_surface import (
-    POSE_TERMS,
-    TERMS,
-    SurfaceFrame,
-    ViewData,
-    across,
-    first_surface,
-    surface_frame,
-    view_data,
-)
 from detectors.registration.registered import Registration, displacement_jacobian
+from detectors.registration.sampling import MEDIAN_TO_SIGMA, independent, sampling_of, thinned
+from detectors.surface import BISQUARE_TUNING
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.units import MM
@@ -48,6 +41,136 @@ CONVERGED_M, CONVERGED_SHARED = 1e-6, 0.02
 views' own errors by no more than a fiftieth."""
 LEAST_SHARED_M = 1e-6
 
+DEGREE = 3
+TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
+"""Chebyshev orders in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
+POSE_TERMS = 3
+MARK_GATE = 16.3
+"""Chi-square limit of a mark's position, three degrees of freedom: a true mark is missed once in a thousand."""
+START_STEPS = 10
+
+
+@dataclass(frozen=True)
+class SurfaceFrame:
+    """The frame in which the surface is z(x, y): z along the mean normal of the reference's target, towards the camera;
+    x and y are scaled to -1..1 by ``half_m`` (2,)."""
+
+    T_surface_reference: np.ndarray
+    half_m: np.ndarray
+
+    def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """(n, 10) terms of the cubic."""
+        in_x = np.polynomial.chebyshev.chebvander(x_m / self.half_m[0], DEGREE)
+        in_y = np.polynomial.chebyshev.chebvander(y_m / self.half_m[1], DEGREE)
+        return np.stack([in_x[:, i] * in_y[:, j] for i, j in TERMS], axis=1)
+
+    def normals(self, x_m: np.ndarray, y_m: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """(n, 3) directions (-dz/dx, -dz/dy, 1), by differences over a thousandth of the extent."""
+        dx, dy = 1e-3 * self.half_m
+        along_x = (self.basis(x_m + dx, y_m) - self.basis(x_m - dx, y_m)) @ coefficients / (2 * dx)
+        along_y = (self.basis(x_m, y_m + dy) - self.basis(x_m, y_m - dy)) @ coefficients / (2 * dy)
+        return np.stack([-along_x, -along_y, np.ones(len(x_m))], axis=1)
+
+
+@dataclass(frozen=True)
+class ViewData:
+    """One view's part, in its camera frame: thinned target points (n, 3), marks, and ``labels`` (m,) which of the
+    reference's marks they are. ``noise_m``: of one point across the surface. ``sigma_m``: the same, so inflated that
+    the points count as if they were independent."""
+
+    points_m: np.ndarray
+    marks: tuple[Mark, ...]
+    labels: np.ndarray
+    noise_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Across:
+    """A view's points against the surface: residuals (n,), basis (n, 10), derivatives (n, 6) by the pose's motion about
+    the surface frame's origin, and robust weights (n,) in 1/m^2."""
+
+    residual_m: np.ndarray
+    basis: np.ndarray
+    by_pose: np.ndarray
+    weight: np.ndarray
+
+
+def surface_frame(reference: PreparedView) -> SurfaceFrame:
+    """The frame of the reference's target."""
+    sampling = sampling_of(reference)
+    z = sampling.normal
+    # x of the frame is the camera's x as far as the surface allows, its y where the surface stands edge-on to that
+    along = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = along - (along @ z) * z
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    T[:3, 3] = -T[:3, :3] @ sampling.centre_m
+    reach = np.abs(transform_points(T, reference.points_m)[:, :2]).max(axis=0)
+    return SurfaceFrame(T, np.maximum(reach, 1e-6))
+
+
+def view_data(view: PreparedView, reference: PreparedView, T_reference_view: np.ndarray) -> ViewData:
+    """Return the data of a view; its marks are those of the reference to which ``T_reference_view`` brings them."""
+    points = thinned(view.points_m)
+    noise = max(sampling_of(view).noise_m, 1e-9)
+    inflation = max(len(points) / independent(int(view.inside.sum())), 1.0)
+    marks, labels = _labelled(view.marks.trusted, reference.marks.trusted, T_reference_view)
+    return ViewData(points, marks, labels, noise, noise * float(np.sqrt(inflation)))
+
+
+def across(
+    data: ViewData, T_surface_view: np.ndarray, frame: SurfaceFrame, surface: np.ndarray, own: np.ndarray
+) -> Across:
+    """A view's points against the common surface (10,) plus the view's own smooth error (10,)."""
+    points = transform_points(T_surface_view, data.points_m)
+    basis = frame.basis(points[:, 0], points[:, 1])
+    residual = points[:, 2] - basis @ (surface + own)
+    normals = frame.normals(points[:, 0], points[:, 1], surface)
+    by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
+    scale = max(data.noise_m, float(np.median(np.abs(residual))) * MEDIAN_TO_SIGMA)
+    return Across(residual, basis, by_pose, tukey(residual / scale) / data.sigma_m**2)
+
+
+def first_surface(frame: SurfaceFrame, points_m: np.ndarray) -> np.ndarray:
+    """(10,) coefficients of the robust cubic through points (n, 3) of the surface's frame."""
+    basis = frame.basis(points_m[:, 0], points_m[:, 1])
+    surface: np.ndarray = np.zeros(len(TERMS))
+    root: np.ndarray = np.ones(len(points_m))
+    for _ in range(START_STEPS):
+        surface = np.linalg.lstsq(basis * root[:, None], points_m[:, 2] * root, rcond=None)[0]
+        residual = points_m[:, 2] - basis @ surface
+        root = np.sqrt(tukey(residual / max(float(np.median(np.abs(residual))) * MEDIAN_TO_SIGMA, 1e-9)))
+    return surface
+
+
+def tukey(scaled: np.ndarray) -> np.ndarray:
+    """Tukey's bisquare weights of residuals in standard deviations."""
+    inside = np.clip(1 - (scaled / BISQUARE_TUNING) ** 2, 0.0, None)
+    weights: np.ndarray = inside**2
+    return weights
+
+
+def _labelled(
+    marks: Sequence[Mark], reference: Sequence[Mark], T_reference_view: np.ndarray
+) -> tuple[tuple[Mark, ...], np.ndarray]:
+    """Marks that are one of the reference's, each at most once, the best fit first; and which."""
+    turn = T_reference_view[:3, :3]
+    fits = []
+    for i, mark in enumerate(marks):
+        for j, other in enumerate(reference):
+            if mark.code != other.code:
+                continue
+            apart = transform_points(T_reference_view, mark.centre_m) - other.centre_m
+            spread = turn @ mark.covariance_m2 @ turn.T + other.covariance_m2 + 2 * SHARED_M**2 * np.eye(3)
+            fits.append((float(apart @ np.linalg.solve(spread, apart)), i, j))
+    chosen: dict[int, int] = {}
+    for chi2, i, j in sorted(fits):
+        if chi2 <= MARK_GATE and i not in chosen and j not in chosen.values():
+            chosen[i] = j
+    return tuple(marks[i] for i in sorted(chosen)), np.array([chosen[i] for i in sorted(chosen)], dtype=int)
+
 
 def register_jointly(views: Sequence[PreparedView]) -> list[Registration]:
     """Views but the first to the first, from all views together.
@@ -55,15 +178,13 @@ def register_jointly(views: Sequence[PreparedView]) -> list[Registration]:
     ``covariance`` is each view's marginal, smooth errors of the views included; ``residual_m`` the root mean square
     across the surface of the points that count. A view whose marks fail keeps that failure and takes no part.
     """
-    started = perf_counter()
     by_marks = [register_by_marks(views[0], view) for view in views[1:]]
     usable = [i for i, found in enumerate(by_marks) if not found.failure]
     joint: dict[int, Registration] = {}
     if usable:
         adjusted = _adjust([views[0], *(views[i + 1] for i in usable)], [by_marks[i] for i in usable])
         joint = dict(zip(usable, adjusted, strict=True))
-    share = (perf_counter() - started) / max(len(by_marks), 1)
-    return [replace(joint.get(i, found), method="joint", seconds=share) for i, found in enumerate(by_marks)]
+    return [replace(joint.get(i, found), method="joint") for i, found in enumerate(by_marks)]
 
 
 @dataclass(frozen=True)
@@ -80,7 +201,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where each unknown stands: the poses of views 1.., the surface, the marks, the own errors of views 0.."""
+    """The index of each unknown: the poses of views 1.., the surface, the marks, the own errors of views 0.."""
 
     views: int
     marks: int
@@ -123,7 +244,11 @@ def _adjust(views: Sequence[PreparedView], by_marks: Sequence[Registration]) -> 
     T_reference = [np.eye(4), *(found.T_reference_view for found in by_marks)]
     data = [view_data(view, views[0], T) for view, T in zip(views, T_reference, strict=True)]
     layout = _Layout(len(views), len(views[0].marks.trusted))
-    state = _start(frame, data, T_reference, views[0])
+    T = np.stack([frame.T_surface_reference @ each for each in T_reference])
+    points = np.concatenate([transform_points(T[v], each.points_m) for v, each in enumerate(data)])
+    places = transform_points(T[0], np.stack([mark.centre_m for mark in views[0].marks.trusted]))
+    noise = float(np.median([each.noise_m for each in data]))
+    state = _State(T, first_surface(frame, points), np.zeros((len(data), len(TERMS))), places[:, :2], noise)
     steps, converged = 0, False
     while steps < MAX_STEPS and not converged:
         steps += 1
@@ -141,16 +266,6 @@ def _adjust(views: Sequence[PreparedView], by_marks: Sequence[Registration]) -> 
     ]
 
 
-def _start(
-    frame: SurfaceFrame, data: Sequence[ViewData], T_reference: Sequence[np.ndarray], reference: PreparedView
-) -> _State:
-    T = np.stack([frame.T_surface_reference @ T for T in T_reference])
-    points = np.concatenate([transform_points(T[v], each.points_m) for v, each in enumerate(data)])
-    places = transform_points(T[0], np.stack([mark.centre_m for mark in reference.marks.trusted]))
-    shared = float(np.median([each.noise_m for each in data]))
-    return _State(T, first_surface(frame, points), np.zeros((len(data), len(TERMS))), places[:, :2], shared)
-
-
 def _equations(frame: SurfaceFrame, data: Sequence[ViewData], layout: _Layout, state: _State) -> _Normal:
     normal = _Normal(layout.size)
     for v, each in enumerate(data):
@@ -158,20 +273,16 @@ def _equations(frame: SurfaceFrame, data: Sequence[ViewData], layout: _Layout, s
         columns = np.concatenate([layout.surface, layout.own(v), layout.pose(v)])
         rows = np.concatenate([-seen.basis, -seen.basis, *([seen.by_pose] if v else [])], axis=1)
         normal.add(columns, rows, seen.residual_m, seen.weight)
-        _add_marks(normal, v, each, layout, state)
+        turn = state.T[v][:2, :3]
+        for mark, label in zip(each.marks, each.labels, strict=True):
+            place = transform_points(state.T[v], mark.centre_m)
+            by_pose = displacement_jacobian(place[None], np.zeros(3))[0, :2]
+            columns = np.concatenate([layout.mark(label), layout.pose(v)])
+            rows = np.concatenate([-np.eye(2), *([by_pose] if v else [])], axis=1)
+            weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
+            normal.add(columns, rows, place[:2] - state.marks_m[label], weight)
         normal.add(layout.own(v), np.eye(len(TERMS)), state.own[v], np.full(len(TERMS), state.shared_m**-2))
     return normal
-
-
-def _add_marks(normal: _Normal, v: int, data: ViewData, layout: _Layout, state: _State) -> None:
-    turn = state.T[v][:2, :3]
-    for mark, label in zip(data.marks, data.labels, strict=True):
-        place = transform_points(state.T[v], mark.centre_m)
-        by_pose = displacement_jacobian(place[None], np.zeros(3))[0, :2]
-        columns = np.concatenate([layout.mark(label), layout.pose(v)])
-        rows = np.concatenate([-np.eye(2), *([by_pose] if v else [])], axis=1)
-        weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
-        normal.add(columns, rows, place[:2] - state.marks_m[label], weight)
 
 
 def _own_motion(layout: _Layout, motion: np.ndarray) -> np.ndarray:
@@ -187,20 +298,16 @@ def _shared_deviation(layout: _Layout, own: np.ndarray, covariance: np.ndarray) 
 
 
 def _moved(layout: _Layout, state: _State, motion: np.ndarray, shared_m: float) -> _State:
-    T = np.stack([_rigid(motion[layout.pose(v)]) @ state.T[v] if v else state.T[v] for v in range(layout.views)])
+    from scipy.spatial.transform import Rotation
+
+    T = state.T.copy()
+    for v in range(1, layout.views):
+        step, pose = np.eye(4), motion[layout.pose(v)]  # a small motion (w, t) about the origin
+        step[:3, :3], step[:3, 3] = Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:]
+        T[v] = step @ T[v]
     marks = np.stack([place + motion[layout.mark(k)] for k, place in enumerate(state.marks_m)])
     own = state.own + _own_motion(layout, motion)
     return _State(T, state.surface + motion[layout.surface], own, marks, shared_m)
-
-
-def _rigid(motion: np.ndarray) -> np.ndarray:
-    """4x4 of a small motion (w, t) about the origin."""
-    from scipy.spatial.transform import Rotation
-
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
-    T[:3, 3] = motion[3:]
-    return T
 
 
 def _registration(

@@ -9,16 +9,14 @@ with the target. No loop is closed, no map is kept, and nothing corrects what ha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from time import perf_counter
 from typing import Any
 
 import cv2
 import numpy as np
 
 from detectors.open3d_library import open3d_on_one_thread
-from detectors.registration.failure import MIN_OVERLAP
-from detectors.registration.points import unplaced
-from detectors.registration.registered import Registration
+from detectors.registration.judged import MIN_OVERLAP
+from detectors.registration.registered import Registration, failed
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
@@ -40,24 +38,16 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[Registration]:
         canvas = _canvas_of(views)
         images = [_image(o3d, view, canvas) for view in views]
         for before, now, view in zip(images, images[1:], views[1:], strict=False):
-            started = perf_counter()
             step, pairs = (np.eye(4), 0) if lost else _step(o3d, now, before, canvas)
-            if not lost and pairs < MIN_OVERLAP * max(_pixels(now), _pixels(before)):
+            pixels = max(int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before))
+            if not lost and pairs < MIN_OVERLAP * pixels:
                 lost = f"odometry lost its way at {view.view.name}: {pairs} pixels match the view before it"
             if lost:
-                found.append(unplaced(view.view.name, METHOD, None, lost, started))
+                found.append(failed(view, METHOD, None, lost))
                 continue
             T_reference_view = T_reference_view @ step
-            found.append(_registration(view, T_reference_view, pairs, started))
+            found.append(Registration(view.view.name, METHOD, T_reference_view, pairs=pairs, notes=(DRIFTS,)))
     return found
-
-
-def _registration(view: PreparedView, T_reference_view: np.ndarray, pairs: int, started: float) -> Registration:
-    unknown, nan = np.full((6, 6), np.nan), float("nan")
-    spent = perf_counter() - started
-    return Registration(
-        view.view.name, METHOD, T_reference_view, unknown, np.zeros(3), nan, nan, pairs, 0, True, spent, "", (DRIFTS,)
-    )
 
 
 def _canvas_of(views: Sequence[PreparedView]) -> Lens:
@@ -90,10 +80,6 @@ def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
         depth_trunc=float(depth.max()) + 1.0,
         convert_rgb_to_intensity=True,
     )
-
-
-def _pixels(image: Any) -> int:
-    return int(np.count_nonzero(np.asarray(image.depth)))
 
 
 def _step(o3d: Any, now: Any, before: Any, canvas: Lens) -> tuple[np.ndarray, int]:

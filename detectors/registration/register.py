@@ -1,17 +1,17 @@
-"""Registering views by whichever method its settings name."""
+"""Registration of views by the method that its settings name, and its consistency around loops of three views."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 from time import perf_counter
 
 import numpy as np
 
-from detectors.registration.agreement import ReferenceTarget
-from detectors.registration.failure import judge
-from detectors.registration.points import guess_of, unplaced
-from detectors.registration.registered import Registration, reference_registration
+from detectors.registration.judged import ReferenceTarget, judge, moved_m
+from detectors.registration.registered import Registration, failed, guess_of, reference_registration
+from detectors.registration.sampling import thinned
 from detectors.registration.settings import (
     PAIRWISE,
     AnyRegistration,
@@ -24,107 +24,134 @@ from detectors.registration.settings import (
 )
 from detectors.views import PreparedView
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import invert
+
+LOOP_POINTS = 500
+"""Number of points of the first view's target over which the error of a loop is averaged."""
 
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[Registration, ...]:
-    """One registration for each view, the first that of the reference.
+    """Return one registration for each view; the first is that of the reference.
 
-    Never raises for what the views show: a registration that cannot be trusted says so in its ``failure``. Raises
-    UserError where the method needs what these views never have (colour, a pixel grid, a guess).
+    Never raises for the content of the views: a registration that cannot be trusted has a ``failure``. Raises
+    UserError where the method needs something that these views never have (colour, a pixel grid, a guess).
     """
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     check_views(views, config)
+    of_reference = reference_registration(views[0].view.name, config.method)
     if len(views) == 1:
-        return (reference_registration(views[0].view.name, config.method),)
+        return (of_reference,)
     reference = ReferenceTarget(views[0])
-    together = config.method not in PAIRWISE
-    found = _all_together(views, config) if together else map(partial(_pairwise(config), views[0]), views[1:])
-    judged = [judge(each, reference, view) for each, view in zip(found, views[1:], strict=True)]
-    return (reference_registration(views[0].view.name, config.method), *judged)
+    if config.method in PAIRWISE:
+        found = [_pair(views[0], view, config) for view in views[1:]]
+    else:
+        started = perf_counter()
+        if isinstance(config, OdometryRegistration):
+            from detectors.registration.odometry import register_by_odometry
 
+            found = register_by_odometry(views)
+        else:
+            from detectors.registration.joint import register_jointly
 
-def register_one(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> Registration:
-    """One view to a reference that need not be the first, by a method that registers pairs; judged as `register` does.
-
-    The guess is what those of both views imply. Does not check that the views have what the method needs.
-    """
-    return judge(_pairwise(config)(reference, view), ReferenceTarget(reference), view)
+            found = register_jointly(views)
+        share = (perf_counter() - started) / len(found)
+        found = [replace(each, seconds=share) for each in found]
+    return (of_reference, *(judge(each, reference, view) for each, view in zip(found, views[1:], strict=True)))
 
 
 def check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
-    """Raises UserError where a method needs what some view never has."""
-    for view in views:
-        missing = _missing(view, config)
-        if missing:
-            raise UserError(
-                f"{view.view.name}: registration by {config.method} needs {missing[0]}",
-                legal=missing[1],
-                fix=missing[2],
-            )
-
-
-def _missing(view: PreparedView, config: AnyRegistration) -> tuple[str, str, str] | None:
-    """What the view lacks for the method, what would be legal, and what to do; None where it lacks nothing."""
-    cloud = view.view.cloud
+    """Raise UserError where the method needs something that a view does not have."""
     by_colour = isinstance(config, OdometryRegistration | MarksRegistration | JointRegistration) or (
         isinstance(config, CpdRegistration | IcpRegistration) and config.points == "marks"
     )
-    if by_colour and cloud.rgb is None:
-        return (
-            "colour, and this capture has none",
-            "captures with colour for every point",
-            "record colour, or use registration.method: icp or cpd with points: target",
-        )
-    if isinstance(config, OdometryRegistration) and (not cloud.organised or cloud.lens is None):
-        return (
-            "a pixel grid and the lens, and this capture has none",
-            "organised captures of a camera whose intrinsics are known",
-            "give the intrinsics, or use another registration.method",
-        )
-    if isinstance(config, NominalRegistration) and view.view.T_reference_view_guess is None:
-        return (
-            "the nominal pose of every view, and this one has none",
-            "a guess of where each view stands to the first",
-            "give the guesses, or use registration.method: marks",
-        )
-    return None
+    for view in views:
+        cloud = view.view.cloud
+        if by_colour and cloud.rgb is None:
+            missing = "colour, and this capture has none"
+            legal = "captures with colour for every point"
+            fix = "record colour, or use registration.method: icp or cpd with points: target"
+        elif isinstance(config, OdometryRegistration) and (not cloud.organised or cloud.lens is None):
+            missing = "a pixel grid and the lens, and this capture has none"
+            legal = "organised captures of a camera whose intrinsics are known"
+            fix = "give the intrinsics, or use another registration.method"
+        elif isinstance(config, NominalRegistration) and view.view.T_reference_view_guess is None:
+            missing = "the nominal pose of every view, and this view has none"
+            legal = "a guess of the pose of each view relative to the first"
+            fix = "give the guesses, or use registration.method: marks"
+        else:
+            continue
+        raise UserError(f"{view.view.name}: registration by {config.method} needs {missing}", legal=legal, fix=fix)
 
 
-def _pairwise(config: AnyRegistration) -> Callable[[PreparedView, PreparedView], Registration]:
-    """The method that registers a view to a reference, both given."""
+def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> Registration:
+    """Return the registration of a view to a reference that need not be the first view, not judged yet."""
+    started = perf_counter()
     if isinstance(config, NominalRegistration):
-        return _nominal
-    if isinstance(config, IcpRegistration):
+        # nobody has said how good the guess is
+        guess = guess_of(reference, view)
+        if guess is None:
+            return failed(view, "nominal", None, "no nominal pose is known")
+        found = Registration(view.view.name, "nominal", guess)
+    elif isinstance(config, IcpRegistration):
         from detectors.registration.icp import register_by_icp
 
-        return lambda reference, view: register_by_icp(reference, view, config)
-    if isinstance(config, CpdRegistration):
+        found = register_by_icp(reference, view, config)
+    elif isinstance(config, CpdRegistration):
         from detectors.registration.cpd import register_by_cpd
 
-        return lambda reference, view: register_by_cpd(reference, view, config)
-    from detectors.registration.by_marks import register_by_marks
+        found = register_by_cpd(reference, view, config)
+    else:
+        from detectors.registration.by_marks import register_by_marks
 
-    return register_by_marks
-
-
-def _all_together(views: Sequence[PreparedView], config: AnyRegistration) -> list[Registration]:
-    """Methods in which one view's place depends on the others."""
-    if isinstance(config, OdometryRegistration):
-        from detectors.registration.odometry import register_by_odometry
-
-        return register_by_odometry(views)
-    from detectors.registration.joint import register_jointly
-
-    return register_jointly(views)
+        found = register_by_marks(reference, view)
+    return replace(found, seconds=perf_counter() - started)
 
 
-def _nominal(reference: PreparedView, view: PreparedView) -> Registration:
-    """The guess itself; how good it is, nobody has said."""
-    started = perf_counter()
-    guess = guess_of(reference, view)
-    unknown, nan = np.full((6, 6), np.nan), float("nan")
-    if guess is None:
-        return unplaced(view.view.name, "nominal", None, "no nominal pose is known", started)
-    spent = perf_counter() - started
-    return Registration(view.view.name, "nominal", guess, unknown, np.zeros(3), nan, nan, 0, 0, True, spent)
+@dataclass(frozen=True)
+class LoopError:
+    """The closure error of a loop of three views, each step of which was registered separately.
+
+    ``views``: names, in the order of the loop. ``rotation_deg``: of the composed transform; ``translation_m``: root
+    mean square displacement of the first view's target by it. NaN where a step failed; ``failure`` names the step.
+    """
+
+    views: tuple[str, str, str]
+    rotation_deg: float
+    translation_m: float
+    failure: str = ""
+
+
+def loop_errors(views: Sequence[PreparedView], config: AnyRegistration, most: int = 40) -> tuple[LoopError, ...]:
+    """Return the closure errors of loops i -> j -> k -> i, at most ``most`` of them, evenly taken from all.
+
+    Every pair is registered directly, with the guess that those of both views imply. The errors of the three steps add,
+    so a loop shows about sqrt(3) times the error of a step; an error that a view brings equally into both of its
+    registrations is not seen. Empty for fewer than three views. Raises UserError as `register` does, and for methods
+    that do not register pairs.
+    """
+    if config.method in ("nominal", "joint", "odometry"):
+        raise UserError(
+            f"loops cannot be closed with {config.method}: it does not register pairs of views separately",
+            legal="icp, cpd, marks",
+        )
+    check_views(views, config)
+    loops = list(combinations(range(len(views)), 3))
+    loops = loops[:: max(1, -(-len(loops) // most))]
+    sides = sorted({pair for i, j, k in loops for pair in ((i, j), (j, k), (i, k))})
+    placed = {(i, j): judge(_pair(views[i], views[j], config), ReferenceTarget(views[i]), views[j]) for i, j in sides}
+    errors = []
+    for i, j, k in loops:
+        names = (views[i].view.name, views[j].view.name, views[k].view.name)
+        steps = [((a, b), placed[a, b]) for a, b in ((i, j), (j, k), (i, k))]
+        failures = [
+            f"{views[b].view.name} to {views[a].view.name}: {step.failure}" for (a, b), step in steps if step.failure
+        ]
+        if failures:
+            errors.append(LoopError(names, float("nan"), float("nan"), "; ".join(failures)))
+            continue
+        T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
+        closed = T_ij @ T_jk @ invert(T_ik)
+        turn = np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2))
+        errors.append(LoopError(names, float(turn), moved_m(closed, thinned(views[i].points_m, LOOP_POINTS))))
+    return tuple(errors)

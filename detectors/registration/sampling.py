@@ -1,4 +1,4 @@
-"""How finely and how precisely a view samples its target: the yardstick for residuals, overlaps and tolerances."""
+"""Point spacing and noise of a view's target: the scale of residuals, overlaps and tolerances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOISE_LAG = 6
 """Pixels between the three points of a second difference: one more than the 5 x 5 window of the widest depth filter, so
 that their errors are independent."""
 MEDIAN_TO_SIGMA = 1 / 0.6745
-"""Of a Gaussian: its standard deviation over its median absolute deviation."""
+"""Standard deviation of a Gaussian over its median absolute deviation."""
 THINNED_POINTS = 2000
 """Points of a view on which overlap and agreement are judged: a share is then known to 1 %."""
 
@@ -63,12 +63,12 @@ def plane_through(points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thinned(points_m: np.ndarray, most: int = THINNED_POINTS) -> np.ndarray:
-    """At most ``most`` of points (n, 3), evenly strided in the order of the grid."""
+    """Return at most ``most`` of points (n, 3), evenly strided in the order of the grid."""
     return points_m[:: max(1, -(-len(points_m) // most))]
 
 
 def independent(points: int) -> float:
-    """How many independent values as many pixels hold, in the worst case of a depth engine's filter; at least one."""
+    """Return the number of independent values among correlated pixels, for the widest depth filter; at least 1."""
     return max(points / CORRELATED_PIXELS, 1.0)
 
 
@@ -114,7 +114,8 @@ def _nearest_pitch(points_m: np.ndarray) -> float:
 
 
 def _local_noise(points_m: np.ndarray) -> float:
-    """From the distance of points to the plane through their 25 nearest, which takes 3 of 25 parts of the variance."""
+    """Return the noise from the distances of points to the plane through their 25 nearest points, which removes 3 of
+    25 parts of the variance."""
     from scipy.spatial import cKDTree
 
     count = min(CORRELATED_PIXELS, len(points_m))

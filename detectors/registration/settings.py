@@ -1,4 +1,4 @@
-"""How views are to be registered."""
+"""Settings of the registration methods."""
 
 from __future__ import annotations
 
@@ -46,20 +46,11 @@ class JointRegistration(Config):
 
 
 class OdometryRegistration(Config):
-    """RGB-D odometry from view to view (Open3D), no marks: what a SLAM system does without closing loops."""
+    """RGB-D odometry from view to view (Open3D), no marks: a SLAM system without loop closure."""
 
     method: Literal["odometry"] = "odometry"
 
 
-RegistrationConfig = Annotated[
-    NominalRegistration
-    | IcpRegistration
-    | CpdRegistration
-    | MarksRegistration
-    | JointRegistration
-    | OdometryRegistration,
-    Field(discriminator="method"),
-]
 AnyRegistration = (
     NominalRegistration
     | IcpRegistration
@@ -68,5 +59,6 @@ AnyRegistration = (
     | JointRegistration
     | OdometryRegistration
 )
+RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="method")]
 PAIRWISE = ("nominal", "icp", "cpd", "marks")
 """Methods that register each view to the first by itself, so that other views cannot change it."""

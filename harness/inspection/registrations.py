@@ -13,7 +13,7 @@ from harness.vocabulary.units import MM
 if TYPE_CHECKING:
     from detectors.mapping.map_views import Mapped
     from detectors.mapping.settings import MappingConfig
-    from detectors.registration.loops import LoopError
+    from detectors.registration.register import LoopError
     from detectors.registration.registered import Registration
 
 LOOPING = ("marks", "icp", "cpd")
@@ -41,7 +41,7 @@ def checks_of(mapped: Mapped, config: MappingConfig) -> Checks:
     _, normal = plane_through(points_m)
     loops: tuple[LoopError, ...] = ()
     if config.registration.method in LOOPING and len(mapped.views) > 2:
-        from detectors.registration.loops import loop_errors
+        from detectors.registration.register import loop_errors
 
         loops = loop_errors(mapped.views, config.registration)
     return Checks(
