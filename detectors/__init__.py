@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.plug_ins import PlugIns
 
 if TYPE_CHECKING:
@@ -57,12 +56,8 @@ def load_detector(name: str, settings: dict[str, Any]) -> Detector:
 
     Raises UserError as `detector_type`, and where the settings are not legal (every problem at once).
     """
-    from pydantic import ValidationError
+    from harness.vocabulary.declaration.diagnose import settings_of
 
     kind = detector_type(name)
     settings_type = cast("type[Config]", kind.settings_type)
-    try:
-        return cast("Detector", kind(settings_type.from_data(settings)))
-    except ValidationError as error:
-        problems = [f"{'.'.join(map(str, p['loc'])) or 'settings'}: {p['msg']}" for p in error.errors()]
-        raise UserError(f"settings of detector {name!r}:\n  " + "\n  ".join(problems)) from error
+    return cast("Detector", kind(settings_of(settings_type, settings, f"settings of detector {name!r}")))

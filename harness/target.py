@@ -87,8 +87,7 @@ def _declared(name_or_path: str, board: int) -> TargetConfig:
 
 
 def _target(name_or_path: str) -> AnyTargetConfig:
-    from harness.vocabulary.declaration.diagnose import validated, wrong_choice
-    from harness.vocabulary.declaration.problems import DeclarationError, Problem
+    from harness.vocabulary.declaration.diagnose import read_as
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.declaration import TARGETS
 
@@ -98,16 +97,7 @@ def _target(name_or_path: str) -> AnyTargetConfig:
         raise UserError(
             f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
         )
-    source = read_yaml(Path(name_or_path))
-    name = source.data.get("name")
-    if name not in TARGETS:
-        place = source.place_of(("name",))
-        lacking = Problem("the file lacks the key `name`", place, legal=f"one of {', '.join(TARGETS)}")
-        raise DeclarationError(name_or_path, [wrong_choice(("name",), name, TARGETS, place) if name else lacking])
-    config, problems = validated(TARGETS[name], source, {})
-    if problems or config is None:
-        raise DeclarationError(name_or_path, problems)
-    return config
+    return read_as(TARGETS, "name", read_yaml(Path(name_or_path)))
 
 
 if __name__ == "__main__":

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.experiment.calibrated import lens_numbers
-from harness.experiment.load import load_experiment
+from harness.experiment.load import lens_numbers, load_experiment
 from harness.sweep import main
 from harness.vocabulary.errors import UserError
 from scenes.field_of_view import check_in_view

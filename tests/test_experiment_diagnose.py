@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from textwrap import dedent
 from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import BaseModel, Field, model_validator
 
+from detectors import load_detector
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import validated
-from harness.vocabulary.declaration.yaml_source import parse_yaml
+from harness.vocabulary.declaration.diagnose import read_as, validated
+from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import parse_yaml, read_yaml
+from harness.vocabulary.errors import UserError
+from scenes.sensor.camera import read_camera
+from scenes.target.declaration import TARGETS
 
 
 class Hole(Config):
@@ -217,7 +223,8 @@ def test_legal_words_of_annotations() -> None:
         fixed: Literal[3]
         below: Annotated[float, Field(lt=5)]
 
-    words = {name: shape.legal_at(annotation) for name, annotation in shape.fields_of(Sample).items()}
+    declared = shape.Declared(Sample, {}, {})
+    words = {name: shape.legal_at(declared.at((name,))) for name in Sample.model_fields}
     assert words == {
         "pair": "a list of a whole number, text",
         "few": "a list (1 to 2 items), each a number",
@@ -225,3 +232,37 @@ def test_legal_words_of_annotations() -> None:
         "fixed": "3",
         "below": "a number below 5",
     }
+
+
+@pytest.mark.parametrize("value", ["[a]", "{a: 1}", "3", "true"])
+def test_a_kind_or_name_that_is_no_text_is_refused_with_its_place(tmp_path: Path, value: str) -> None:
+    target, camera = tmp_path / "target.yaml", tmp_path / "camera.yaml"
+    target.write_text(f"name: {value}\n")
+    camera.write_text(f"kind: {value}\n")
+    with pytest.raises(DeclarationError, match=r"target\.yaml:1:7: `name` is .*none of the legal values"):
+        read_as(TARGETS, "name", read_yaml(target))
+    with pytest.raises(DeclarationError, match=r"camera\.yaml:1:7: `kind` is .*none of the legal values"):
+        read_camera(camera)
+    camera.write_text("name: a\n")
+    with pytest.raises(DeclarationError, match="lacks the key `kind`"):
+        read_camera(camera)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"surfce": {"degree": 3}}, ["unknown key `surfce`", "did you mean: surface"]),
+        ({"surface": {"degree": 99}}, ["`surface.degree` is 99: it should be less than or equal to"]),
+        ({"surface": {"degree": "x"}, "extra": 1}, ['`surface.degree` is "x"', "unknown key `extra`"]),
+        ({"crop": {"kind": "bax"}}, ['`crop.kind` is "bax"', "did you mean: box"]),
+    ],
+)
+def test_settings_from_options_are_refused_in_the_same_words(settings: dict[str, Any], expected: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        load_detector("thesis", settings)
+    message = str(caught.value)
+    assert message.startswith("settings of detector 'thesis':\n")
+    for words in expected:
+        assert words in message
+    for raw in ("Input should be", "Extra inputs", "pydantic"):
+        assert raw not in message

@@ -10,8 +10,7 @@ import pandas as pd
 from detectors import load_detector
 from detectors.average import prefix_averages
 from harness.experiment.load import resolved_yaml
-from harness.experiment.points import Experiment, Point
-from harness.experiment.recorded import recording_of
+from harness.experiment.points import Experiment, Point, recording_of
 from harness.experiment.schema import CaptureSource
 from harness.inspection.printed import print_warnings
 from harness.inspection.steps import judged as judged_cloud

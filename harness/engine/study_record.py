@@ -10,8 +10,7 @@ import pandas as pd
 from harness.engine.plan import PACKAGES, Batch, Group, Plan
 from harness.engine.tables import Tables
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
-from harness.experiment.declared import detector_version
-from harness.experiment.points import Experiment, Point
+from harness.experiment.points import Experiment, Point, detector_version
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
 

@@ -13,7 +13,7 @@ import pandas as pd
 from harness.engine.walls import wall_rows
 from harness.experiment.points import MAIN, Experiment, Point
 from harness.experiment.schema import LabelledVariation
-from harness.experiment.set_ups import FRAMES
+from harness.experiment.unfold import FRAMES
 from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.units import MM
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from harness.experiment.declared import DETECTOR_NAME, detector_names
-from harness.experiment.recorded import recording_of
-from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource
+from detectors import detector_names
+from harness.experiment.points import recording_of
+from harness.experiment.schema import DETECTOR_NAME, CaptureSource, ExperimentConfig, SimulatedSource
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
 from harness.vocabulary.declaration.problems import Problem

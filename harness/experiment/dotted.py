@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, get_args, get_origin
-
-from pydantic import BaseModel, TypeAdapter, ValidationError
-from pydantic.fields import FieldInfo
+from typing import Any
 
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
@@ -19,11 +15,8 @@ NOT_VARIED = ("sweep", "sensitivity")
 """Keys that hold dotted paths themselves."""
 
 
-_ABSENT = object()
-
-
 class PathError(Exception):
-    """A dotted path that leads nowhere in the data: what was met at ``path``, the part that could be followed."""
+    """A dotted path that leads nowhere in the data: the message, and the part of the path that could be followed."""
 
     def __init__(self, message: str, path: KeyPath) -> None:
         super().__init__(message)
@@ -48,18 +41,14 @@ def get_path(data: Any, path: KeyPath) -> Any:
     return data
 
 
-def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None) -> Any:
+def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
     """``data`` with the value at ``path`` replaced or added; the argument itself and all off the path stay unchanged.
 
     A mapping that is missing on the way is filled with its declared defaults where ``declared`` is given, so that
     setting one key of it leaves the others at what they would have been. Likewise a key that says which of several
-    kinds a mapping is (``merge.kind``) leaves out what only the former kind has. Raises PathError where the way is
-    barred.
+    kinds a mapping is (``merge.kind``) leaves out what only the former kind has. ``above`` is where ``data`` stands in
+    the declared data. Raises PathError where the way is barred.
     """
-    return _with(data, path, value, declared, ())
-
-
-def _with(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None, above: KeyPath) -> Any:
     if not path:
         return value
     key, rest = _index(data, path[0], above), path[1:]
@@ -67,27 +56,20 @@ def _with(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None,
     if isinstance(data, list):
         if not isinstance(key, int) or key >= len(data):
             raise PathError(f"the list has no item {key}; it has {len(data)}, counted from 0", here)
-        return [*data[:key], _with(data[key], rest, value, declared, here), *data[key + 1 :]]
-    if key in data or not rest:
-        inner = data.get(key)
-    else:
-        inner = default_at(declared, here)
-        if inner is _ABSENT:
+        return [*data[:key], set_path(data[key], rest, value, declared, here), *data[key + 1 :]]
+    inner = data.get(key)
+    if key not in data and rest:
+        schema = declared.at(here) if declared else None
+        if schema is None or "default" not in schema:
             raise PathError(f"there is no `{key}`", here)
-    kept = data if rest else _of_kind(data, key, value, declared, above)
-    return {**kept, key: _with(inner, rest, value, declared, here)}
-
-
-def _of_kind(data: Any, key: Any, value: Any, declared: shape.Declared | None, path: KeyPath) -> Any:
-    """The mapping at ``path`` without keys of its kind that the kind which ``value`` chooses does not know."""
-    annotation = declared.at(path) if declared else None
-    if annotation is None or shape.bare(annotation)[1] != key:
-        return data
-    old, new = (shape.model_for(annotation, one) for one in (data, {**data, key: value}))
-    if old is None or new is None:
-        return data
-    gone = set(old.model_fields) - set(new.model_fields)
-    return {name: one for name, one in data.items() if name not in gone}
+        inner = schema["default"]
+    around = declared.at(above) if declared and not rest else None
+    kinds = shape.kinds_of(around or {})
+    if around is not None and kinds and kinds[0] == key:
+        old, new = (shape.object_for(around, kind) or {} for kind in (data, {**data, key: value}))
+        gone = set(old.get("properties", ())) - set(new.get("properties", ()))
+        data = {name: held for name, held in data.items() if name not in gone}
+    return {**data, key: set_path(inner, rest, value, declared, here)}
 
 
 def _index(data: Any, key: str | int, above: KeyPath) -> Any:
@@ -98,37 +80,11 @@ def _index(data: Any, key: str | int, above: KeyPath) -> Any:
     raise PathError(f"`{dotted(above)}` is {shown(data)} here, which has no `{key}`", above)
 
 
-def default_at(declared: shape.Declared | None, path: KeyPath) -> Any:
-    """The declared default of a field as plain data, `_ABSENT` where it has none."""
-    annotation: Any = declared.at(path) if declared else None
-    for extra in get_args(annotation)[1:] if get_origin(annotation) is Annotated else ():
-        if isinstance(extra, FieldInfo) and not extra.is_required():
-            default = extra.get_default(call_default_factory=True, validated_data={})
-            if isinstance(default, BaseModel):
-                return _least(default, annotation)
-            adapter: TypeAdapter[Any] = TypeAdapter(annotation)
-            return adapter.dump_python(default, mode="json")
-    return _ABSENT
-
-
-def _least(default: BaseModel, annotation: Any) -> dict[str, Any]:
-    """The fewest keys that say what a default says, so that what a preset fills in is left to it."""
-    discriminator = shape.bare(annotation)[1]
-    least = default.model_dump(mode="json", exclude_defaults=True)
-    if discriminator:
-        least[discriminator] = getattr(default, discriminator)
-    try:
-        same = TypeAdapter(annotation).validate_json(json.dumps(least)) == default
-    except ValidationError:
-        same = False
-    return least if same else default.model_dump(mode="json")
-
-
 def path_problem(path: KeyPath, declared: shape.Declared, place: Place) -> Problem | None:
     """The problem of a path that the declaration does not have, None where it is legal; with the nearest legal path."""
     for depth in range(1, len(path) + 1):
         if declared.at(path[:depth]) is None:
-            known = [dotted(one) for one in declared.paths() if path[0] in NOT_VARIED or one[0] not in NOT_VARIED]
+            known = [dotted(legal) for legal in declared.paths() if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED]
             found = unknown_key(str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), place)
             return Problem(
                 f"unknown path `{dotted(path)}`: {found.message}", place, found.legal, nearest(dotted(path), known)

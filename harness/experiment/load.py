@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.calibrated import lens_numbers
-from harness.experiment.declared import DETECTOR_SETTINGS, declared_of, splices_of
 from harness.experiment.dotted import OPTION, overridden, set_path
-from harness.experiment.points import Experiment
-from harness.experiment.recorded import recording_of
-from harness.experiment.schema import ExperimentConfig, ValuesVariation
+from harness.experiment.points import Experiment, recording_of
+from harness.experiment.schema import DETECTOR_SETTINGS, ExperimentConfig, ValuesVariation, declared_of, splices_of
 from harness.experiment.unfold import unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import validated
@@ -20,7 +18,7 @@ from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.versions import check_version, stamp_of, stamped
-from scenes.sensor.camera import CameraConfig
+from scenes.sensor.camera import CameraConfig, camera_names, load_camera
 
 EXPERIMENT_VERSION = 1
 """Of the resolved experiment in a result folder; raised when a key changes its meaning."""
@@ -28,16 +26,22 @@ STAMP_KIND = "experiment"
 RESERVED = frozenset(
     {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
 )
+"""Devices on Windows: no folder of results can be called so there."""
+LENS_NUMBERS = {"lens.fx_px": "fx", "lens.fy_px": "fy", "lens.cx_px": "cx", "lens.cy_px": "cy"}
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
     """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
 
-    ``calibration``: a recording whose lens takes the place of the nominal one (`harness.experiment.calibrated`).
+    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`).
     """
     recording_of.cache_clear()
     written = read_yaml(Path(path))
-    _refuse_other_version(written, Path(path))
+    # a file that a result folder holds states its version; a file that is written by hand states none
+    found = stamp_of(written.text, STAMP_KIND)
+    if found is not None:
+        again = "take the experiment that it was made from, or remove the first line and mend what is refused then"
+        check_version(found, EXPERIMENT_VERSION, Path(path), "an experiment", again=again)
     source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, Path(path).resolve().parent)
     if calibration is not None:
@@ -45,7 +49,10 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     config, invalid = validated(ExperimentConfig, source, splices_of(source.data))
     problems += invalid
     problems += checks.name_problems(source)
-    problems += _reserved_names(source)
+    name = source.data.get("name")
+    if isinstance(name, str) and name.lower() in RESERVED:
+        message = f"`name` is {name}, which is a device's name on Windows"
+        problems.append(Problem(message, source.place_of(("name",)), fix="choose another name"))
     if config is not None and not problems:
         problems += checks.joint_problems(config, source)
     points, unfolding = unfolded(source, None if problems else config)
@@ -57,22 +64,6 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 def resolved_yaml(experiment: Experiment) -> str:
     """The experiment with every default written out, under its version; loading it again gives the same points."""
     return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
-
-
-def _refuse_other_version(source: Source, path: Path) -> None:
-    """A file that a result folder holds says its version; one that is written by hand says none and is read as is."""
-    found = stamp_of(source.text, STAMP_KIND)
-    if found is not None:
-        again = "take the experiment that it was made from, or remove the first line and mend what is refused then"
-        check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
-
-
-def _reserved_names(source: Source) -> Iterator[Problem]:
-    """Names that are devices on Windows: no folder of results can be called so there."""
-    name = source.data.get("name")
-    if isinstance(name, str) and name.lower() in RESERVED:
-        place = source.place_of(("name",))
-        yield Problem(f"`name` is {name}, which is a device's name on Windows", place, fix="choose another name")
 
 
 def _resolved_data(config: ExperimentConfig, source: Source) -> dict[str, Any]:
@@ -95,16 +86,16 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     data = source.data
     if shape.get(data, ("source", "kind")) != "capture":
         return source
-    listed = shape.get(data, ("source", "paths"))
-    names: list[KeyPath] = [
-        ("source", "paths", index) for index in range(len(listed) if isinstance(listed, list) else 0)
-    ]
-    lens = shape.get(data, ("source", "intrinsics"))
-    if isinstance(lens, str) and lens not in checks.camera_names():
-        names.append(("source", "intrinsics"))
-    for at in names:
-        data = _absolute(data, at, Path.cwd() if source.place_of(at).origin == OPTION else folder)
-    return Source(source.origin, source.text, data, source.values, source.keys)
+    listed, lens = (shape.get(data, ("source", key)) for key in ("paths", "intrinsics"))
+    places: list[KeyPath] = [("source", "paths", k) for k in range(len(listed) if isinstance(listed, list) else 0)]
+    if isinstance(lens, str) and lens not in camera_names():
+        places.append(("source", "intrinsics"))
+    for at in places:
+        name = shape.get(data, at)
+        if isinstance(name, str) and name:
+            start = Path.cwd() if source.place_of(at).origin == OPTION else folder
+            data = set_path(data, at, str(start / Path(name).expanduser()))
+    return replace(source, data=data)
 
 
 def _with_calibration(source: Source, recording: Path) -> Source:
@@ -116,10 +107,33 @@ def _with_calibration(source: Source, recording: Path) -> Source:
     names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]
     numbers = shape.get(source.data, checks.CAMERA_NUMBERS)
     merged = {**(numbers if isinstance(numbers, dict) else {}), **lens_numbers(recording, map(str, names))}
-    data = set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data))
-    return Source(source.origin, source.text, data, source.values, source.keys)
+    return replace(source, data=set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data)))
 
 
-def _absolute(data: Any, at: KeyPath, folder: Path) -> Any:
-    name = shape.get(data, at)
-    return set_path(data, at, str(folder / Path(name).expanduser())) if isinstance(name, str) and name else data
+def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
+    """The ``source.camera.numbers`` with which the cameras look through a recording's own lens.
+
+    Raises UserError where the recording cannot be read, names no lens, or is of another size than a camera's sensor.
+    """
+    from detectors.recordings import open_capture  # brings the readers of every format
+
+    lens = None
+    if recording.is_dir() or recording.suffix.lower() == ".mkv":
+        lens = open_capture([recording]).lens
+    elif not recording.is_file():
+        raise UserError(f"--calibration {recording}: no such file or folder")
+    if lens is None:
+        raise UserError(
+            f"--calibration {recording}: holds no calibration of a lens",
+            legal="an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them",
+        )
+    for name in cameras:
+        nominal = load_camera(name).nominal_lens if name in camera_names() else lens
+        if (nominal.width, nominal.height) != (lens.width, lens.height):
+            raise UserError(
+                f"{recording}: the calibration is of {lens.width} x {lens.height} pixels",
+                legal=f"{nominal.width} x {nominal.height}, as {name} has",
+                fix="name a recording of the same camera in the same mode, or choose another source.camera.name",
+            )
+    numbers: dict[str, Any] = {path: float(getattr(lens, key)) for path, key in LENS_NUMBERS.items()}
+    return {**numbers, "lens.distortion": [float(term) for term in lens.distortion]}

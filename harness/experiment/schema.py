@@ -1,4 +1,4 @@
-"""What an experiment's YAML may say. Ranges of single fields are here; what concerns several together in `checks`."""
+"""The keys of an experiment's YAML. Ranges of single fields are here; what concerns several together is in `checks`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from detectors import detector_names, detector_type
 from detectors.average import AverageConfig
 from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
+from harness.vocabulary.declaration import shape
 from scenes.perspectives import AnyViews
 from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig
@@ -23,20 +25,13 @@ DEFAULT_RATE_PER_M2 = 1.0
 Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
 Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
-AxisValues = Annotated[
-    tuple[Any, ...],
-    Field(min_length=1, max_length=1000),
-    # strict mode takes no list for a tuple, and within a mapping nothing has made one of it yet
-    BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values),
-]
+ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values)
+"""Strict mode takes no list for a tuple, and within a mapping nothing has made a tuple of it yet."""
+AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
 Reason = Annotated[str, Field(min_length=1, max_length=1000)]
-StudyFrames = Annotated[
-    tuple[Frames, ...],
-    Field(min_length=1, max_length=100),
-    BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values),
-]
+StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100), ListAsTuple]
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -187,3 +182,21 @@ class ExperimentConfig(Config):
         None, description="a mapping of switches: a set-up with none on, with each alone, with all but each, with all"
     )
     sensitivity: SensitivityConfig | None = None
+
+
+DETECTOR_NAME = ("detector", "name")
+DETECTOR_SETTINGS = ("detector", "settings")
+
+
+def splices_of(data: Any) -> shape.Splices:
+    """The model of the detector's settings where they stand in the data; nothing for a detector that does not exist."""
+    detector = shape.child(data, "detector")
+    name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
+    if not isinstance(name, str) or name not in detector_names():
+        return {}
+    return {DETECTOR_SETTINGS: detector_type(name).settings_type}
+
+
+def declared_of(data: Any) -> shape.Declared:
+    """The declaration that ``data`` is meant to fill, the settings of the detector that it names included."""
+    return shape.Declared(ExperimentConfig, data, splices_of(data))

@@ -71,9 +71,8 @@ def mapping_config(arguments: argparse.Namespace) -> tuple[MappingConfig, tuple[
 
     Raises UserError where they are not legal, every problem at once.
     """
-    from pydantic import ValidationError
-
     from detectors.mapping.settings import MappingConfig
+    from harness.vocabulary.declaration.diagnose import settings_of
 
     data: dict[str, Any] = {
         "crop": crop_from_text(arguments.crop, arguments.target),
@@ -84,9 +83,5 @@ def mapping_config(arguments: argparse.Namespace) -> tuple[MappingConfig, tuple[
     for assignment in arguments.set:
         if assignment.startswith(PREFIX):
             assign(data, assignment.removeprefix(PREFIX))
-    try:
-        config = MappingConfig.from_data(data)
-    except ValidationError as error:
-        problems = [f"{PREFIX}{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()]
-        raise UserError("settings of the mapping:\n  " + "\n  ".join(problems)) from error
+    config = settings_of(MappingConfig, data, "settings of the mapping", PREFIX)
     return config, tuple(each for each in arguments.set if not each.startswith(PREFIX))

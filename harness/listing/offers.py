@@ -108,11 +108,11 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
 
 def _legal(declared: Declared, path: tuple[str, ...]) -> str:
     """What a setting may be; of one that chooses a kind, all kinds."""
-    from harness.vocabulary.declaration.shape import bare, branches, legal_at, tags_of
+    from harness.vocabulary.declaration.shape import kinds_of, legal_at
 
-    around = declared.at(path[:-1]) if len(path) > 1 else None
-    if around is not None and bare(around)[1] == path[-1]:
-        return "one of " + ", ".join(tag for branch in branches(around) for tag in tags_of(branch, path[-1]))
+    around = kinds_of(declared.at(path[:-1]) or {})
+    if around is not None and around[0] == path[-1]:
+        return "one of " + ", ".join(around[1])
     return legal_at(declared.at(path)) or ""
 
 

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.declaration.diagnose import validated, wrong_choice
+from harness.vocabulary.declaration.diagnose import read_as
 from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
@@ -187,14 +187,7 @@ def _camera_at(path: Path) -> AnyCamera:
 def read_camera(path: Path) -> AnyCamera:
     """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
     source = read_yaml(path)
-    kind = source.data.get("kind")
-    if kind not in KINDS:
-        place = source.place_of(("kind",))
-        lacking = Problem("the file lacks the key `kind`", place, legal="one of " + ", ".join(KINDS))
-        raise DeclarationError(str(path), [wrong_choice(("kind",), kind, KINDS, place) if kind else lacking])
-    camera, problems = validated(KINDS[kind], source, {})
-    if problems or camera is None:
-        raise DeclarationError(str(path), problems)
+    camera = read_as(KINDS, "kind", source)
     if camera.name != path.stem:
         message = f"`name` is {camera.name}, but the file is {path.name}"
         raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])

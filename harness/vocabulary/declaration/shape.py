@@ -1,20 +1,19 @@
 """The shape that a declaration's models give to data: which keys are legal where, and what a place accepts.
 
-Walks the type annotations of pydantic models: nested models, lists, tuples, mappings, unions with and without a
-discriminator. A *splice* puts a model where another holds free data (the settings of a detector chosen by name).
+It is read from the JSON schema that pydantic makes of a model, with every reference filled in. A *splice* puts a model
+where another holds free data (the settings of a detector chosen by name).
 """
 
 from __future__ import annotations
 
 import json
-import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from functools import lru_cache
+from typing import Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, Discriminator, Tag, TypeAdapter
-from pydantic.errors import PydanticSchemaGenerationError, PydanticUserError
-from pydantic.fields import FieldInfo
+from pydantic import BaseModel, ValidationError
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaWarningKind, NoDefault
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import KeyPath
@@ -22,23 +21,9 @@ from harness.vocabulary.declaration.yaml_source import KeyPath
 LONGEST_NOTE = 100
 """Characters of a field's description that a message repeats; longer ones are essays, not limits."""
 
+Schema = Mapping[str, Any]
+"""A JSON schema without references; empty where anything is legal."""
 Splices = Mapping[KeyPath, type[Config]]
-
-
-@dataclass(frozen=True)
-class UnionChoice:
-    """A union without a discriminator that an error passed, and the branch that it belongs to."""
-
-    path: KeyPath
-    label: str
-
-
-@dataclass(frozen=True)
-class Landing:
-    """Where an error's location leads: the path in the data and the unions passed."""
-
-    path: KeyPath
-    unions: tuple[UnionChoice, ...]
 
 
 @dataclass(frozen=True)
@@ -49,148 +34,153 @@ class Declared:
     data: Any
     splices: Splices
 
-    def at(self, path: KeyPath) -> Any:
-        """What is declared at ``path``; None where some key on the way is unknown."""
-        return at(self.model, self.data, path, self.splices)
+    def at(self, path: KeyPath) -> Schema | None:
+        """The schema of what belongs at ``path``; None where some key on the way is unknown."""
+        schema: Schema | None = schema_of(self.model)
+        data = self.data
+        for depth in range(len(path) + 1):
+            schema = schema_of(self.splices[path[:depth]]) if path[:depth] in self.splices else schema
+            if depth == len(path) or schema is None:
+                return schema
+            schema, data = _below(schema, data, path[depth]), child(data, path[depth])
+        return schema
 
     def names(self, path: KeyPath) -> tuple[str, ...]:
-        """The legal keys of the mapping at ``path``."""
-        return names_at(self.at(path), get(self.data, path))
+        """The legal keys of the mapping at ``path``: its model's fields, or the keys that free data has."""
+        schema, data = self.at(path), get(self.data, path)
+        model = object_for(schema, data) if schema is not None else None
+        return tuple(model["properties"] if model else data if isinstance(data, Mapping) else ())
 
-    def paths(self) -> Iterator[KeyPath]:
-        """Every path that can be set."""
-        return all_paths(self.model, self.data, self.splices)
+    def paths(self, path: KeyPath = (), depth: int = 8) -> Iterator[KeyPath]:
+        """Every path that can be set: fields of models to ``depth`` levels, list items as the data has them."""
+        data = get(self.data, path)
+        for key in (range(len(data)) if isinstance(data, list) else self.names(path)) if depth else ():
+            yield (*path, key)
+            yield from self.paths((*path, key), depth - 1)
 
 
 DeclaredOf = Callable[[Any], Declared]
 """From data to what is declared for it (which detector's settings belong in it depends on the data)."""
 
 
-def bare(annotation: Any) -> tuple[Any, str | None]:
-    """An annotation without ``Annotated``, and the key that discriminates its union, if any."""
-    discriminator: str | None = None
-    while get_origin(annotation) is Annotated:
-        annotation, *extras = get_args(annotation)
-        for extra in extras:
-            found = extra.discriminator if isinstance(extra, FieldInfo | Discriminator) else None
-            found = found.discriminator if isinstance(found, Discriminator) else found
-            discriminator = found if isinstance(found, str) else discriminator
-    return annotation, discriminator
+class _Generator(GenerateJsonSchema):
+    """pydantic's generator, but with defaults of factories, with defaults of models in the fewest keys that mean the
+    same (so that what a preset fills in is left to it), and with an empty schema for a type that has none."""
+
+    ignored_warning_kinds: set[JsonSchemaWarningKind] = {  # noqa: RUF012 (declared so by the base class)
+        "skipped-choice",
+        "non-serializable-default",
+    }
+
+    def sort(self, value: Any, parent_key: str | None = None) -> Any:
+        return value  # kinds stay in the order in which they are declared
+
+    def handle_invalid_for_json_schema(self, schema: Any, error_info: str) -> dict[str, Any]:
+        return {}
+
+    def get_default_value(self, schema: Any) -> Any:
+        factory = None if schema.get("default_factory_takes_data") else schema.get("default_factory")
+        return factory() if factory else schema.get("default", NoDefault)
+
+    def encode_default(self, dft: Any) -> Any:
+        if not isinstance(dft, BaseModel):
+            return super().encode_default(dft)
+        constant = {
+            name: getattr(dft, name)
+            for name, field in type(dft).model_fields.items()
+            if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1
+        }
+        least = {**constant, **dft.model_dump(mode="json", exclude_defaults=True)}
+        try:
+            same = type(dft).model_validate(json.loads(json.dumps(least))) == dft
+        except ValidationError:
+            same = False
+        return least if same else dft.model_dump(mode="json")
 
 
-def branches(annotation: Any) -> tuple[Any, ...]:
-    """The members of a union but None; the annotation itself where it is no union."""
-    core, _ = bare(annotation)
-    if get_origin(core) in (Union, types.UnionType):
-        return tuple(member for member in get_args(core) if member is not type(None))
-    return (annotation,)
+@lru_cache(maxsize=200)
+def schema_of(model: type[BaseModel]) -> Schema:
+    """The JSON schema of a model with references filled in; a model within itself is free data there.
 
-
-def fields_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The annotation of every field with all that its FieldInfo says."""
-    return {name: Annotated[field.annotation, field] for name, field in model.model_fields.items()}
-
-
-def tags_of(branch: Any, discriminator: str) -> tuple[str, ...]:
-    """The values of ``discriminator`` that choose this branch of a union."""
-    core, _ = bare(branch)
-    tagged = tuple(extra.tag for extra in get_args(branch)[1:] if isinstance(extra, Tag))
-    if tagged or not _is_model(core):
-        return tagged
-    literal, _ = bare(core.model_fields[discriminator].annotation)
-    return tuple(map(str, get_args(literal))) if get_origin(literal) is Literal else ()
-
-
-def model_for(annotation: Any, data: Any) -> type[BaseModel] | None:
-    """The model that a mapping at this place is meant to fill: by its discriminator, else by most keys in common.
-
-    Most keys in common decide too where the discriminator's value is not legal, which is a problem of its own.
+    ``discriminator.mapping`` holds the schema of each tag. ``description`` is a field's own, never a docstring.
     """
-    _, discriminator = bare(annotation)
-    models = [core for core, _ in map(bare, branches(annotation)) if _is_model(core)]
-    if not models:
-        return None
-    keys = set(data) if isinstance(data, Mapping) else set()
-    if discriminator:
-        tag = data.get(discriminator) if isinstance(data, Mapping) else None
-        models = [model for model in models if str(tag) in tags_of(model, discriminator)] or models
-    return max(models, key=lambda model: len(keys & set(model.model_fields)))
+    whole = model.model_json_schema(schema_generator=_Generator)
+    definitions = whole.pop("$defs", {})
+
+    def filled(part: Any, within: tuple[str, ...]) -> Any:
+        if isinstance(part, list):
+            return [filled(item, within) for item in part]
+        if not isinstance(part, dict):
+            return part
+        name = part.get("$ref", "").rsplit("/", 1)[-1] if isinstance(part.get("$ref", ""), str) else ""
+        if not name:
+            return {key: filled(value, within) for key, value in part.items()}
+        target = {} if name in within else filled(definitions[name], (*within, name))
+        own = {key: filled(value, within) for key, value in part.items() if key != "$ref"}
+        return {**{key: value for key, value in target.items() if key != "description"}, **own}
+
+    def with_tags(part: Any) -> Any:
+        if (
+            isinstance(part, dict)
+            and isinstance(part.get("discriminator"), dict)
+            and "mapping" in part["discriminator"]
+        ):
+            tags = {tag: {"$ref": ref} for tag, ref in part["discriminator"]["mapping"].items()}
+            part = {**part, "discriminator": {**part["discriminator"], "mapping": tags}}
+        if isinstance(part, dict):
+            return {key: with_tags(value) for key, value in part.items()}
+        return [with_tags(item) for item in part] if isinstance(part, list) else part
+
+    definitions = {name: with_tags(part) for name, part in definitions.items()}
+    return dict(filled(with_tags(whole), ()))
 
 
-def step(annotation: Any, data: Any, key: str | int) -> Any:
-    """What is declared one key (or index) deeper, given the data here; None where the key is unknown there."""
-    model = model_for(annotation, data)
-    if model is not None and isinstance(key, str):
-        return fields_of(model).get(key)
-    for branch in branches(annotation):
-        core, _ = bare(branch)
-        origin, args = get_origin(core), get_args(core)
-        if isinstance(key, int) and origin is tuple and args:
-            return args[0] if args[-1] is Ellipsis else args[key] if key < len(args) else None
-        if isinstance(key, int) and isinstance(origin, type) and issubclass(origin, Sequence | set | frozenset):
-            return args[0]
-        if isinstance(key, str) and isinstance(origin, type) and issubclass(origin, Mapping):
-            return args[1]
-        if isinstance(key, str) and core in (dict, Any):
-            return Any
+def branches(schema: Schema) -> tuple[Schema, ...]:
+    """The alternatives of a union but null; the schema itself where it is no union."""
+    members = schema.get("anyOf") or schema.get("oneOf")
+    if members is None:
+        return () if schema.get("type") == "null" else (schema,)
+    return tuple(branch for member in members for branch in branches(member))
+
+
+def kinds_of(schema: Schema) -> tuple[str, Mapping[str, Schema]] | None:
+    """The key that tells the kinds of a mapping apart and the schema of each; None where there is no such key."""
+    for part in (schema, *schema.get("anyOf", ())):
+        if "discriminator" in part:
+            return part["discriminator"]["propertyName"], part["discriminator"]["mapping"]
     return None
 
 
-def at(annotation: Any, data: Any, path: KeyPath, splices: Splices) -> Any:
-    """What is declared at ``path``; None where some key on the way is unknown."""
-    for depth in range(len(path) + 1):
-        annotation = splices.get(path[:depth], annotation)
-        if depth == len(path) or annotation is None:
-            return annotation
-        annotation = step(annotation, data, path[depth])
-        data = child(data, path[depth])
-    return annotation
+def object_for(schema: Schema, data: Any) -> Schema | None:
+    """The model that a mapping at this place is meant to fill: by its kind, else by most keys in common.
+
+    Most keys in common decide too where the kind is not legal, which is a problem of its own.
+    """
+    keys = set(data) if isinstance(data, Mapping) else set()
+    kinds = kinds_of(schema)
+    if kinds and isinstance(data, Mapping) and str(data.get(kinds[0])) in kinds[1]:
+        return kinds[1][str(data[kinds[0]])]
+    models = [branch for branch in branches(schema) if "properties" in branch]
+    return max(models, key=lambda model: len(keys & set(model["properties"])), default=None)
 
 
-def names_at(annotation: Any, data: Any) -> tuple[str, ...]:
-    """The legal keys of a mapping at this place: its model's fields, or the keys that free data has."""
-    model = model_for(annotation, data)
-    if model is not None:
-        return tuple(model.model_fields)
-    return tuple(data) if isinstance(data, Mapping) else ()
-
-
-def all_paths(annotation: Any, data: Any, splices: Splices, path: KeyPath = (), depth: int = 8) -> Iterator[KeyPath]:
-    """Every path that can be set: fields of models to ``depth`` levels, list items as the data has them."""
-    annotation = splices.get(path, annotation)
-    if depth == 0:
-        return
-    keys: Sequence[str | int] = names_at(annotation, data)
-    if isinstance(data, list):
-        keys = range(len(data))
-    for key in keys:
-        below = step(annotation, data, key)
-        yield (*path, key)
-        yield from all_paths(below, child(data, key), splices, (*path, key), depth - 1)
-
-
-def land(declared: Declared, loc: Sequence[str | int]) -> Landing:
-    """Follow pydantic's error location, which mixes keys of the data with labels of union branches."""
-    annotation: Any = declared.model
-    data, rest = declared.data, list(loc)
-    path: KeyPath = ()
-    unions: list[UnionChoice] = []
-    while rest:
-        annotation = declared.splices.get(path, annotation)
-        members = branches(annotation)
-        if len(members) > 1:
-            label = str(rest.pop(0))
-            _, discriminator = bare(annotation)
-            if discriminator is None:
-                unions.append(UnionChoice(path, label))
-            annotation = next((one for one in members if label in _labels(one, discriminator)), None)
-            continue
-        key = rest.pop(0)
-        below = step(annotation, data, key) if annotation is not None else None
-        if below is None and not _has(data, key):
-            continue  # the label of a wrapping validator, no key of the data
-        annotation, data, path = below, child(data, key), (*path, key)
-    return Landing(path, tuple(unions))
+def _below(schema: Schema, data: Any, key: str | int) -> Schema | None:
+    """The schema one key (or index) deeper, given the data here; None where the key is unknown there."""
+    model = object_for(schema, data)
+    if model is not None and isinstance(key, str):
+        return model["properties"].get(key)
+    for branch in branches(schema):
+        kind = branch.get("type")
+        if isinstance(key, int) and kind == "array":
+            items = branch.get("prefixItems")
+            return branch.get("items", {}) if items is None else items[key] if key < len(items) else None
+        if isinstance(key, str) and kind == "object":
+            by_pattern: Any = next(iter(branch.get("patternProperties", {}).values()), {})
+            values: Any = branch.get("additionalProperties") or by_pattern
+            return values if isinstance(values, Mapping) else {}
+        if isinstance(key, str) and not {"type", "enum", "const"} & set(branch):
+            return {}
+    return None
 
 
 def get(data: Any, path: KeyPath) -> Any:
@@ -209,110 +199,75 @@ def child(data: Any, key: str | int) -> Any:
     return None
 
 
-def _has(data: Any, key: str | int) -> bool:
-    """Whether a mapping has the key, or a list the index."""
-    return key in data if isinstance(data, Mapping) else isinstance(data, list) and key in range(len(data))
-
-
-def choices_of(annotation: Any) -> tuple[Any, ...]:
+def choices_of(schema: Schema | None) -> tuple[Any, ...]:
     """The values of an enumeration or Literal at this place, () where it is neither."""
-    schema = json_schema_of(annotation)
-    found: list[Any] = []
-    for option in (schema, *schema.get("anyOf", ())):
-        option = _dereferenced(option, schema)
-        found += option["enum"] if "enum" in option else [option["const"]] if "const" in option else []
-    return tuple(found)
+    found = [one.get("enum", [one["const"]] if "const" in one else []) for one in branches(schema or {})]
+    return tuple(value for values in found for value in values)
 
 
-def legal_at(annotation: Any) -> str | None:
-    """In words, what a place accepts: type, bounds, choices, and what the field's description says of it."""
-    if annotation is None:
-        return None
-    schema = json_schema_of(annotation)
-    words = _words(schema, schema)
-    note = schema.get("description", "") if get_origin(annotation) is Annotated else ""
+def legal_at(schema: Schema | None) -> str | None:
+    """What a place accepts in words: type, bounds, choices, and what the field's description says of it."""
+    words, note = _words(schema or {}), (schema or {}).get("description", "")
     return f"{words} ({note})" if words and 0 < len(note) <= LONGEST_NOTE else words or None
 
 
-def json_schema_of(annotation: Any) -> dict[str, Any]:
-    """The JSON schema of an annotation, {} where it has none."""
-    try:
-        return TypeAdapter(annotation).json_schema()
-    except (PydanticSchemaGenerationError, PydanticUserError):
-        return {}
-
-
-def _is_model(core: Any) -> bool:
-    return isinstance(core, type) and issubclass(core, BaseModel)
-
-
-def _labels(branch: Any, discriminator: str | None) -> tuple[str, ...]:
-    """What pydantic calls a branch of a union in an error's location."""
-    if discriminator is not None:
-        return tags_of(branch, discriminator)
-    core, _ = bare(branch)
-    name = core.__name__ if isinstance(core, type) and get_origin(core) is None else str(core)
-    origin = get_origin(core)
-    listed = f"{origin.__name__}[" if isinstance(origin, type) else ""
-    return (name, f"constrained-{name}", listed)
-
-
-def _dereferenced(schema: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str, Any]:
-    if "$ref" in schema:
-        return root.get("$defs", {}).get(schema["$ref"].rsplit("/", 1)[-1], {})
-    return schema
-
-
-def _words(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
-    schema = _dereferenced(schema, root)
+def _words(schema: Schema) -> str:
     for union in ("anyOf", "oneOf", "allOf"):
         if union in schema:
-            return " or ".join(filter(None, dict.fromkeys(_words(one, root) for one in schema[union])))
+            return " or ".join(filter(None, dict.fromkeys(map(_words, schema[union]))))
     if "enum" in schema:
-        return "one of " + ", ".join(map(_plain, schema["enum"]))
+        return "one of " + ", ".join(map(plain, schema["enum"]))
     if "const" in schema:
-        return _plain(schema["const"])
+        return plain(schema["const"])
     kind = schema.get("type")
     if kind == "object":
-        return _object_words(schema, root)
+        if "properties" in schema:
+            return "a mapping with the keys " + ", ".join(schema["properties"])
+        values = schema.get("additionalProperties")
+        inner = _words(values) if isinstance(values, Mapping) else ""
+        return f"a mapping of names to {inner}" if inner else "a mapping"
     if kind == "array":
-        return _array_words(schema, root)
+        if "prefixItems" in schema:
+            return "a list of " + ", ".join(_words(item) or "a value" for item in schema["prefixItems"])
+        least, most = schema.get("minItems"), schema.get("maxItems")
+        counts = {(True, True): f" ({least} to {most} items)", (True, False): f" (at least {least} items)"}
+        count = counts.get((bool(least), bool(most)), f" (at most {most} items)" if most else "")
+        inner = _words(schema.get("items", {}))
+        return f"a list{count}" + (f", each {inner}" if inner else "")
     if kind == "string":
-        pattern = f" that matches {schema['pattern']}" if "pattern" in schema else ""
-        return f"text{pattern}"
-    words = {"integer": "a whole number", "number": "a number", "boolean": "true or false", "null": "null"}
-    return words[kind] + _bounds(schema) if kind in words else ""
+        return f"text that matches {schema['pattern']}" if "pattern" in schema else "text"
+    numbers = {"integer": "a whole number", "number": "a number", "boolean": "true or false", "null": "null"}
+    if kind not in numbers:
+        return ""
+    bounds = {
+        word: f"{schema[key]:g}" if isinstance(schema[key], float) else str(schema[key])
+        for key, word in (
+            ("minimum", "at least"),
+            ("exclusiveMinimum", "above"),
+            ("maximum", "at most"),
+            ("exclusiveMaximum", "below"),
+        )
+        if key in schema
+    }
+    if {"at least", "at most"} <= set(bounds):
+        return f"{numbers[kind]} from {bounds['at least']} to {bounds['at most']}"
+    return " ".join([numbers[kind], " and ".join(f"{word} {bound}" for word, bound in bounds.items())]).strip()
 
 
-def _object_words(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
-    if "properties" in schema:
-        return "a mapping with the keys " + ", ".join(schema["properties"])
-    values = schema.get("additionalProperties")
-    inner = _words(values, root) if isinstance(values, Mapping) else ""
-    return f"a mapping of names to {inner}" if inner else "a mapping"
-
-
-def _array_words(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
-    if "prefixItems" in schema:
-        return "a list of " + ", ".join(_words(item, root) or "a value" for item in schema["prefixItems"])
-    least, most = schema.get("minItems"), schema.get("maxItems")
-    count = f" ({least} to {most} items)" if least and most else f" (at least {least} items)" if least else ""
-    count = f" (at most {most} items)" if most and not least else count
-    inner = _words(schema.get("items", {}), root)
-    return f"a list{count}" + (f", each {inner}" if inner else "")
-
-
-def _bounds(schema: Mapping[str, Any]) -> str:
-    least, above, most, below = (
-        f"{schema[key]:g}" if isinstance(schema.get(key), float) else str(schema[key]) if key in schema else None
-        for key in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")
-    )
-    if least and most:
-        return f" from {least} to {most}"
-    low = f"at least {least}" if least else f"above {above}" if above else ""
-    high = f"at most {most}" if most else f"below {below}" if below else ""
-    return " " + " and ".join(filter(None, [low, high])) if low or high else ""
-
-
-def _plain(value: Any) -> str:
+def plain(value: Any) -> str:
+    """A legal value as a user writes it."""
     return value if isinstance(value, str) else json.dumps(value)
+
+
+def landing(data: Any, location: Sequence[str | int], missing: bool) -> tuple[KeyPath, tuple[KeyPath, str] | None]:
+    """The path in the data of pydantic's error location, which mixes keys of the data with labels of union branches,
+    and the first such label with the path where it stands. ``missing``: the last key is not in the data."""
+    path: KeyPath = ()
+    label: tuple[KeyPath, str] | None = None
+    for number, key in enumerate(location):
+        known = key in data if isinstance(data, Mapping) else isinstance(data, list) and key in range(len(data))
+        if known or (missing and number == len(location) - 1):
+            path, data = (*path, key), child(data, key)
+        else:
+            label = label or (path, str(key))
+    return path, label
