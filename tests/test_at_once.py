@@ -127,7 +127,10 @@ def compared(one: np.ndarray, other: np.ndarray) -> float:
     return float(difference / error) if error > 0 else (0.0 if difference == 0 else np.inf)
 
 
-@pytest.mark.parametrize("behind_mm", [2.0, 9.5, 20.0, 200.0, NOTHING_BEHIND_M / MM])
+@pytest.mark.parametrize(
+    "behind_mm",
+    [20.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (2.0, 9.5, 200.0, NOTHING_BEHIND_M / MM))],
+)
 @pytest.mark.parametrize("name", REGIONS)
 def test_averages_drawn_at_once_have_the_distribution_of_those_of_frames(name: str, behind_mm: float):
     """Dents and blind holes (2 and 9.5 mm), and through-holes with a backing near, far and none."""
@@ -247,6 +250,7 @@ def trial(unit: SimulatedUnit, number: int, hole: np.ndarray, exact: bool, detec
     return np.nanmax(score[hole]) > k, np.nanmax(np.where(hole, np.nan, score))
 
 
+@pytest.mark.slow
 def test_a_detector_finds_as_often_and_calls_as_often_falsely():
     """A shallow hole near the limit, 200 trials each way: detection at a threshold that half the trials pass, the quiet
     threshold's distribution (Kolmogorov and Smirnov), and false calls at the threshold that one in five passes."""

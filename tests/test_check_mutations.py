@@ -19,6 +19,8 @@ import pytest
 from harness import check
 from tests.mutated_detectors import write_mutants
 
+pytestmark = pytest.mark.slow  # a study of twenty boards for each fault
+
 ROOT = Path(__file__).resolve().parents[1]
 SMALLER = (
     "study.boards=20",

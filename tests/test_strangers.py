@@ -69,9 +69,13 @@ ANSWERED = (
     ("dropouts", 0), ("pipe_outside", 0), ("sphere", 0), ("dark_patch", 1),
     ("quarter_mm", 0), ("undamaged", 0), ("passer_by", 0), ("resolutions", 0),
 )  # fmt: skip
+QUICK = ("before_wall", "no_return", "pipe_outside", "quarter_mm", "undamaged", "tilted")
+"""A board before a wall, missing returns, a curved part, an unclear unit, no damage, a slanted view."""
 
 
-@pytest.mark.parametrize(("kind", "seed"), ANSWERED)
+@pytest.mark.parametrize(
+    ("kind", "seed"), [pytest.param(*each, marks=[] if each[0] in QUICK else [pytest.mark.slow]) for each in ANSWERED]
+)
 def test_no_answer_is_wrong_without_a_word(kind, seed, tmp_path):
     score = made(kind, seed, tmp_path)
     assert score.verdict != "wrong", (score.why, score.output)

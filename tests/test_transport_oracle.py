@@ -107,6 +107,7 @@ def test_inside_a_blind_hole(histogram):
     assert_agree(view.phasor.astype(complex), theirs, inside, 1e-3)
 
 
+@pytest.mark.slow
 @BOTH
 def test_the_thesis_scene(histogram):
     """The board in its room, through-holes before a backing 50 mm behind: the face, and what is seen in the holes.

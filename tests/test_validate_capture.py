@@ -143,6 +143,7 @@ def test_nothing_flat_is_refused(tmp_path, capsys):
 # ---- real captures ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_real_walls_are_found_and_the_simulation_follows_them(shared_data, tmp_path):
     """Both walls of the Azure Kinect's capture, without being told where they are; ratios as in docs/azure_walls.md."""
     lens = {key: getattr(AZURE.nominal_lens, key) for key in ("width", "height", "fx", "fy", "distortion")}

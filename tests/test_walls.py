@@ -85,6 +85,7 @@ def test_a_plane_is_exact_and_outliers_do_not_move_it():
 # ---------------------------------------------------------------- the camera model against the walls
 
 
+@pytest.mark.slow
 def test_temporal_deviation_follows_the_walls(checks):
     """In the lit cone the simulated deviation is 0.75 to 1 of the measured one, in every bin.
 
@@ -96,6 +97,7 @@ def test_temporal_deviation_follows_the_walls(checks):
             assert 0.75 < part.ratio < 1.0, f"{check.wall.name} wall at {part.at} m"
 
 
+@pytest.mark.slow
 def test_temporal_deviation_grows_with_range_as_on_the_walls(checks):
     """Each wall's ratios lie within 10 % of their mean: the growth with range is the model's, not the gain's."""
     for check in checks:
@@ -103,12 +105,14 @@ def test_temporal_deviation_grows_with_range_as_on_the_walls(checks):
         assert np.abs(ratios / ratios.mean() - 1).max() < 0.1
 
 
+@pytest.mark.slow
 def test_whole_walls_are_never_simulated_noisier_than_measured(checks):
     """Towards the edge of the lit field the real light falls off and the closed-form plane's does not."""
     for check in checks:
         assert all(0.45 < part.ratio < 1.0 for part in check.by_range)
 
 
+@pytest.mark.slow
 def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
     """Within 0.1 at lags 1 to 5, along x and y, without what a frame's pixels have in common (not modelled).
 
@@ -122,6 +126,7 @@ def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
         assert np.abs(raw).max() < 0.11
 
 
+@pytest.mark.slow
 def test_real_frames_jitter_as_a_whole(checks):
     """The camera's file has 0.25 mm from these frames; 22 simulated ones tell it to 15 % (one deviation)."""
     for check in checks:
@@ -130,6 +135,7 @@ def test_real_frames_jitter_as_a_whole(checks):
         assert 0.25e-3 * (1 - 3 * 0.15) < simulated < 0.25e-3 * (1 + 3 * 0.15)
 
 
+@pytest.mark.slow
 def test_the_files_fixed_pattern_is_that_of_the_walls(checks):
     """0.47 and 0.42 mm of the file's source, and 6.3 px within 1 px as the mean of both walls."""
     left, right = (check.pattern for check in checks)
@@ -138,6 +144,7 @@ def test_the_files_fixed_pattern_is_that_of_the_walls(checks):
     assert np.mean([left.length_px, right.length_px]) == pytest.approx(FILE.smooth_length_px.value, abs=1.0)
 
 
+@pytest.mark.slow
 def test_simulated_fixed_pattern_through_the_same_analysis(checks):
     """The file's pixel part is found again within 0.03 mm; the whole is 0.85 to 1.15 of the measured."""
     for check in checks:
@@ -149,6 +156,7 @@ def test_simulated_fixed_pattern_through_the_same_analysis(checks):
         assert 0.85 < std / check.pattern.std_m < 1.15
 
 
+@pytest.mark.slow
 def test_page_table_and_figure_hold_the_numbers(checks):
     text = page(checks, walls_camera())
     for check in checks:
