@@ -22,7 +22,7 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
     outline = transform_points(config.pose.T_camera_board, outline_board_m(config.board))
     seen_region(outline, optics)
     face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
-    range_m = face[:, 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
+    range_m = face[..., 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(
             f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
