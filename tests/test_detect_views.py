@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from detectors.mapping.map_views import Mapped
-from detectors.mapping.merge import Merged
+from detectors.mapping.merge import Mapped, Merged
 from detectors.marks.mark import MarkSet
 from detectors.registration.registered import reference_registration
 from detectors.views import PreparedView, View

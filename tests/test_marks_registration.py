@@ -12,10 +12,9 @@ from marked_boards import TAPES, board_pose, prepared
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from detectors.marks.mark import Mark, MarkSet
+from detectors.marks.mark import Mark, MarkSet, problem_of
 from detectors.marks.pairing import pair_marks
 from detectors.marks.placing import kabsch, place
-from detectors.marks.sufficient import problem_of
 from detectors.registration.by_marks import held_out_error_m, register_by_marks
 from detectors.registration.registered import displacement_jacobian, predicted_error_m
 from detectors.views import PreparedView

@@ -1,4 +1,4 @@
-"""What views of one surface disagree about beyond noise: the random effects of their errors, read off the views.
+"""Disagreement of views of one surface beyond noise: the random effects of their errors, estimated from the views.
 
 View i measures a cell's height as h + e_i + f(p_i) + g_i: e_i is the noise that the sensor's law and the registration's
 covariance explain; f the camera's fixed pattern, which belongs to the *pixel* p_i that looks at the cell and which all
@@ -56,8 +56,9 @@ class BetweenViews:
 def between_views(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
 ) -> BetweenViews:
-    """From heights (k, h, w), NaN where a view has none, with variances that the ``sensor`` and ``other`` (lens,
-    registration) explain, and the direction ``looks_px`` (k, h, w, 2) in which each view sees each cell, in pixels.
+    """Estimate it from heights (k, h, w), NaN where a view has none, with variances that the ``sensor`` and ``other``
+    (lens, registration) explain, and the direction ``looks_px`` (k, h, w, 2) in which each view sees each cell, in
+    pixels.
 
     ``repeated``: the sensor's variances come from repeated frames. All zero with one view or too little overlap.
     """

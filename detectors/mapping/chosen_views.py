@@ -24,7 +24,7 @@ class ChosenView:
 
     @property
     def cloud(self) -> Cloud:
-        """In its own camera's frame."""
+        """The cloud in its own camera's frame."""
         return self.prepared.view.cloud
 
     @property

@@ -15,9 +15,9 @@ GATE_SIGMAS = 5.0
 
 @dataclass(frozen=True)
 class Combined:
-    """Per cell, (h, w): ``height_m``, ``variance_m2`` of an intact surface's height, ``temporal_m2`` the part of it
-    that more frames would lessen, ``spread_m2`` the views' sample variance (NaN below two views). ``used`` (k, h, w)
-    bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``: outliers."""
+    """Values of each cell, (h, w): ``height_m``, ``variance_m2`` of an intact surface's height, ``temporal_m2`` the
+    part of it that more frames would lessen, ``spread_m2`` the views' sample variance (NaN below two views). ``used``
+    (k, h, w) bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``: outliers."""
 
     height_m: np.ndarray
     variance_m2: np.ndarray
@@ -121,7 +121,7 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _alone(heights: np.ndarray, row: int, column: int, limit: float) -> bool:
-    """Whether a cell lies farther than the limit behind the median of itself and its eight neighbours."""
+    """Return True if a cell lies farther than the limit behind the median of itself and its eight neighbours."""
     h, w = heights.shape
     near = np.empty(9)
     n = 0

@@ -1,4 +1,4 @@
-"""How noisy a view's depth is, read off the capture itself: the variance of each pixel's z from a law, not a sample.
+"""Noise of a view's depth, estimated from the capture itself: the variance of each pixel's z from a law, not a sample.
 
 The law is v = k q + c with q = 1 / amplitude^2 (phase noise of a correlation camera falls as 1 / amplitude: Lange and
 Seitz 2001) and c what does not depend on it (rounding, jitter). A sample variance of ten frames is off by a factor of

@@ -121,8 +121,9 @@ def _observe(view: PlacedView, sheet: _Sheet, T_reference_map: np.ndarray, slope
 def _sight_lines(
     points: np.ndarray, gradient: np.ndarray, camera: np.ndarray, R_view_map: np.ndarray, slope_step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For cells (h, w): unit direction to the camera (h, w, 3), change of height per metre along the ray, square of
-    the greatest change per metre across it, and x/z, y/z in the view's frame in the first view's pixels (h, w, 2)."""
+    """Return for cells (h, w): unit direction to the camera (h, w, 3), change of height per metre along the ray, square
+    of the greatest change per metre across it, and x/z, y/z in the view's frame in the first view's pixels (h, w,
+    2)."""
     h, w = points.shape[:2]
     direction, looks = np.empty((h, w, 3)), np.empty((h, w, 2))
     per_range, across = np.empty((h, w)), np.empty((h, w))
@@ -156,7 +157,7 @@ def _roughness(view: PlacedView) -> np.ndarray:
 
 
 def _neighbour_correlation(view: PlacedView) -> float:
-    """Of the deviations of pixels side by side, 0..1, from medians; 1 where the view has no grid to tell.
+    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a pixel grid.
 
     A smooth misfit of the surface counts as correlation, so that the variance is rather stated too large.
     """
@@ -172,7 +173,7 @@ def _neighbour_correlation(view: PlacedView) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    """Of some of the finite values, evenly taken; NaN where there is none."""
+    """Return the median of some of the finite values, evenly taken; NaN where there is none."""
     known = values[np.isfinite(values)]
     return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
 

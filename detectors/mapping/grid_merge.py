@@ -87,7 +87,7 @@ def _by_box(points: np.ndarray, corner: np.ndarray, step_m: float) -> tuple[np.n
 
 
 def _cloud(views: Sequence[ChosenView], sums: np.ndarray) -> Cloud:
-    """From rows of sums (m, 10): points, what `_values` gives, number of points."""
+    """Build the cloud from rows of sums (m, 10): points, what `_values` gives, number of points."""
     clouds = [view.cloud for view in views]
     n, samples = sums[:, 9:], sums[:, 7]
     # MATLAB rounds the mean colour

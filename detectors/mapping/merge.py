@@ -1,4 +1,4 @@
-"""Merging by whichever way its settings name."""
+"""From views to one cloud: prepare, register, and merge by the method that the settings name."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detectors.mapping.chosen_views import ChosenView, choose
+from detectors.crop import crop
+from detectors.mapping.chosen_views import choose
 from detectors.mapping.fusion import fuse
 from detectors.mapping.grid_merge import merge_on_grid
-from detectors.mapping.settings import AnyMerge, FusedMerge, GridMerge
+from detectors.mapping.settings import AnyMerge, FusedMerge, GridMerge, MappingConfig
 from detectors.mapping.surface_map import SurfaceMap
 from detectors.mapping.volume import integrate
+from detectors.marks.find import find_marks
+from detectors.registration.register import register
 from detectors.registration.registered import Registration
-from detectors.views import PreparedView
+from detectors.views import PreparedView, View
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.units import MM
 
@@ -47,13 +50,32 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
         cloud = merge_on_grid(chosen, config.step_mm * MM)
     elif isinstance(config, FusedMerge):
         surface_map, notes = fuse(chosen, None if config.cell_mm is None else config.cell_mm * MM)
-        cloud, T_reference_cloud = _cloud(chosen, surface_map), surface_map.T_reference_map
+        clouds = [view.cloud for view in chosen]
+        left = tuple(each for cloud in clouds for each in cloud.left_out)
+        cloud, T_reference_cloud = surface_map.cloud(sum(c.n_frames for c in clouds), left), surface_map.T_reference_map
     else:
         cloud, notes = integrate(chosen, None if config.voxel_mm is None else config.voxel_mm * MM)
     used = tuple(view.prepared.view.name for view in chosen)
     return Merged(cloud, T_reference_cloud, used, time.perf_counter() - began, left_out + notes, surface_map)
 
 
-def _cloud(views: Sequence[ChosenView], surface_map: SurfaceMap) -> Cloud:
-    clouds = [view.cloud for view in views]
-    return surface_map.cloud(sum(c.n_frames for c in clouds), tuple(left for c in clouds for left in c.left_out))
+@dataclass(frozen=True)
+class Mapped:
+    """Views, their registrations, and the cloud that they form."""
+
+    views: tuple[PreparedView, ...]
+    registrations: tuple[Registration, ...]
+    merged: Merged
+
+
+def prepare(view: View, config: MappingConfig) -> PreparedView:
+    """Cut the target out of a view and find its marks. Raises UserError where the crop leaves nothing."""
+    inside = crop(view.cloud, config.crop)
+    return PreparedView(view, inside, find_marks(view.cloud, inside, config.marks))
+
+
+def map_views(views: Sequence[View], config: MappingConfig) -> Mapped:
+    """Prepare, register and merge the first ``config.views`` of some views. Raises UserError as its parts do."""
+    prepared = tuple(prepare(view, config) for view in views[: config.views])
+    registrations = register(prepared, config.registration)
+    return Mapped(prepared, registrations, merge(prepared, registrations, config.merge))

@@ -46,7 +46,7 @@ class PlacedView:
         return np.isfinite(self.deviation_m)
 
     def raster(self, grid: Grid) -> Raster:
-        """Where the grid's cells lie among this view's pixels."""
+        """Return the position of the grid's cells among this view's pixels."""
         return raster_between(self.places_m, self.inside, self.chosen.cloud.organised, self.pitch_m, grid)
 
 

@@ -1,4 +1,4 @@
-"""From scattered samples of a surface to a grid: each cell lies in one triangle of neighbouring samples.
+"""Resampling of scattered samples of a surface to a grid: each cell lies in one triangle of neighbouring samples.
 
 Linear interpolation in triangles leaves no gaps and no beats between two grids of nearly equal pitch, as binning does;
 it blurs by a tent whose variance is, averaged over where cells fall, a sixth of the samples' spacing squared along
@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 LONGEST_EDGE = 4.0
-"""Of a triangle between samples without a grid, in spacings: a longer one bridges a gap."""
+"""Longest edge of a triangle between samples without a grid, in spacings: a longer one bridges a gap."""
 EXACT_PARTS = 4
 """Parts along a side up to which the weights of a cell's samples are added up one by one."""
 SLACK = 1e-9
@@ -52,7 +52,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Raster:
-    """For each cell of a grid the samples that it lies between. ``corners`` (h, w, 3) int64 flat indices of samples,
+    """The samples around each cell of a grid. ``corners`` (h, w, 3) int64 flat indices of samples,
     -1 where there is no triangle; ``shares`` (h, w, 3) their weights, which sum to 1. Cells that are larger than the
     samples' spacing are divided into ``parts`` x ``parts``, which the arrays then hold, and take their mean."""
 
@@ -112,7 +112,8 @@ def raster_of_grid(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raster:
 
 
 def raster_of_points(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raster:
-    """As `raster_of_grid`, for samples ``places`` (n, 2) without a grid: Delaunay's triangles with short edges."""
+    """Do the same as `raster_of_grid` for samples ``places`` (n, 2) without a grid: Delaunay's triangles with short
+    edges."""
     from scipy.spatial import Delaunay
 
     known = np.flatnonzero(valid)

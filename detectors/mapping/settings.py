@@ -1,4 +1,4 @@
-"""How registered views become one cloud."""
+"""Settings that turn registered views into one cloud."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 
 
 class MappingConfig(Config):
-    """From views to one cloud: the target is cut out of each view, its marks are found, views registered and merged.
+    """Settings from views to one cloud: the target is cut out of each view, its marks are found, views registered and
+    merged.
 
     ``views``: use the first so many; none means all. ``crop``: of each view, in its own frame.
     """

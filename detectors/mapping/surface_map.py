@@ -49,9 +49,9 @@ class SurfaceMap:
     amplitude: np.ndarray | None
 
     def cloud(self, n_frames: int, left_out: tuple[LeftOut, ...]) -> Cloud:
-        """What a detector sees: an organised cloud in the map's frame. ``variance_m2`` over ``count`` is the temporal
-        part of the variance, ``mean_variance_m2`` all of it, which one view does not know of itself (then None).
-        Rounding is in it, so there is no rounding step left."""
+        """Return the cloud that a detector sees: an organised cloud in the map's frame. ``variance_m2`` over ``count``
+        is the temporal part of the variance, ``mean_variance_m2`` all of it, which one view does not know of itself
+        (then None). Rounding is in it, so there is no rounding step left."""
         x, y = np.meshgrid(self.x_m, self.y_m)
         known = np.isfinite(self.height_m)
         points = np.stack([x, y, self.surface_z_m + self.height_m], axis=-1)

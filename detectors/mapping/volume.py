@@ -34,8 +34,8 @@ OVERSAMPLING = 2
 """Pixels of the undistorted image along a side of a pixel: the field takes the depth of the nearest one, which is wrong
 by up to half a pixel's width times the tangent of the incidence."""
 WALL_DEG = 60.0
-"""Between a crossing's normal and that of the target's smooth face, beyond which the crossing lies on a wall. A dent as
-deep as its radius has flanks of 45 degrees; a drilled wall has 90, less what the camera's blur takes."""
+"""Angle between a crossing's normal and that of the target's smooth face, beyond which the crossing lies on a wall. A
+dent as deep as its radius has flanks of 45 degrees; a drilled wall has 90, less what the camera's blur takes."""
 LOOKED_UP_AT = 0.5
 """Added to the principal point: Open3D's integration cuts pixel positions off, so the first pixel's centre is 0.5."""
 BLOCK = 8

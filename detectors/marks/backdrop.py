@@ -1,4 +1,4 @@
-"""What the target's own colour is, pixel by pixel, and which pixels stand apart from it.
+"""The target's own colour, pixel by pixel, and the pixels that differ from it.
 
 Colour enters as chromaticity, which uneven light leaves alone and light of another colour shifts. A smooth polynomial
 over the target, fitted robustly, follows the shift; the scatter of what is left (minimum covariance determinant,
@@ -19,11 +19,11 @@ FALSE_RATE = 1e-5
 a Gaussian scatter of the counts gives ten times as many, Laplace's a hundred times: one pixel in a thousand, which is
 no mark, because a mark has nine that touch."""
 DEGREE = 2
-"""Of the polynomial: one lamp's fall-off over a board, or two lamps of different colour, bend once."""
+"""Degree of the polynomial: one lamp's fall-off over a board, or two lamps of different colour, bend once."""
 SAMPLE = 4096
 """Pixels of the fit: a coefficient's standard error is then a sixtieth of the scatter."""
 STEPS = 6
-"""Of reweighting: the scatter has then settled to 3 %."""
+"""Iterations of the reweighting: the scatter has then settled to 3 %."""
 CORE = 0.6
 """Share of the pixels that the scatter rests on."""
 CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
@@ -32,7 +32,8 @@ the chi-squared distribution."""
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
 """Distances that `FALSE_RATE` of a Gaussian's exceed, in one and two dimensions."""
 NEARBY_PX = 16
-"""How far a camera smears colour: JPEG and video keep one colour for two by two pixels, in blocks of eight of these."""
+"""Reach over which a camera smears colour: JPEG and video keep one colour for two by two pixels, in blocks of eight of
+these."""
 TAIL = (0.4, 0.7)
 """Quantiles from which the tail is extrapolated; those above may be marks."""
 
@@ -53,7 +54,7 @@ def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Apart:
-    """How far pixels are from the target's own colour: ``contrast`` (n,) in deviations of its scatter, and ``margin``
+    """Distance of pixels from the target's own colour: ``contrast`` (n,) in deviations of its scatter, and ``margin``
     (n,) in units of the threshold, which is wider for dark pixels."""
 
     contrast: np.ndarray
@@ -61,7 +62,7 @@ class Apart:
 
 
 def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> Apart:
-    """Which pixels stand apart from the rest.
+    """Find the pixels that stand apart from the rest.
 
     ``features`` (n, p), p 1 or 2; ``rounding`` (n,) their variance from the whole counts, which dark pixels have more
     of: whatever noise the counts have is taken to grow as it does. ``xy`` (n, 2): any smooth co-ordinates.

@@ -12,23 +12,23 @@ from detectors.segment import euclidean_clusters
 from harness.vocabulary.capture import Cloud
 
 LEAST_PIXELS = 9
-"""Of a mark: three by three. Fewer have no inside, so nothing tells them from noise or from a rim."""
+"""Least pixels of a mark: three by three. Fewer have no inside, so nothing tells them from noise or from a rim."""
 MOST_BLOBS = 200
 """The largest are looked at: more than this is speckle."""
 RIM_PX = 2
-"""How far beyond the pixels found a mixed rim is looked for."""
+"""Reach beyond the pixels found within which a mixed rim is searched."""
 RING_PX = 8
 """Reach of the surroundings whose colour is compared; they begin where a window of five pixels misses the rim."""
 MIXED_SHARE = 0.15
-"""Of the rim two pixels wide: colours that are means over the pixel's area put 0.6 / 2 of it between 0.2 and 0.8 of the
-way from one colour to the other, colours of the pixel's centre none."""
+"""Weight of the rim two pixels wide: colours that are means over the pixel's area put 0.6 / 2 of it between 0.2 and 0.8
+of the way from one colour to the other, colours of the pixel's centre none."""
 SHARE_SIGMA = 0.1
-"""Of a rim's colour as a share of area: a camera's transfer curve and its lens's blur are not known. A curve of 1 / 2.2
-moves the shares between two colours of a contrast of five by as much."""
+"""Error of a rim's colour as a share of area: a camera's transfer curve and its lens's blur are not known. A curve of 1
+/ 2.2 moves the shares between two colours of a contrast of five by as much."""
 ALIKE = 0.35
 """A pixel has a blob's colour where its distance to it is less than this part of that to the surroundings' colour."""
 CUT_SHARE = 0.05
-"""Of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
+"""Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
 GAP_SPACINGS = 2.2
 """Steps between points of one mark in a cloud without a grid: neighbours along a diagonal (1.4), and one missing."""
 
@@ -77,7 +77,7 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
 
 
 def _once(blobs: list[Blob], pixels: int) -> list[Blob]:
-    """Without those that share pixels with a larger one: parts of it."""
+    """Drop blobs that share pixels with a larger blob: they are parts of it."""
     taken = np.zeros(pixels, dtype=bool)
     kept = []
     for blob in sorted(blobs, key=lambda b: -float(b.weights.sum())):
@@ -207,7 +207,7 @@ def _blob(window: _Window, mixed: bool, shape: tuple[int, int]) -> Blob | None:
 
 
 def _cut(window: _Window) -> str:
-    """Whether the group's colour goes on where the target's points do not."""
+    """Return a doubt if the group's colour continues where the target's points do not."""
     around = _dilated(window.group, 1) & ~window.group
     on = around & window.alike & ~window.inside
     if on.sum() <= max(2.0, CUT_SHARE * around.sum()):
@@ -240,7 +240,7 @@ def _dilated(mask: np.ndarray, by_px: int) -> np.ndarray:
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
-    """By one pixel; beyond the window counts as outside."""
+    """Erode by one pixel; everything beyond the window counts as outside."""
     padded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     shrunk: np.ndarray = padded > 0
     return shrunk

@@ -8,9 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from detectors.marks.mark import Mark, MarkSet
+from detectors.marks.mark import Mark, MarkSet, problem_of
 from detectors.marks.patch import Patch, fit_patch, mean_sigma_m
-from detectors.marks.sufficient import problem_of
 from harness.vocabulary.capture import Cloud
 
 CORNER_PX = 0.25

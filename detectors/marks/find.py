@@ -11,10 +11,9 @@ from detectors.marks.backdrop import above_half, chromaticity, lightness, stand_
 from detectors.marks.blobs import Blob, find_blobs
 from detectors.marks.coded import coded_marks
 from detectors.marks.judge import Candidate, judged
-from detectors.marks.mark import MarkSet
+from detectors.marks.mark import LEAST_MARKS, MarkSet, problem_of
 from detectors.marks.patch import fit_patch, place_spot
 from detectors.marks.settings import CodedMarks, ColourMarks, RedMarks
-from detectors.marks.sufficient import LEAST_MARKS, problem_of
 from harness.vocabulary.capture import Cloud
 
 Feature = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -42,8 +41,8 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
 
 
 def _red_marks(cloud: Cloud, inside: np.ndarray, deviations: float) -> MarkSet:
-    """By the thesis' rule: the red channel above the mean of the cropped cloud's by some of its standard deviations
-    (MATLAB's, with n - 1)."""
+    """Find marks by the thesis' rule: the red channel above the mean of the cropped cloud's by some of its standard
+    deviations (MATLAB's, with n - 1)."""
     assert cloud.rgb is not None
     red = cloud.rgb[inside][:, 0].astype(np.float64)
     limit = red.mean() + deviations * red.std(ddof=1)
@@ -59,8 +58,8 @@ def _red_marks(cloud: Cloud, inside: np.ndarray, deviations: float) -> MarkSet:
 
 
 def _colour_marks(cloud: Cloud, inside: np.ndarray) -> MarkSet:
-    """By chromaticity; where that gives too few marks or hardly any contrast, by lightness if that does better: black
-    and white have the light's own chromaticity, and black hardly any."""
+    """Find marks by chromaticity; where that gives too few marks or hardly any contrast, by lightness if that does
+    better: black and white have the light's own chromaticity, and black hardly any."""
     found, margin = _standing_out(cloud, inside, chromaticity)
     if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
         return found

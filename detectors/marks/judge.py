@@ -1,4 +1,4 @@
-"""Which coloured spots are marks, and which of these are in doubt.
+"""Decides which coloured spots are marks, and which marks are doubtful.
 
 A mark lies on the target's surface: what lies behind it is a hole through which something of another colour is seen.
 Pieces of tape of one colour are alike: which of them is the odd one, its colour's median tells, if there are three.
@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detectors.marks.blobs import Blob
-from detectors.marks.mark import Mark
+from detectors.marks.mark import LEAST_MARKS, Mark
 from detectors.marks.patch import Spot
-from detectors.marks.sufficient import LEAST_MARKS
 from harness.vocabulary.units import MM
 
 BEHIND_M = 2.0 * MM
@@ -26,13 +25,13 @@ RAISED_SHARE = 0.25
 SAME_COLOUR = 0.35
 """Two spots have one colour where their contrasts to their surroundings differ by less than this part of them."""
 WEAK_SHARE = 1 / 3
-"""Of the strongest colour's contrast to its surroundings: weaker spots beside such marks are stains, or what a camera's
-compression makes of the light."""
+"""Share of the strongest colour's contrast to its surroundings: weaker spots beside such marks are stains, or what a
+camera's compression makes of the light."""
 UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
 """A mark's length, breadth or area is unlike the others' where it differs by more than this part of the median and so
 many pixels more: a pixel at either end may be missed."""
 LARGEST_SHARE = 0.15
-"""Of the target: a larger spot is no mark, but a part of the target of another colour."""
+"""Share of the target: a larger spot is no mark but a part of the target of another colour."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +44,21 @@ class Candidate:
 
     @property
     def behind(self) -> bool:
-        """Whether it lies behind the surface."""
+        """True if it lies behind the surface."""
         return self.spot.behind_m > max(BEHIND_M, BEHIND_SIGMAS * self.spot.behind_sigma_m)
 
 
 def judged(candidates: Sequence[Candidate]) -> tuple[tuple[Mark, ...], tuple[str, ...]]:
     """The marks, in the order of their pixels, and notes on what was taken for none."""
-    colours = [kept for group in _by_colour(candidates) if (kept := _on_surface(group))]
+    colours = []
+    for group in _by_colour(candidates):
+        # a colour most of whose area lies behind has no mark: holes too small to look deep share the colour of others
+        behind = sum(c.spot.area_m2 for c in group if c.behind)
+        if behind <= 0.5 * sum(c.spot.area_m2 for c in group):
+            colours.append([c for c in group if not c.behind])
+    colours = [group for group in colours if group]
     groups = [_marks_of(group) for group in colours]
-    vivid = [_vividness(group) for group in colours]
+    vivid = [float(np.linalg.norm(group[0].blob.contrast)) for group in colours]
     enough = [sum(not mark.doubt for mark in group) >= LEAST_MARKS for group in groups]
     least = WEAK_SHARE * max((v for v, many in zip(vivid, enough, strict=True) if many), default=0.0)
     marks = [
@@ -71,17 +76,6 @@ def _doubt_of_colour(weak: bool, alone: bool) -> str:
     if weak:
         return "its colour hardly stands apart beside the others'"
     return f"no {LEAST_MARKS} marks have its colour, as they have another" if alone else ""
-
-
-def _on_surface(group: Sequence[Candidate]) -> list[Candidate]:
-    """Those of one colour that lie on the surface; none where most of its area lies behind, because holes too small to
-    look deep share the colour of those that do."""
-    behind = sum(c.spot.area_m2 for c in group if c.behind)
-    return [] if behind > 0.5 * sum(c.spot.area_m2 for c in group) else [c for c in group if not c.behind]
-
-
-def _vividness(group: Sequence[Candidate]) -> float:
-    return float(np.linalg.norm(group[0].blob.contrast))
 
 
 def _by_colour(candidates: Sequence[Candidate]) -> list[list[Candidate]]:

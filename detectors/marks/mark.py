@@ -1,10 +1,23 @@
-"""What a fiducial mark is to a registration: a place in the view's frame, with its covariance."""
+"""A fiducial mark as a registration sees it: a position in the view's frame, with its covariance; and the marks that
+suffice for a registration: three or more, trusted, and not on a line."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from harness.vocabulary.units import MM
+
+LEAST_MARKS = 3
+OFF_LINE_SIGMAS = 5.0
+"""Marks lie on a line where their root mean square distance from it is less than so many standard deviations of one
+mark's place: the turn about the line would be wrong by a fifth of a radian."""
+OFF_LINE_SHARE = 0.02
+"""... or less than this part of their root mean square distance along it: each millimetre that a view is wrong at a
+mark would become 50 mm at the same distance across the line."""
 
 
 @dataclass(frozen=True)
@@ -42,3 +55,30 @@ class MarkSet:
     def trusted(self) -> tuple[Mark, ...]:
         """The marks without a doubt."""
         return tuple(mark for mark in self.marks if not mark.doubt)
+
+
+def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
+    """Return the reason why no registration can rest on these marks, else empty. ``missing`` says why there are not
+    more."""
+    trusted = [mark for mark in marks if not mark.doubt]
+    doubtful = [mark for mark in marks if mark.doubt]
+    if len(trusted) < LEAST_MARKS:
+        found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+        counted = sorted(Counter(mark.doubt for mark in doubtful).items())
+        each = "; ".join(doubt if n == 1 else f"{doubt} ({n} times)" for doubt, n in counted)
+        doubts = f"; {len(doubtful)} more in doubt: {each}" if doubtful else ""
+        return found + doubts + (f"; {missing}" if missing else "")
+    return off_line_problem(trusted)
+
+
+def off_line_problem(marks: Sequence[Mark]) -> str:
+    """Return the problem that the marks lie on a line, with their distance from it, else empty."""
+    places = np.stack([mark.centre_m for mark in marks])
+    sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
+    error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))
+    if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
+        return ""
+    return (
+        f"the {len(marks)} marks lie on a line, {sizes[1] / MM:.1f} mm off it, which leaves the turn about it open;"
+        " a mark beside the line is missing"
+    )

@@ -1,4 +1,4 @@
-"""Which mark of one view is which mark of another: by code, or by the distances between marks, which no move changes.
+"""Matching of the marks of two views: by code, or by the distances between marks, which no move changes.
 
 Search over pairs, as in the interpretation trees of Grimson and Lozano-Perez (1987), without the tree. Two marks and
 their normals fix a placement; so each ordered pair of marks of the larger set that is as far apart as a pair of the
@@ -29,10 +29,11 @@ allows more (11 mm + 0.1 % of the distance), nearly all of which the marks of on
 DISTANCE_SIGMAS = 4.0
 """A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
-"""Of a matched mark's place, three degrees of freedom: a true one is lost once in 10,000."""
+"""Chi-square limit of a matched mark's position, three degrees of freedom: a true match is lost once in 10,000."""
 LEAST_PAIRS = 3
 GUESS_SIGMA_M = 50 * MM
-"""How far the guess puts marks wrong, root mean square: five degrees over half a metre, and some centimetres."""
+"""Error of the marks' positions by the guess, root mean square: five degrees over half a metre, and some
+centimetres."""
 PAIR_WORTH = 3.0
 """Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
 CLEAR_ODDS = 4.5
@@ -240,7 +241,7 @@ def _weights(few: _Side, many: _Side, partner: np.ndarray) -> np.ndarray:
 
 
 def _distinct(solutions: list[_Solution], few: _Side) -> list[_Solution]:
-    """Without those that place the marks as a better one does, to within half the distance between neighbours."""
+    """Drop solutions that place the marks as a better solution does, to within half the distance between neighbours."""
     own = few.distances + np.where(np.eye(len(few.distances), dtype=bool), np.inf, 0.0)
     limit = own.min() / 2
     kept: list[_Solution] = []

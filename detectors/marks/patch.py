@@ -139,7 +139,8 @@ def place_spot(cloud: Cloud, pixels: np.ndarray, weights: np.ndarray, grid: np.n
 
 
 def _offset(patch: Patch, points_m: np.ndarray) -> tuple[float, float]:
-    """How far points lie behind the plane, the mean of those within four scales of the median; their deviation."""
+    """Return the distance of points behind the plane, the mean of those within four scales of the median; their
+    deviation."""
     height = patch.above_m(points_m)
     middle = float(np.median(height))
     scale = max(float(np.median(np.abs(height - middle))) / 0.6745, LEAST_SCALE_M)

@@ -1,4 +1,4 @@
-"""How well a grid of pixels places the centroid of a region: the lattice's own error, with sharp edges and no noise.
+"""Error of a region's centroid on a grid of pixels: the lattice's own error, with sharp edges and no noise.
 
 A pixel belongs to the region where its centre does. Over random shifts of the lattice the error of the sum of
 f(x) = x - c over the pixels has, by Poisson's summation formula, the sum of |F(k)|^2 over all integer frequencies k but

@@ -1,4 +1,4 @@
-"""How marks are to be found."""
+"""Settings of the search for marks."""
 
 from __future__ import annotations
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from detectors.marks.mark import Mark
+from detectors.marks.mark import Mark, off_line_problem
 from detectors.marks.pairing import SHARED_M, Pairing, pair_marks
 from detectors.marks.placing import Placement, place
-from detectors.marks.sufficient import off_line_problem
 from detectors.registration.registered import Registration, failed, guess_of
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import transform_points

@@ -7,8 +7,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from detectors.mapping.map_views import prepare
-from detectors.mapping.merge import Merged, merge
+from detectors.mapping.merge import Merged, merge, prepare
 from detectors.mapping.settings import MappingConfig
 from detectors.registration.register import register
 from detectors.registration.registered import Registration, predicted_error_m

@@ -11,7 +11,7 @@ from harness.inspection import printed
 from harness.vocabulary.units import MM
 
 if TYPE_CHECKING:
-    from detectors.mapping.map_views import Mapped
+    from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
     from detectors.registration.register import LoopError
     from detectors.registration.registered import Registration

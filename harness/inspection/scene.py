@@ -10,7 +10,7 @@ from harness.report.view3d import Circle3d, Scene3d
 from harness.vocabulary.units import MM
 
 if TYPE_CHECKING:
-    from detectors.mapping.map_views import Mapped
+    from detectors.mapping.merge import Mapped
     from harness.report.findings import Judged
 
 SEVERAL = -1

@@ -21,7 +21,7 @@ from harness.vocabulary.versions import RESULTS_VERSION
 
 if TYPE_CHECKING:
     from detectors.interface import Detector
-    from detectors.mapping.map_views import Mapped
+    from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
@@ -123,8 +123,7 @@ def _view(arguments: argparse.Namespace, name: str, recording: Recording, guess:
 
 def _mapped(prepared: tuple[PreparedView, ...], config: MappingConfig, has_poses: bool) -> Mapped:
     """Register and merge. Raises UserError where a view's registration failed."""
-    from detectors.mapping.map_views import Mapped
-    from detectors.mapping.merge import merge
+    from detectors.mapping.merge import Mapped, merge
     from detectors.registration.register import register
 
     if config.registration.method in START_FROM_MARKS and not has_poses:
@@ -147,7 +146,7 @@ def _prepared(
 
     Raises UserError where it has no target.
     """
-    from detectors.mapping.map_views import prepare
+    from detectors.mapping.merge import prepare
 
     prepared = _of_view(view, prepare, view, config)
     print_choice(choice)
