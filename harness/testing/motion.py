@@ -14,9 +14,9 @@ from harness.vocabulary.geometry import Region, transform_points
 from harness.vocabulary.lens import Lens
 
 SCORE_TOLERANCE = 0.01
-"""Of the highest score: robust fits stop at a tolerance of their own, and sums in another order round otherwise."""
+"""Share of the highest score: robust fits stop at a tolerance of their own; sums in another order round otherwise."""
 CROP_TOLERANCE = 0.01
-"""Of the pixels: a crop may come to another decision at the target's rim."""
+"""Share of the pixels: a crop may come to another decision at the target's rim."""
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
 QUARTER_TURN = np.array([[0.0, 1.0, 0, 0], [-1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
@@ -113,14 +113,14 @@ def _compare_findings(
     before: Look, after: Look, threshold: float, pixels: np.ndarray, T_after_before: np.ndarray, how: str
 ) -> None:
     flat = pixels.reshape(-1)
-    was = {frozenset(one.pixels.tolist()): one for one in before.find(threshold)}
-    now = {frozenset(flat[one.pixels].tolist()): one for one in after.find(threshold)}
+    was = {frozenset(finding.pixels.tolist()): finding for finding in before.find(threshold)}
+    now = {frozenset(flat[finding.pixels].tolist()): finding for finding in after.find(threshold)}
     there, lost = len(was), len(was.keys() - now.keys())
     require(was.keys() == now.keys(), f"{how}, {lost} of {there} findings have other pixels, and there are {len(now)}")
-    for key, one in was.items():
-        apart = _apart_m(transform_points(T_after_before, one.centre_m), now[key].centre_m)
+    for key, finding in was.items():
+        apart = _apart_m(transform_points(T_after_before, finding.centre_m), now[key].centre_m)
         require(apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre lies {1e3 * apart:.2f} mm off")
-        sizes = [_diameter_m(look, found) for look, found in ((before, one), (after, now[key]))]
+        sizes = [_diameter_m(look, found) for look, found in ((before, finding), (after, now[key]))]
         grown = abs(sizes[1] - sizes[0])
         require(grown <= PLACE_TOLERANCE_M, f"{how}, a finding's extent changed by {1e3 * grown:.2f} mm")
 
@@ -129,6 +129,6 @@ def _apart_m(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
 
 
-def _diameter_m(look: Look, one: Detection) -> float:
+def _diameter_m(look: Look, finding: Detection) -> float:
     with no_crash("`measure`"):
-        return float(look.detector.measure(look.cloud, look.evidence, one).extent_diameter_m)
+        return float(look.detector.measure(look.cloud, look.evidence, finding).extent_diameter_m)

@@ -1,4 +1,4 @@
-"""From pydantic's errors to problems with a place: what is wrong, what is legal there, the nearest legal word."""
+"""Turning pydantic's errors into problems with a place: what is wrong, what is legal there, the nearest legal word."""
 
 from __future__ import annotations
 
@@ -81,11 +81,14 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, prefix: str 
         raise UserError(f"{what}:\n  " + "\n  ".join(told)) from error
 
 
-def _with_spliced(config: C, path: KeyPath, filled: BaseModel) -> C:
-    """The declaration with free data at ``path`` replaced by its completed form."""
-    head, rest = str(path[0]), path[1:]
-    value = _with_spliced(getattr(config, head), rest, filled) if rest else filled.model_dump(mode="json")
-    return config.model_copy(update={head: value})
+def _with_spliced(config: Any, path: KeyPath, filled: BaseModel) -> Any:
+    """The declaration (or a tuple or mapping in it) with free data at ``path`` replaced by its completed form."""
+    if not path:
+        return filled.model_dump(mode="json")
+    head, rest = path[0], path[1:]
+    if isinstance(config, tuple) and isinstance(head, int):
+        return (*config[:head], _with_spliced(config[head], rest, filled), *config[head + 1 :])
+    return config.model_copy(update={str(head): _with_spliced(getattr(config, str(head)), rest, filled)})
 
 
 @dataclass(frozen=True)
@@ -171,10 +174,10 @@ def _problem(error: _Located, declared: Declared, source: Source) -> Problem:
         fix = f"write {int(value)}, without point or exponent"
     if error.kind.startswith("bool_") and str(value).lower() in YES_AND_NO:
         fix = f"write {YES_AND_NO[str(value).lower()]}"
-    return Problem(f"`{dotted(path)}` is {shown(value)}: {_in_words_of_yaml(error.text)}", place, legal, fix=fix)
+    return Problem(f"`{dotted(path)}` is {shown(value)}: {in_words_of_yaml(error.text)}", place, legal, fix=fix)
 
 
-def _in_words_of_yaml(text: str) -> str:
+def in_words_of_yaml(text: str) -> str:
     """pydantic's sentence, as the end of ours, without words of JSON and Python."""
     words = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
     words |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
