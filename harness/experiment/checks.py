@@ -15,7 +15,7 @@ from detectors import detector_names
 from harness.experiment.points import recording_of
 from harness.experiment.schema import DETECTOR_NAME, CaptureSource, ExperimentConfig, SimulatedSource
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import in_words_of_yaml, nearest, wrong_choice
+from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
 from harness.vocabulary.declaration.problems import Place, Problem
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
@@ -146,8 +146,10 @@ def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Sou
         poses = [target.pose] if views is None else poses_of(views, target.pose)
     except ValidationError as error:
         first = error.errors()[0]
-        message = f"a view's pose is not legal: {first['loc'][-1]} would be {first['input']:g}"
-        yield Problem(message, place, legal=in_words_of_yaml(first["msg"]), fix="lower the spread or the sway")
+        key, value = str(first["loc"][-1]), first["input"]
+        legal = shape.legal_at(shape.schema_of(type(target.pose))["properties"].get(key))
+        message = f"a view's pose is not legal: {key} would be {value:g}"
+        yield Problem(message, place, legal, fix="lower the spread or the sway")
         return
     for number, pose in enumerate(poses):
         found = _camera_mistake(simulated.camera, target.model_copy(update={"pose": pose}))

@@ -59,15 +59,15 @@ def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
 
 def keeps_its_input(make: Make, cloud: Cloud) -> None:
     """Neither the cloud nor the evidence is written to, not even for a moment."""
-    given = _copied(cloud)
+    given = _with_arrays(cloud, np.ndarray.copy)
     look = Look.at(make(), given)
     require(same(given, cloud), "`analyse` changed the cloud that it was given")
-    kept = _copied(look.evidence)
+    kept = _with_arrays(look.evidence, np.ndarray.copy)
     _all_of(look)
     require(same(given, cloud), "`find`, `quiet_threshold` or `measure` changed the cloud")
     require(same(look.evidence, kept), "`find`, `quiet_threshold` or `measure` changed the evidence")
-    protected = Look.at(make(), _protected(_copied(cloud)))
-    _all_of(replace(protected, evidence=_protected(protected.evidence)))
+    protected = Look.at(make(), _with_arrays(_with_arrays(cloud, np.ndarray.copy), _read_only))
+    _all_of(replace(protected, evidence=_with_arrays(protected.evidence, _read_only)))
 
 
 def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
@@ -156,13 +156,17 @@ def measures_extents(make: Make, cloud: Cloud) -> None:
 
 def survives_pickling(make: Make, cloud: Cloud) -> None:
     """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
-    unused = _pickled(make(), "the detector")
+
+    def sent(value: Any, what: str) -> Any:
+        with no_crash(f"pickling {what}"):
+            return pickle.loads(pickle.dumps(value))
+
+    unused = sent(make(), "the detector")
     detector = make()
-    look = Look.at(detector, cloud)
-    result = _all_of(look)
-    require(same(_pickled(result, "a result"), result), "a result that was pickled is not the same")
-    for sent in (unused, _pickled(detector, "the detector, once used,")):
-        require(same(_all_of(Look.at(sent, cloud)), result), "a detector that was pickled gave another result")
+    result = _all_of(Look.at(detector, cloud))
+    require(same(sent(result, "a result"), result), "a result that was pickled is not the same")
+    for arrived in (unused, sent(detector, "the detector, once used,")):
+        require(same(_all_of(Look.at(arrived, cloud)), result), "a detector that was pickled gave another result")
 
 
 # ---------------------------------------------------------------- what several checks ask
@@ -229,28 +233,14 @@ def _all_of(look: Look) -> tuple[Any, ...]:
     return look.evidence, quiet, found, [_measured(look, finding) for finding in found[:STRONGEST]]
 
 
-def _copied(value: T) -> T:
-    """A dataclass whose arrays are copies."""
-    return _with_arrays(value, np.ndarray.copy)
-
-
-def _protected(value: T) -> T:
-    """A dataclass whose arrays refuse to be written to."""
-
-    def view(array: np.ndarray) -> np.ndarray:
-        seen = array.view()
-        seen.setflags(write=False)
-        return seen
-
-    return _with_arrays(value, view)
-
-
 def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
+    """A dataclass whose arrays are changed."""
     held = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
     changed = {name: change(array) for name, array in held.items() if isinstance(array, np.ndarray)}
     return cast(T, replace(cast(Any, value), **changed))
 
 
-def _pickled(value: T, what: str) -> T:
-    with no_crash(f"pickling {what}"):
-        return cast(T, pickle.loads(pickle.dumps(value)))
+def _read_only(array: np.ndarray) -> np.ndarray:
+    seen = array.view()
+    seen.setflags(write=False)
+    return seen

@@ -174,10 +174,10 @@ def _problem(error: _Located, declared: Declared, source: Source) -> Problem:
         fix = f"write {int(value)}, without point or exponent"
     if error.kind.startswith("bool_") and str(value).lower() in YES_AND_NO:
         fix = f"write {YES_AND_NO[str(value).lower()]}"
-    return Problem(f"`{dotted(path)}` is {shown(value)}: {in_words_of_yaml(error.text)}", place, legal, fix=fix)
+    return Problem(f"`{dotted(path)}` is {shown(value)}: {_in_words_of_yaml(error.text)}", place, legal, fix=fix)
 
 
-def in_words_of_yaml(text: str) -> str:
+def _in_words_of_yaml(text: str) -> str:
     """pydantic's sentence, as the end of ours, without words of JSON and Python."""
     words = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
     words |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
