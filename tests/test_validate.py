@@ -311,6 +311,8 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     curves = list(csv.DictReader((out / "curves.csv").open()))
     assert len(curves) == len(list(curve_points(QUICK_GRIDS)))
     assert {row["results_version"] for row in scores + curves} == {str(RESULTS_VERSION)}
+    assert {row["lag_x_px"] for row in curves} == {"", "0", "1", "4"}
+    assert {row["multipath"] for row in curves} == {""} and {row["shadow"] for row in curves} == {"", "True", "False"}
     provenance = json.loads((out / "provenance.json").read_text())
     assert provenance["command"].startswith("python -m harness.validate --quick")
     assert provenance["results_version"] == RESULTS_VERSION

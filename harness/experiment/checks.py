@@ -123,7 +123,7 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
                     f"off the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by "
                     f"{pose.roll_deg:.3g}°: "
                 )
-                of_camera = problems[0].place in map(source.place_of, (CAMERA_NAME, CAMERA_NUMBERS))
+                of_camera = problems[0].place in [source.place_of(CAMERA_NAME), source.place_of(CAMERA_NUMBERS)]
                 yield problems[0] if of_camera else replace(problems[0], message=where + problems[0].message)
                 break
     damages = [*target.holes, *target.dents] if target is not None else []

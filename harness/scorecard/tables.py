@@ -42,6 +42,12 @@ class Column:
         return attrgetter(self.value)(row) if isinstance(self.value, str) else self.value(row)
 
 
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
 @dataclass(frozen=True)
 class Table:
     """A result table. ``note``: the meaning of a row."""
@@ -52,15 +58,15 @@ class Table:
 
     def write(self, folder: Path, rows: Sequence[Any]) -> None:
         """Write the table as CSV; empty where a value is unknown, floats with nine digits."""
-        records: list[dict[str, Any]] = []
+        records: list[dict[str, str]] = []
         for row in rows:
-            records.append({})
+            values: dict[str, Any] = {}
             for column in self.columns:
-                value = column.of(row) if column.name else {}
-                records[-1] |= value if column.spread or not column.name else {column.name: value}
-        frame = pd.DataFrame(records, dtype=object)
-        frame = frame.map(lambda value: f"{value:.9g}" if isinstance(value, float) and not np.isnan(value) else value)
-        write_text(folder / f"{self.name}.csv", frame.to_csv(index=False, lineterminator="\n") if records else "")
+                if column.name:
+                    values |= column.of(row) if column.spread else {column.name: column.of(row)}
+            records.append({name: _cell(value) for name, value in values.items()})
+        text = pd.DataFrame(records).to_csv(index=False, lineterminator="\n") if records else ""
+        write_text(folder / f"{self.name}.csv", text)
 
     def heads(self, but: str = "") -> list[str]:
         """Return the labels of the columns but one."""
