@@ -9,8 +9,6 @@ from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
-HERE = Path(__file__).parent / "scorecard"
-
 
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
@@ -60,7 +58,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
                 raise UserError(
                     f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture", fix="leave it out"
                 )
-        return _run_capture(options, command)
+        from harness.scorecard.capture_program import run_capture
+
+        return run_capture(options, command)
     for name in ("unit", "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
@@ -71,40 +71,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
         )
     if options.baseline and not options.update_baseline and not options.baseline.is_file():
         raise UserError(f"--baseline {options.baseline}: no such file", fix="write one with --update-baseline")
-    from harness.scorecard.program import ScorecardOptions, run_scorecard
+    from harness.scorecard.program import run_scorecard
 
-    return run_scorecard(
-        ScorecardOptions(
-            cameras=tuple(options.camera),
-            out=options.out,
-            figures=options.figures or HERE / "figures.yaml",
-            baseline=options.baseline or (None if options.quick else HERE / "baseline.json"),
-            quick=options.quick,
-            update_baseline=options.update_baseline,
-            jobs=options.jobs,
-            command=command,
-        )
-    )
-
-
-def _run_capture(options: argparse.Namespace, command: str) -> int:
-    from harness.scorecard.capture_program import CaptureOptions, run_capture
-
-    if len(options.camera) > 1:
-        raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
-    return run_capture(
-        CaptureOptions(
-            paths=tuple(options.capture),
-            camera=options.camera[0] if options.camera else None,
-            out=options.out,
-            unit=options.unit,
-            intrinsics=options.intrinsics,
-            frames=options.frames,
-            mask=options.mask,
-            albedo=options.albedo,
-            command=command,
-        )
-    )
+    return run_scorecard(options, command)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,10 @@ import pytest
 from pydantic import BaseModel, Field, model_validator
 
 from detectors import load_detector
+from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import read_as, validated
+from harness.vocabulary.declaration.diagnose import read_as, settings_of, validated
 from harness.vocabulary.declaration.problems import DeclarationError
 from harness.vocabulary.declaration.yaml_source import parse_yaml, read_yaml
 from harness.vocabulary.errors import UserError
@@ -266,3 +267,11 @@ def test_settings_from_options_are_refused_in_the_same_words(settings: dict[str,
         assert words in message
     for raw in ("Input should be", "Extra inputs", "pydantic"):
         assert raw not in message
+
+
+def test_settings_below_a_key_are_told_with_their_whole_path() -> None:
+    data = {"merge": {"kind": "fusion", "step_mm": 1}, "registration": {"method": "ipc"}}
+    with pytest.raises(UserError) as caught:
+        settings_of(MappingConfig, data, "settings of the mapping", "mapping")
+    assert "unknown key `step_mm` in `mapping.merge`" in str(caught.value)
+    assert '`mapping.registration.method` is "ipc"' in str(caught.value) and "did you mean: icp" in str(caught.value)

@@ -120,13 +120,19 @@ ARC = "views: {kind: arc, count: 3, spread_deg: 40.0}"
         ("views: {kind: arc, count: 3, spread_deg: 140.0}", "mapping: {}", "spread_deg"),
         ("views: {kind: arc, count: 3}", "mapping: {}", "spread_deg"),
         ("views: {kind: ark, count: 3, spread_deg: 40.0}", "mapping: {}", "arc"),
+        (
+            f"{ARC.replace('40.0', '118.0')}\n  target: {{name: thesis, tilt_y_deg: 50.0}}",
+            "",
+            "a number from -70 to 70",
+        ),
         (ARC, "mapping: {registration: {method: ipc}}", "icp"),
         (ARC, "mapping: {merge: {kind: fusion, step_mm: 1.0}}", "step_mm"),
     ],
 )
 def test_what_does_not_fit_is_told_where_it_stands(tmp_path: Path, views, mapping, said):
     path = tmp_path / "views.yaml"
-    path.write_text(BASE.replace("VIEWS", views).replace("MAPPING", mapping))
+    base = BASE.replace("  target: {name: thesis}\n", "") if "target:" in views else BASE
+    path.write_text(base.replace("VIEWS", views).replace("MAPPING", mapping))
     with pytest.raises(DeclarationError) as error:
         load_experiment(path)
     assert said in str(error.value)

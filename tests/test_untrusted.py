@@ -20,7 +20,7 @@ from harness.experiment.load import load_experiment
 from harness.inspection.poses import read_poses
 from harness.inspection.steps import assign
 from harness.scorecard.capture_program import read_mask
-from harness.scorecard.judge import read_baseline
+from harness.scorecard.figures import read_baseline
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import inside, write_text

@@ -14,15 +14,20 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from harness.evaluation.intervals import Interval
-from harness.scorecard.bench import QUICK
-from harness.scorecard.conditions import in_words
-from harness.scorecard.curves import FULL_GRIDS, QUICK_GRIDS, curve_points
-from harness.scorecard.estimate import NOTHING, Estimate
-from harness.scorecard.judge import BASELINE_FILE, judged, read_baseline, write_baseline
-from harness.scorecard.published import FIGURES_FILE, Figure, Published, read_figures
-from harness.scorecard.quantities import QUANTITIES
-from harness.scorecard.run import Request, measured, requests_of
-from harness.scorecard.tables import number, plain_table
+from harness.scorecard.bench import NOTHING, QUICK, Reading
+from harness.scorecard.figures import (
+    BASELINE_FILE,
+    FIGURES_FILE,
+    Figure,
+    Published,
+    judged,
+    read_baseline,
+    read_figures,
+    write_baseline,
+)
+from harness.scorecard.measure import FULL_GRIDS, QUICK_GRIDS, Request, curve_points, measured, requests_of
+from harness.scorecard.quantities import QUANTITIES, in_words
+from harness.scorecard.tables import SCORES, number
 from harness.validate import main
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION
@@ -151,17 +156,17 @@ def test_a_negative_tolerance_is_refused():
 # ---- the judgement and the baseline ----------------------------------------------------------------------------------
 
 
-def scores_of(figures: tuple[Figure, ...], wall: Estimate, baseline: dict[str, bool] | None = None):
-    return judged(figures, {"wall": wall, "neighbours": Estimate(0.7)}, baseline or {})
+def scores_of(figures: tuple[Figure, ...], wall: Reading, baseline: dict[str, bool] | None = None):
+    return judged(figures, {"wall": wall, "neighbours": Reading(0.7)}, baseline or {})
 
 
 def test_verdicts(tmp_path):
     figures = read_figures(written(tmp_path))
     for simulated, before, verdict in (
-        (Estimate(0.93), None, "pass"),
-        (Estimate(0.96), None, "fail"),
-        (Estimate(0.96), False, "fail"),
-        (Estimate(0.96), True, "FAIL (passed before)"),
+        (Reading(0.93), None, "pass"),
+        (Reading(0.96), None, "fail"),
+        (Reading(0.96), False, "fail"),
+        (Reading(0.96), True, "FAIL (passed before)"),
         (NOTHING, True, "FAIL (passed before)"),
     ):
         baseline = {} if before is None else {"wall": before}
@@ -173,13 +178,13 @@ def test_verdicts(tmp_path):
 def test_a_baseline_comes_back_and_an_update_for_one_camera_keeps_the_rest(tmp_path):
     figures, path = read_figures(written(tmp_path)), tmp_path / "baseline.json"
     assert read_baseline(path) == {}
-    write_baseline(path, scores_of(figures, Estimate(0.96)), ["wall", "neighbours"])
+    write_baseline(path, scores_of(figures, Reading(0.96)), ["wall", "neighbours"])
     assert read_baseline(path) == {"wall": False, "neighbours": True}
-    write_baseline(path, scores_of(figures, Estimate(0.9))[:1], ["wall", "neighbours"])
+    write_baseline(path, scores_of(figures, Reading(0.9))[:1], ["wall", "neighbours"])
     assert read_baseline(path) == {"wall": True, "neighbours": True}
     assert json.loads(path.read_text())["figures"]["wall"] == {"passes": True, "simulated": 0.9}
     # a figure that is no longer on file is dropped
-    write_baseline(path, scores_of(figures, Estimate(0.9))[:1], ["wall"])
+    write_baseline(path, scores_of(figures, Reading(0.9))[:1], ["wall"])
     assert read_baseline(path) == {"wall": True}
 
 
@@ -214,7 +219,7 @@ def test_the_committed_baseline_knows_exactly_the_figures_on_file():
 
 def test_the_table_tells_value_interval_published_and_source(tmp_path):
     figures = read_figures(written(tmp_path))
-    lines = plain_table(scores_of(figures, Estimate(0.9, Interval(0.88, 0.92)))).splitlines()
+    lines = SCORES.lines(scores_of(figures, Reading(0.9, Interval(0.88, 0.92))))
     assert len(lines) == 3
     for words in ("azure_kinect_nfov", "1.5 m, albedo 0.8", "0.900", "0.880 to 0.920", "±0.06", "calibration", "[M] a"):
         assert words in lines[1]
@@ -306,6 +311,8 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys):
     curves = list(csv.DictReader((out / "curves.csv").open()))
     assert len(curves) == len(list(curve_points(QUICK_GRIDS)))
     assert {row["results_version"] for row in scores + curves} == {str(RESULTS_VERSION)}
+    assert {row["lag_x_px"] for row in curves} == {"", "0", "1", "4"}
+    assert {row["multipath"] for row in curves} == {""} and {row["shadow"] for row in curves} == {"", "True", "False"}
     provenance = json.loads((out / "provenance.json").read_text())
     assert provenance["command"].startswith("python -m harness.validate --quick")
     assert provenance["results_version"] == RESULTS_VERSION

@@ -10,13 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from harness.scorecard.bench import QUICK, Bench
-from harness.scorecard.conditions import PlateauConditions, SurvivalConditions
-from harness.scorecard.edges import edge_widths, on_surface_tolerance_m
-from harness.scorecard.estimate import jackknifed, mean_of, share_of
+from harness.scorecard.bench import QUICK, Bench, jackknifed, mean_of, share_of
+from harness.scorecard.noise import correlation_at, temporal_sigma_m
 from harness.scorecard.planes import find_planes, fit_plane
-from harness.scorecard.quantities import QUANTITIES
-from harness.scorecard.temporal import correlation_at, temporal_sigma_m
+from harness.scorecard.quantities import QUANTITIES, PlateauConditions, SurvivalConditions
+from harness.scorecard.steps import edge_widths, on_surface_tolerance_m
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import BEAM_REACH_FWHM, Footprints, Plane, layered_view, plane_view
 from scenes.optics import BeamFootprint, Optics

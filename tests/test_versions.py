@@ -18,7 +18,7 @@ from harness.inspection.poses import POSES_KEY, read_poses
 from harness.report.compare_rows import COMPARISON_VERSION
 from harness.report.findings import COLUMNS, FINDINGS_VERSION, VERSION_COLUMN, csv_text
 from harness.report.page_parts import template
-from harness.scorecard.judge import BASELINE_FILE, SCORECARD_VERSION, read_baseline, write_baseline
+from harness.scorecard.figures import BASELINE_FILE, SCORECARD_VERSION, read_baseline, write_baseline
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION, check_version, stamp_of, stamped
 from tests.synthetic_study import SetUp, Study, study_record

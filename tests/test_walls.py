@@ -10,9 +10,8 @@ from scipy import ndimage
 from validation.azure_walls import Wall, WallCheck, check_folder, walls_camera
 from validation.azure_walls_page import figure, page, table
 
-from harness.scorecard.pattern import fixed_pattern
+from harness.scorecard.noise import correlation, covariance, deviations, fixed_pattern
 from harness.scorecard.planes import robust_inverse_fit
-from harness.scorecard.temporal import correlation, covariance, deviations
 from harness.vocabulary.geometry import Region
 from scenes.sensor.camera import load_camera
 
@@ -57,9 +56,10 @@ def test_covariance_and_correlation_by_hand():
     d = np.array([[[1.0, 2.0, 0.0], [3.0, -1.0, 5.0]]])
     where = np.array([[True, True, False], [True, True, True]])
     # along x: pairs (1, 2), (3, -1), (-1, 5); along y: (1, 3), (2, -1)
-    assert covariance(d, where, 1, axis=0) == pytest.approx(((2 - 3 - 5) / 3, ((1 + 9 + 1) / 3 + (4 + 1 + 25) / 3) / 2))
-    assert covariance(d, where, 1, axis=1) == pytest.approx(((3 - 2) / 2, ((1 + 4) / 2 + (9 + 1) / 2) / 2))
-    assert correlation(d, where, lags=1)[:, 0] == pytest.approx([-2 / (41 / 6), 0.5 / 3.75])
+    assert covariance(d, where, 1, 0) == pytest.approx(((2 - 3 - 5) / 3, ((1 + 9 + 1) / 3 + (4 + 1 + 25) / 3) / 2))
+    assert covariance(d, where, 0, 1) == pytest.approx(((3 - 2) / 2, ((1 + 4) / 2 + (9 + 1) / 2) / 2))
+    found = [correlation(d, where, *lags) for lags in ((1, 0), (0, 1))]
+    assert found == pytest.approx([-2 / (41 / 6), 0.5 / 3.75])
 
 
 def test_common_jitter_is_taken_off_only_on_request():

@@ -1,4 +1,4 @@
-"""What concerns several keys of one experiment together, or things outside the file: names, files, parts that fit."""
+"""Mistakes that concern several keys of an experiment together, or things outside the file: names, files, views."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from harness.experiment.points import recording_of
 from harness.experiment.schema import DETECTOR_NAME, CaptureSource, ExperimentConfig, SimulatedSource
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
-from harness.vocabulary.declaration.problems import Problem
+from harness.vocabulary.declaration.problems import Place, Problem
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import MM
 from scenes.field_of_view import check_in_view
-from scenes.perspectives import AnyViews, poses_of, view_count
+from scenes.perspectives import poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
@@ -52,8 +52,12 @@ def joint_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem
     yield from _study_problems(config, source)
 
 
+def _problem_of(mistake: UserError, place: Place, where: str = "") -> Problem:
+    return Problem(where + mistake.message, place, legal=mistake.legal, fix=mistake.fix)
+
+
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """Whether a study, a family of boards and a threshold set on boards come together."""
+    """A study, a family of boards and a threshold set on boards belong together."""
     target = config.source.target if isinstance(config.source, SimulatedSource) else None
     calibrate = config.threshold.calibrate
     if config.study is None:
@@ -71,52 +75,60 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
         yield Problem("a study takes no sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
-    yield from _rule_axes(config, source)
-    if calibrate is not None and calibrate.boards is None:
-        place = source.place_of(("threshold", "calibrate"))
-        yield Problem("a study's threshold is set on boards of their own", place, fix="write `boards: 60`")
-    elif calibrate is not None and calibrate.boards is not None:
-        yield from _too_few_boards(calibrate.boards, calibrate.false_calls_per_m2 or 0.0, target, source)
-
-
-def _rule_axes(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """What is a hit and which rate of false calls is wanted are one study's rules, the same for all its set-ups."""
+    # what is a hit and which rate of false calls is wanted are the study's rules, the same for all its set-ups
     for path in config.sweep:
         if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
             message = f"`{path}` is a rule of the study and cannot be an axis of it"
             fix = "run the study once for each value with --set, and compare them with harness.compare"
             yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
-
-
-def _too_few_boards(boards: int, rate_per_m2: float, target: DrawnTargetConfig, source: Source) -> Iterator[Problem]:
-    """Whether so few boards can show so low a rate, were all of their face judged: a new run exceeds the highest of n
-    with probability 1 / (n + 1), and calls at all with 1 - exp(-rate * area)."""
-    board = target.board
-    area_m2 = board.width_mm * board.height_mm * MM**2
-    needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
-    if boards < needed:
-        message = f"{boards} hole-free boards of {area_m2:.3g} m2 cannot show {rate_per_m2:g} false calls per m2"
-        fix = "simulate more boards or larger ones, or ask for a higher false_calls_per_m2"
-        yield Problem(message, source.place_of(("threshold", "calibrate", "boards")), f"at least {needed}", fix=fix)
+    if calibrate is not None and calibrate.boards is None:
+        place = source.place_of(("threshold", "calibrate"))
+        yield Problem("a study's threshold is set on boards of their own", place, fix="write `boards: 60`")
+    elif calibrate is not None and calibrate.boards is not None:
+        # so few boards can show no lower rate, were all of their face judged: a new run exceeds the highest of n with
+        # probability 1 / (n + 1), and calls at all with 1 - exp(-rate * area)
+        rate_per_m2 = calibrate.false_calls_per_m2 or 0.0
+        area_m2 = target.board.width_mm * target.board.height_mm * MM**2
+        needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
+        if calibrate.boards < needed:
+            boards = f"{calibrate.boards} hole-free boards of {area_m2:.3g} m2"
+            message = f"{boards} cannot show {rate_per_m2:g} false calls per m2"
+            fix = "simulate more boards or larger ones, or ask for a higher false_calls_per_m2"
+            place = source.place_of(("threshold", "calibrate", "boards"))
+            yield Problem(message, place, f"at least {needed}", fix=fix)
 
 
 def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+    drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
+    target: TargetConfig | None = None
     try:
         target = simulated.target.declare()
         mistake = _target_mistake(target)
     except UserError as error:  # a family of boards that are too full for their damage
         mistake = error
-    if mistake:
-        place = source.place_of(("source", "target"))
-        yield Problem(mistake.message, place, legal=mistake.legal, fix=mistake.fix)
-    elif isinstance(simulated.target, DrawnTargetConfig):
-        yield from _drawn_problems(simulated, simulated.target, source)
-    elif simulated.views is None:
-        yield from _camera_problems(simulated.camera, target, source)
+    if target is None or mistake is not None:
+        yield _problem_of(mistake or UserError("the target cannot be built"), source.place_of(("source", "target")))
+    elif drawn is None:
+        yield from _pose_problems(simulated, target, source)
     else:
-        yield from _view_problems(simulated, target, simulated.views, source)
-    drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
-    pitch_mm = _smallest_pitch_mm(target) if drawn is None else drawn.apart_mm
+        # the first pose that the camera does not see whole stands for all
+        alone = simulated.model_copy(update={"views": None})
+        for pose in drawn.extreme_poses():
+            posed = target.model_copy(update={"pose": pose})
+            problems = [*_pose_problems(alone, posed, source)]
+            problems += _pose_problems(simulated, posed, source) if simulated.views else ()
+            if problems:
+                where = (
+                    f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm "
+                    f"off the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by "
+                    f"{pose.roll_deg:.3g}°: "
+                )
+                of_camera = problems[0].place in [source.place_of(CAMERA_NAME), source.place_of(CAMERA_NUMBERS)]
+                yield problems[0] if of_camera else replace(problems[0], message=where + problems[0].message)
+                break
+    damages = [*target.holes, *target.dents] if target is not None else []
+    apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(damages, 2)]
+    pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
         yield Problem(
             f"a matching radius of {config.matching.radius_mm:g} mm reaches beyond half the way to the next damage, so "
@@ -126,63 +138,33 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
         )
 
 
-def _camera_problems(config: CameraConfig, target: TargetConfig, source: Source) -> Iterator[Problem]:
-    """Whether the camera can be made, sees the whole face within its range, and finds an albedo at its wavelength."""
-    if config.name not in camera_names():
-        return
-    found = _camera_mistake(config, target)
-    if found:
-        path, mistake = found
-        yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
-
-
-def _drawn_problems(simulated: SimulatedSource, drawn: DrawnTargetConfig, source: Source) -> Iterator[Problem]:
-    """Whether the camera sees every board that can be drawn. The first pose that it does not see whole is told."""
-    for pose in drawn.extreme_poses():
-        target = drawn.declare().model_copy(update={"pose": pose})
-        found = _camera_mistake(simulated.camera, target)
-        if found and found[0] != ("source", "target"):
-            yield from _camera_problems(simulated.camera, target, source)
-            return
-        problems = list(_camera_problems(simulated.camera, target, source))
-        if simulated.views is not None:
-            problems += _view_problems(simulated, target, simulated.views, source)
-        if problems:
-            where = (
-                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
-                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
-            )
-            yield replace(problems[0], message=f"{where}: {problems[0].message}")
-            return
-
-
-def _view_problems(
-    simulated: SimulatedSource, target: TargetConfig, views: AnyViews, source: Source
-) -> Iterator[Problem]:
-    """Whether every view can be had: a legal pose that sees the whole face. The first that cannot is told."""
-    place = source.place_of(("source", "views"))
+def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Source) -> Iterator[Problem]:
+    """The first pose (of several views the first view) from which the camera does not see the whole face within its
+    range, or finds no albedo at its wavelength; or that the camera cannot be made."""
+    place, views = source.place_of(("source", "views")), simulated.views
     try:
-        poses = poses_of(views, target.pose)
+        poses = [target.pose] if views is None else poses_of(views, target.pose)
     except ValidationError as error:
         first = error.errors()[0]
-        message = f"a view's pose is not legal: {first['loc'][-1]} would be {first['input']:g}"
-        yield Problem(message, place, legal=first["msg"], fix="lower the spread or the sway")
+        key, value = str(first["loc"][-1]), first["input"]
+        legal = shape.legal_at(shape.schema_of(type(target.pose))["properties"].get(key))
+        message = f"a view's pose is not legal: {key} would be {value:g}"
+        yield Problem(message, place, legal, fix="lower the spread or the sway")
         return
     for number, pose in enumerate(poses):
         found = _camera_mistake(simulated.camera, target.model_copy(update={"pose": pose}))
-        if found and found[0] != ("source", "target"):
-            path, mistake = found
-            yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
-            return
         if found:
-            where = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
-            message = f"view {number} of {len(poses)} ({where}): {found[1].message}"
-            yield Problem(message, place, legal=found[1].legal, fix=found[1].fix)
+            path, mistake = found
+            if views is None or path != ("source", "target"):
+                yield _problem_of(mistake, source.place_of(path))
+            else:
+                tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+                yield _problem_of(mistake, place, f"view {number} of {len(poses)} ({tilts}): ")
             return
 
 
 def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
-    """Whether views and what is made of them fit together."""
+    """Find what does not fit between several views and their mapping into one cloud."""
     if simulated.views is None and config.mapping is not None:
         fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
         yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
@@ -219,43 +201,30 @@ def _target_mistake(target: TargetConfig) -> UserError | None:
     return None
 
 
-def _smallest_pitch_mm(target: TargetConfig) -> float | None:
-    centres = [hole.centre_mm for hole in target.holes] + [dent.centre_mm for dent in target.dents]
-    return min((dist(a, b) for a, b in combinations(centres, 2)), default=None)
-
-
 def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
-    missing = list(_missing_files(capture, source))
-    yield from missing
+    missing = False
+    for index, name in enumerate(capture.paths):
+        if not Path(name).exists():
+            missing = True
+            near = nearest(Path(name).name, [file.name for file in Path(name).parent.glob("*")])
+            place = source.place_of(("source", "paths", index))
+            yield Problem(f"{name}: there is no such file or folder", place, nearest=near)
+    lens = capture.intrinsics
+    if lens and lens not in camera_names() and not Path(lens).is_file():
+        missing = True
+        legal = f"a file, or one of {', '.join(camera_names())}"
+        yield Problem(f"{lens}: neither a file nor a camera", source.place_of(("source", "intrinsics")), legal)
     if config.mapping is not None:
         place = source.place_of(("mapping",))
         yield Problem("a mapping needs the views of a simulated source", place, fix="use harness.detect --register")
-    mistake = None if missing else _recording_mistake(capture)
-    if mistake:
-        yield Problem(mistake.message, source.place_of(("source", "paths")), legal=mistake.legal, fix=mistake.fix)
+    if not missing:
+        try:
+            recording_of(capture)
+        except UserError as error:
+            yield _problem_of(error, source.place_of(("source", "paths")))
     if config.threshold.calibrate is not None:
         yield Problem(
             "a threshold can be calibrated only on hole-free repeats, which a capture does not have",
             source.place_of(("threshold", "calibrate")),
             legal="a given threshold, such as `k: 3.5`",
         )
-
-
-def _recording_mistake(capture: CaptureSource) -> UserError | None:
-    try:
-        recording_of(capture)
-    except UserError as error:
-        return error
-    return None
-
-
-def _missing_files(capture: CaptureSource, source: Source) -> Iterator[Problem]:
-    for index, name in enumerate(capture.paths):
-        if not Path(name).exists():
-            near = nearest(Path(name).name, [one.name for one in Path(name).parent.glob("*")])
-            place = source.place_of(("source", "paths", index))
-            yield Problem(f"{name}: there is no such file or folder", place, nearest=near)
-    place = source.place_of(("source", "intrinsics"))
-    if capture.intrinsics and capture.intrinsics not in camera_names() and not Path(capture.intrinsics).is_file():
-        legal = f"a file, or one of {', '.join(camera_names())}"
-        yield Problem(f"{capture.intrinsics}: neither a file nor a camera", place, legal)

@@ -1,4 +1,4 @@
-"""From a YAML file and ``--set`` overrides to an experiment, or to everything that is wrong with it. Runs nothing."""
+"""Loading an experiment from a YAML file and ``--set`` overrides, or telling everything that is wrong with it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from harness.vocabulary.versions import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig, camera_names, load_camera
 
 EXPERIMENT_VERSION = 1
-"""Of the resolved experiment in a result folder; raised when a key changes its meaning."""
+"""Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
 STAMP_KIND = "experiment"
 RESERVED = frozenset(
     {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}

@@ -70,7 +70,7 @@ class Experiment:
         return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
 
     def folder(self, results: Path) -> Path:
-        """Where the results go: ``results/<name>/<digest>``. Raises UserError where a link leads out of it."""
+        """Return ``results/<name>/<digest>``, the folder of the results; UserError where a link leads out of it."""
         return inside(Path(results), self.config.name, self.digest)
 
 
@@ -99,7 +99,7 @@ def detector_version(config: ExperimentConfig) -> int:
 
 
 def _content_of(source: SimulatedSource | CaptureSource) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What decides the frames of a source, seeds aside, and what decides its noise-free render.
+    """Return the content that decides a source's frames, seeds aside, and the content that decides its render.
 
     Frames: the full target (of a family of boards what they are drawn from) and the camera's numbers; of a recording
     the content of its files, the unit, and the lens where it is named. A render: the target, the lens, the emitter,

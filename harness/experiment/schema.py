@@ -57,7 +57,7 @@ class CaptureSource(Config):
 
 
 class CaptureConfig(Config):
-    """How many frames are averaged, and how."""
+    """Number of frames that are averaged, and the kind of average."""
 
     frames: Frames
     average: AverageConfig = AverageConfig()
@@ -116,7 +116,7 @@ class ThresholdConfig(Config):
 
 
 class MatchingConfig(Config):
-    """Which detection counts for which damage: the nearest centre within this radius on the face, one to one."""
+    """Rule by which a detection counts for a damage: the nearest centre within this radius on the face, one to one."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
 

@@ -1,6 +1,6 @@
-"""From axes, switches and variations to points: each one validated, each problem at the value that causes it.
+"""Unfolding axes, switches and variations into points: each is validated, problems stand at the value that causes them.
 
-What tells the set-ups of one experiment apart are the axes other than the number of frames, and switches by name.
+Set-ups of an experiment differ in the axes other than the number of frames, and switches by name.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Draft:
 
     @property
     def named_at(self) -> KeyPath:
-        """Where the user finds it: at its label where it has one, else at its last value."""
+        """Place in the file: its label where it has one, else its last value."""
         at = self.settings[-1].written_at
         return (*at[:3], "label") if "set" in at[:4] else at
 

@@ -83,5 +83,5 @@ def mapping_config(arguments: argparse.Namespace) -> tuple[MappingConfig, tuple[
     for assignment in arguments.set:
         if assignment.startswith(PREFIX):
             assign(data, assignment.removeprefix(PREFIX))
-    config = settings_of(MappingConfig, data, "settings of the mapping", PREFIX)
+    config = settings_of(MappingConfig, data, "settings of the mapping", PREFIX.rstrip("."))
     return config, tuple(each for each in arguments.set if not each.startswith(PREFIX))

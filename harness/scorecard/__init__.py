@@ -1,1 +1,1 @@
-"""The scorecard: what a simulated camera does, measured as one measures a real one, beside what was published of it."""
+"""The scorecard: measurements of simulated cameras beside published measurements of the real ones."""

@@ -1,12 +1,15 @@
-"""The bench: a camera before a scene of known geometry, and the frames that it takes."""
+"""The bench: a camera before a scene of known geometry, the frames that it takes, and numbers with their intervals."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval, mean_t, wilson
 from harness.vocabulary.geometry import Region
 from scenes.sensor.camera import AnyCamera, CameraConfig, load_camera
 from scenes.sensor.effects import NONE, EffectsConfig
@@ -14,16 +17,21 @@ from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
 
 SEED = 1
-"""Of all noise on the bench; streams differ by camera and scene."""
+"""Seed of all noise on the bench; streams differ by camera and scene."""
 NOISE = NONE.model_copy(update={"noise": True, "ambient": True, "saturation": True})
-"""What the calibration point speaks of: the noise of each pixel, without traits of a unit or of a frame."""
+"""The noise of each pixel, which the calibration point speaks of, without traits of a unit or of a frame."""
 WHOLE = EffectsConfig()
-"""The camera as it is."""
+"""All effects of the camera."""
+STEADY = WHOLE.model_copy(update={"frame_jumps": False})
+JITTER = NOISE.model_copy(update={"frame_jumps": True})
+PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
+GROUPS = 10
+"""Groups of frames of the jackknife: 9 degrees of freedom, Student's factor 2.26."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How many frames each kind of measurement takes, and on how many units a unit's error is judged."""
+    """Numbers of frames of each kind of measurement, and of units on which a unit's error is judged."""
 
     noise_frames: int
     valid_frames: int
@@ -65,7 +73,7 @@ class Bench:
 
 
 @dataclass(frozen=True)
-class Stack:
+class FrameStack:
     """Frames of a static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``amplitude`` (h, w) mean
     over frames in the camera's units; ``slopes`` (h, w, 2)."""
 
@@ -80,7 +88,7 @@ class Stack:
         return np.ones(self.true_z_m.shape, bool)
 
 
-def taken(unit: SimulatedUnit, frames: int, *labels: str | int) -> Stack:
+def taken(unit: SimulatedUnit, frames: int, *labels: str | int) -> FrameStack:
     """``frames`` frames of a unit; the noise is the stream of the labels."""
     view, cut = unit.view, unit.cut
     z_m = np.empty((frames, *unit.region.shape))
@@ -89,4 +97,54 @@ def taken(unit: SimulatedUnit, frames: int, *labels: str | int) -> Stack:
         z_m[number] = frame.z_m
         amplitude += 0.0 if frame.amplitude is None else frame.amplitude / frames
     true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
-    return Stack(z_m, true_z_m, amplitude, view.slopes[cut])
+    return FrameStack(z_m, true_z_m, amplitude, view.slopes[cut])
+
+
+# ---- numbers with their intervals ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A value and its two-sided 95 % interval (unknown where nothing repeats); ``nan`` where there was no data."""
+
+    value: float
+    interval: Interval = UNKNOWN
+
+
+NOTHING = Reading(float("nan"))
+"""The estimate under a condition in which the camera sees nothing."""
+
+
+def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
+    """``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over frames.
+
+    Frames must be independent, pixels need not be: what neighbours or a whole frame share is in the interval. Groups
+    are interleaved. The interval is unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11.
+    """
+    from scipy.stats import t
+
+    value = float(statistic(frames))
+    g = min(groups, len(frames) // 2)
+    if g < 2 or not np.isfinite(value):
+        return Reading(value)
+    number = np.arange(len(frames)) % g
+    without = np.array([statistic(frames[number != group]) for group in range(g)])
+    half = float(t.ppf(0.5 + CONFIDENCE / 2, g - 1) * np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
+    return Reading(value, Interval(value - half, value + half) if np.isfinite(half) else UNKNOWN)
+
+
+def mean_of(values: ArrayLike) -> Reading:
+    """The mean of independent values with Student's interval; values that are NaN are left out."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    if known.size < 2:
+        return Reading(float(known[0])) if known.size else NOTHING
+    low, high = mean_t(known.mean(), known.std(ddof=1), known.size)
+    return Reading(float(known.mean()), Interval(float(low), float(high)))
+
+
+def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
+    """The share of true values among ``hits`` with Wilson's interval, ``pixels_each`` neighbours counting as one."""
+    trials = hits.size / pixels_each
+    low, high = wilson(hits.mean() * trials, trials)
+    return Reading(float(hits.mean()), Interval(float(low), float(high)))

@@ -18,7 +18,7 @@ BISQUARE = 4.685
 CANDIDATES = 400
 """Planes tried in each round: triples of near points, of which half hit a plane that covers half of the image."""
 TRIPLE_PX = 40
-"""How far apart a triple's points are: near enough to lie on one surface, far enough to tell its slope."""
+"""Distance of a triple's points: near enough to lie on one surface, far enough to tell its slope."""
 SCREENED = 4000
 """Pixels on which a candidate is judged; the best is then fitted to all."""
 GROWN = 2.0
@@ -60,38 +60,30 @@ def find_planes(
 ) -> list[FoundPlane]:
     """The planes of a depth image, largest first: RANSAC round by round, each plane's largest connected piece.
 
-    ``z_m`` (h, w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected ones up to
-    `GROWN` times as far. Planes of fewer than ``least_px`` pixels are not told. The same image gives the same planes.
+    ``z_m`` (h, w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up to
+    `GROWN` times as far: a wall that a wrong lens bows stays one. Planes of fewer than ``least_px`` pixels are left
+    out. The same image gives the same planes.
     """
     left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
     found: list[FoundPlane] = []
     for number in range(2 * most):
         if len(found) == most or left.sum() < least_px:
             break
-        mask = _largest_plane(z_m, slopes, left, tolerance_m, number)
+        inverse = _best_candidate(z_m, slopes, left, tolerance_m, number)
+        mask = left
+        for _ in range(3):
+            mask = left & (_distance_m(inverse, slopes, z_m) < tolerance_m)
+            if mask.sum() < 3:
+                break
+            inverse, _ = robust_inverse_fit(np.column_stack([np.ones(int(mask.sum())), slopes[mask]]), z_m[mask])
+        else:
+            labels, _ = ndimage.label(left & (_distance_m(inverse, slopes, z_m) < GROWN * tolerance_m))
+            mask = labels == int(np.argmax(np.bincount(labels[mask])))
         if mask.sum() < least_px:
             break
         found.append(FoundPlane(fit_plane(z_m[mask], slopes[mask]), mask))
         left = left & ~mask
-    return sorted(found, key=lambda one: -int(one.mask.sum()))
-
-
-def _largest_plane(
-    z_m: np.ndarray, slopes: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
-) -> np.ndarray:
-    """(h, w) bool: the largest connected piece of the plane with most pixels among those ``left``.
-
-    Pixels up to `GROWN` tolerances away belong to it where they connect to it: a wall that a wrong lens bows stays one.
-    """
-    inverse = _best_candidate(z_m, slopes, left, tolerance_m, number)
-    mask = np.zeros_like(left)
-    for _ in range(3):
-        mask = left & (_distance_m(inverse, slopes, z_m) < tolerance_m)
-        if mask.sum() < 3:
-            return mask
-        inverse, _ = robust_inverse_fit(np.column_stack([np.ones(int(mask.sum())), slopes[mask]]), z_m[mask])
-    labels, _ = ndimage.label(left & (_distance_m(inverse, slopes, z_m) < GROWN * tolerance_m))
-    return labels == int(np.argmax(np.bincount(labels[mask]))) if mask.any() else mask
+    return sorted(found, key=lambda plane: -int(plane.mask.sum()))
 
 
 def _best_candidate(
@@ -121,7 +113,7 @@ def _distance_m(inverse: np.ndarray, slopes: np.ndarray, z_m: np.ndarray) -> np.
 
     Infinite for NaN.
     """
-    one = inverse[..., 0] + inverse[..., 1] * slopes[..., 0] + inverse[..., 2] * slopes[..., 1]
+    by_z = inverse[..., 0] + inverse[..., 1] * slopes[..., 0] + inverse[..., 2] * slopes[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.abs(z_m * one - 1) / np.linalg.norm(inverse, axis=-1)
+        distance = np.abs(z_m * by_z - 1) / np.linalg.norm(inverse, axis=-1)
     return np.nan_to_num(distance, nan=np.inf)

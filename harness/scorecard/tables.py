@@ -1,35 +1,128 @@
-"""The scorecard as rows: for the terminal, for CSV, for the page."""
+"""The tables of the scorecard and of a comparison with a capture, each column declared once."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from harness.evaluation.intervals import Interval
-from harness.scorecard.curves import CurvePoint
-from harness.scorecard.estimate import Estimate
-from harness.scorecard.judge import Score
+from harness.scorecard.bench import Reading
+from harness.scorecard.measure import CurvePoint
 from harness.scorecard.quantities import QUANTITIES
-from harness.scorecard.run import Request
+from harness.vocabulary.config import Config
+from harness.vocabulary.files import write_text
 from harness.vocabulary.versions import RESULTS_VERSION
 
-CONDITION_COLUMNS = (
-    "distance_m",
-    "albedo",
-    "angle_deg",
-    "lag_x_px",
-    "lag_y_px",
-    "step_mm",
-    "across",
-    "shadow",
-    "diameter_px",
-    "multipath",
-)
-HEADS = ("camera", "figure", "simulated", "95 % interval", "published", "tolerance", "unit", "verdict", "use", "source")
+CONDITIONS = tuple(dict.fromkeys(name for each in QUANTITIES.values() for name in each.conditions.model_fields))
+"""Every condition of any quantity."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: ``name`` in files and ``label`` on pages and terminals, either may be empty. ``value``: a path of a
+    row's attributes, or a function of the row; ``text``: a value on a page; ``spread``: values are mappings, each key a
+    column of its own."""
+
+    name: str
+    label: str
+    value: str | Callable[[Any], Any]
+    note: str = ""
+    text: Callable[[Any], str] = str
+    spread: bool = False
+
+    def of(self, row: Any) -> Any:
+        """Return the row's value."""
+        return attrgetter(self.value)(row) if isinstance(self.value, str) else self.value(row)
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A result table. ``note``: the meaning of a row."""
+
+    name: str
+    note: str
+    columns: tuple[Column, ...]
+
+    def write(self, folder: Path, rows: Sequence[Any]) -> None:
+        """Write the table as CSV; empty where a value is unknown, floats with nine digits."""
+        records: list[dict[str, str]] = []
+        for row in rows:
+            values: dict[str, Any] = {}
+            for column in self.columns:
+                if column.name:
+                    values |= column.of(row) if column.spread else {column.name: column.of(row)}
+            records.append({name: _cell(value) for name, value in values.items()})
+        text = pd.DataFrame(records).to_csv(index=False, lineterminator="\n") if records else ""
+        write_text(folder / f"{self.name}.csv", text)
+
+    def heads(self, but: str = "") -> list[str]:
+        """Return the labels of the columns but one."""
+        return [column.label for column in self.columns if column.label and column.label != but]
+
+    def cells(self, row: Any, but: str = "") -> list[str]:
+        """Return a row's texts below `heads`."""
+        return [column.text(column.of(row)) for column in self.columns if column.label and column.label != but]
+
+    def lines(self, rows: Sequence[Any], but: str = "") -> list[str]:
+        """Return aligned lines without colour, the heads first."""
+        listed = [self.heads(but), *(self.cells(row, but) for row in rows)]
+        widths = [max(map(len, texts)) for texts in zip(*listed, strict=True)]
+        return ["  ".join(map(str.ljust, texts, widths)).rstrip() for texts in listed]
+
+    def show(self, rows: Sequence[Any], but: str = "", style: Callable[[Any, str], str] = lambda row, text: "") -> None:
+        """Print the table: wrapped and with the style of each text on a terminal, plain lines elsewhere."""
+        if not sys.stdout.isatty():
+            print("\n".join(self.lines(rows, but)))
+            return
+        from rich.box import SIMPLE_HEAD
+        from rich.console import Console
+        from rich.table import Table as RichTable
+        from rich.text import Text
+
+        table = RichTable(*self.heads(but), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for row in rows:
+            table.add_row(*(Text(text, style=style(row, text)) for text in self.cells(row, but)))
+        Console().print(table)
+
+
+@dataclass(frozen=True)
+class MeasuredPoint:
+    """One point of one curve of one camera."""
+
+    camera: str
+    point: CurvePoint
+    simulated: Reading
+
+
+@dataclass(frozen=True)
+class Beside:
+    """One number of the capture and of the simulation. ``at`` says under which condition, ``unit`` may be empty."""
+
+    where: str
+    quantity: str
+    at: str
+    unit: str
+    pixels: int
+    measured: Reading
+    simulated: Reading
+
+    @property
+    def ratio(self) -> float:
+        """Simulated by measured; NaN for what may be 0."""
+        return self.simulated.value / self.measured.value if self.unit == "mm" and self.measured.value else float("nan")
 
 
 def number(value: float) -> str:
@@ -50,121 +143,95 @@ def interval(between: Interval) -> str:
     return f"{number(between.low)} to {number(between.high) if np.isfinite(between.high) else 'inf'}"
 
 
-def score_cells(score: Score) -> tuple[str, ...]:
-    """One figure as texts under `HEADS`."""
-    entry = score.figure.entry
-    tolerance = entry.published.tolerance
+def _conditions(conditions: Config) -> dict[str, Any]:
+    return {key: conditions.to_data().get(key) for key in CONDITIONS}
+
+
+def _or_dash(text: str) -> str:
+    return text or "–"
+
+
+def _reading(name: str, label: str, low: str, high: str, note: str, head: str = "95 % interval") -> tuple[Column, ...]:
+    """A reading: its value and its interval's ends in three columns of a file, and in two of a page."""
     return (
-        entry.camera,
-        score.figure.what(),
-        number(score.simulated.value),
-        interval(score.simulated.interval),
-        entry.published.in_words(),
-        f"±{tolerance:g}" if tolerance else "–",
-        score.figure.quantity.unit or "–",
-        score.verdict,
-        "calibration" if entry.calibration else "test",
-        f"[{entry.tag}] {entry.source}",
+        Column(name, label, f"{name}.value", note, number),
+        Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),
+        Column(high, "", f"{name}.interval.high", "upper end of its 95 % interval"),
+        Column("", head, f"{name}.interval", "", interval),
     )
 
 
-def plain_table(scores: Sequence[Score]) -> str:
-    """The scorecard as aligned lines without colour, one a figure."""
-    rows = [HEADS, *(score_cells(score) for score in scores)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+_VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
 
-
-def print_scorecard(scores: Sequence[Score]) -> None:
-    """The table: in colour and wrapped on a terminal, plain lines elsewhere."""
-    import sys
-
-    if not sys.stdout.isatty():
-        print(plain_table(scores))
-        return
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for head in HEADS:
-        table.add_column(head, justify="right" if head in ("simulated", "published", "tolerance") else "left")
-    for score in scores:
-        colour = "green" if score.passes else "bold red" if score.regressed else "yellow"
-        table.add_row(*(Text(cell, style=colour if cell == score.verdict else "") for cell in score_cells(score)))
-    Console().print(table)
-
-
-def scores_csv(scores: Sequence[Score]) -> str:
-    """The scorecard as CSV with numbers at full precision."""
-    rows = []
-    for score in scores:
-        entry, published = score.figure.entry, score.figure.entry.published
-        low, high = published.limits
-        rows.append(
-            {
-                "name": entry.name,
-                "camera": entry.camera,
-                "quantity": entry.quantity,
-                "unit": score.figure.quantity.unit,
-                **_conditions(score.figure.conditions.to_data()),
-                **_estimate(score.simulated),
-                "published": published.in_words(),
-                "tolerance": published.tolerance,
-                "passes_from": low,
-                "passes_to": high,
-                "verdict": score.verdict,
-                "passed_before": score.passed_before,
-                "calibration": entry.calibration,
-                "tag": entry.tag,
-                "source": entry.source,
-                "note": entry.note,
-            }
-        )
-    return _csv(rows)
-
-
-def curves_csv(cameras: Sequence[str], points: Sequence[CurvePoint], found: Mapping[Request, Estimate]) -> str:
-    """Every point of every curve of every camera."""
-    rows = [
-        {
-            "curve": point.curve,
-            "camera": camera,
-            "quantity": point.quantity,
-            "unit": QUANTITIES[point.quantity].unit,
-            **_conditions(point.conditions.to_data()),
-            **_estimate(found[Request(camera, point.quantity, point.conditions)]),
-        }
-        for camera in cameras
-        for point in points
-    ]
-    return _csv(rows)
-
-
-def _conditions(data: Mapping[str, Any]) -> dict[str, Any]:
-    return {column: data.get(column) for column in CONDITION_COLUMNS}
-
-
-def _estimate(estimate: Estimate) -> dict[str, float]:
-    return {"simulated": estimate.value, "low": estimate.interval.low, "high": estimate.interval.high}
-
-
-def _csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows with equal keys, and the version, as CSV text; NaN and None are empty cells, floats have nine digits."""
-    listed = [{**row, "results_version": RESULTS_VERSION} for row in rows]
-    if not listed:
-        return ""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, fieldnames=list(listed[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in row.items()} for row in listed)
-    return buffer.getvalue()
-
-
-def _cell(value: Any) -> str:
-    if value is None or (isinstance(value, float) and np.isnan(value)):
-        return ""
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
+SCORES = Table(
+    "scorecard",
+    "one row per published figure",
+    (
+        Column("name", "", "figure.name", "name in the file of figures"),
+        Column("camera", "camera", "figure.entry.camera", "simulated camera"),
+        Column("", "figure", lambda score: score.figure.what()),
+        Column("quantity", "", "figure.entry.quantity", "quantity that is measured"),
+        Column("unit", "", "figure.quantity.unit", "unit of all values"),
+        Column("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
+        *_reading("simulated", "simulated", "low", "high", "simulated value"),
+        Column("published", "published", lambda score: score.figure.entry.published.in_words(), "published value"),
+        Column(
+            "tolerance",
+            "tolerance",
+            "figure.entry.published.tolerance",
+            "how far beyond it the simulated value may lie",
+            lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
+        ),
+        Column("", "unit", "figure.quantity.unit", "", _or_dash),
+        Column("passes_from", "", lambda score: score.figure.entry.published.limits[0], "lowest value that passes"),
+        Column("passes_to", "", lambda score: score.figure.entry.published.limits[1], "highest value that passes"),
+        Column(
+            "verdict",
+            "verdict",
+            "verdict",
+            "whether the simulated value passes",
+        ),
+        Column(
+            "passed_before",
+            "",
+            "passed_before",
+            "whether it passed in the baseline, empty where that does not know it",
+        ),
+        Column("calibration", "", "figure.entry.calibration", "whether the camera's file was, or may be, fitted to it"),
+        Column("", "use", lambda score: "calibration" if score.figure.entry.calibration else "test"),
+        Column("tag", "", "figure.entry.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
+        Column("source", "", "figure.entry.source", "source of the published value"),
+        Column("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
+        Column("note", "note", "figure.entry.note", "what was assumed"),
+        _VERSION,
+    ),
+)
+CURVES = Table(
+    "curves",
+    "one row per point of a curve",
+    (
+        Column("curve", "", "point.curve", "picture that it belongs to"),
+        Column("camera", "", "camera", "simulated camera"),
+        Column("quantity", "", "point.quantity", "quantity that is measured"),
+        Column("unit", "", lambda row: QUANTITIES[row.point.quantity].unit, "unit of the value"),
+        Column("conditions", "", lambda row: _conditions(row.point.conditions), "conditions", spread=True),
+        *_reading("simulated", "", "low", "high", "simulated value")[:3],
+        _VERSION,
+    ),
+)
+BESIDE = Table(
+    "capture",
+    "one row per number of a capture beside its simulation",
+    (
+        Column("where", "where", "where", "plane or edge"),
+        Column("quantity", "quantity", "quantity", "quantity that is measured"),
+        Column("at", "at", "at", "condition"),
+        Column("unit", "", "unit", "unit of the values"),
+        Column("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
+        *_reading("measured", "measured", "measured_low", "measured_high", "measured on the capture", "95 %"),
+        *_reading("simulated", "simulated", "simulated_low", "simulated_high", "measured on its simulation", "95 %"),
+        Column("", "ratio", "ratio", "", lambda ratio: f"{ratio:.2f}" if np.isfinite(ratio) else "–"),
+        Column("", "unit", "unit", "", _or_dash),
+        _VERSION,
+    ),
+)

@@ -20,7 +20,7 @@ from harness.vocabulary.errors import UserError
 STRONGEST = 5
 """Findings of one cloud that are looked at one by one."""
 CENTRE_MARGIN_M = 0.02
-"""How far outside the cloud's extent the centre of a finding may lie."""
+"""Distance outside the cloud's extent up to which the centre of a finding may lie."""
 
 T = TypeVar("T")
 
@@ -59,15 +59,15 @@ def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
 
 def keeps_its_input(make: Make, cloud: Cloud) -> None:
     """Neither the cloud nor the evidence is written to, not even for a moment."""
-    given = _copied(cloud)
+    given = _with_arrays(cloud, np.ndarray.copy)
     look = Look.at(make(), given)
     require(same(given, cloud), "`analyse` changed the cloud that it was given")
-    kept = _copied(look.evidence)
+    kept = _with_arrays(look.evidence, np.ndarray.copy)
     _all_of(look)
     require(same(given, cloud), "`find`, `quiet_threshold` or `measure` changed the cloud")
     require(same(look.evidence, kept), "`find`, `quiet_threshold` or `measure` changed the evidence")
-    protected = Look.at(make(), _protected(_copied(cloud)))
-    _all_of(replace(protected, evidence=_protected(protected.evidence)))
+    protected = Look.at(make(), _with_arrays(_with_arrays(cloud, np.ndarray.copy), _read_only))
+    _all_of(replace(protected, evidence=_with_arrays(protected.evidence, _read_only)))
 
 
 def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
@@ -75,16 +75,16 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
     look = Look.at(make(), cloud)
     for threshold in look.thresholds():
         found = look.find(threshold)
-        scores = np.array([one.score for one in found], dtype=float)
+        scores = np.array([finding.score for finding in found], dtype=float)
         require(np.isfinite(scores).all(), f"at a threshold of {threshold:g} a finding's score is not finite")
         low = float(scores.min(initial=np.inf))
         require(low > threshold, f"a finding scores {low:g}, no more than the threshold of {threshold:g}")
         require((np.diff(scores) <= 0).all(), f"at a threshold of {threshold:g} the strongest finding is not first")
-        for one in found[:STRONGEST]:
-            gone, there = (look.find(at) for at in (one.score, float(np.nextafter(one.score, 0.0))))
+        for finding in found[:STRONGEST]:
+            gone, there = (look.find(at) for at in (finding.score, float(np.nextafter(finding.score, 0.0))))
             require(
-                not np.isin(one.pixels, pixels_of(gone)).any() and np.isin(one.pixels, pixels_of(there)).any(),
-                f"a finding scores {one.score:g}, but that is not the threshold at which it vanishes",
+                not np.isin(finding.pixels, pixels_of(gone)).any() and np.isin(finding.pixels, pixels_of(there)).any(),
+                f"a finding scores {finding.score:g}, but that is not the threshold at which it vanishes",
             )
 
 
@@ -122,18 +122,18 @@ def finds_valid_pixels(make: Make, cloud: Cloud) -> None:
     """Pixels are ascending flat indices of valid points; centres are finite and lie within the cloud."""
     look = Look.at(make(), cloud)
     for threshold in look.thresholds():
-        for one in look.find(threshold):
-            _sound_finding(cloud, one)
+        for finding in look.find(threshold):
+            _sound_finding(cloud, finding)
 
 
 def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
-    """With a twentieth of the pixels, a block and a column gone, evidence and findings are as sound as before."""
+    """Evidence and findings stay sound where a twentieth of the pixels, a block and a column are gone."""
     gaps = with_gaps(cloud, seed=5)
     look = Look.at(make(), gaps)
     _sound(look)
-    for one in look.find(look.quiet / 2):
-        _sound_finding(gaps, one)
-        _measured(look, one)
+    for finding in look.find(look.quiet / 2):
+        _sound_finding(gaps, finding)
+        _measured(look, finding)
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
@@ -150,19 +150,23 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
 def measures_extents(make: Make, cloud: Cloud) -> None:
     """Each finding has a finite extent and centre, its own score, and a number of points."""
     look = Look.at(make(), cloud)
-    for one in look.find(look.quiet / 2)[:STRONGEST]:
-        _measured(look, one)
+    for finding in look.find(look.quiet / 2)[:STRONGEST]:
+        _measured(look, finding)
 
 
 def survives_pickling(make: Make, cloud: Cloud) -> None:
     """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
-    unused = _pickled(make(), "the detector")
+
+    def sent(value: Any, what: str) -> Any:
+        with no_crash(f"pickling {what}"):
+            return pickle.loads(pickle.dumps(value))
+
+    unused = sent(make(), "the detector")
     detector = make()
-    look = Look.at(detector, cloud)
-    result = _all_of(look)
-    require(same(_pickled(result, "a result"), result), "a result that was pickled is not the same")
-    for sent in (unused, _pickled(detector, "the detector, once used,")):
-        require(same(_all_of(Look.at(sent, cloud)), result), "a detector that was pickled gave another result")
+    result = _all_of(Look.at(detector, cloud))
+    require(same(sent(result, "a result"), result), "a result that was pickled is not the same")
+    for arrived in (unused, sent(detector, "the detector, once used,")):
+        require(same(_all_of(Look.at(arrived, cloud)), result), "a detector that was pickled gave another result")
 
 
 # ---------------------------------------------------------------- what several checks ask
@@ -195,8 +199,8 @@ def _sound(look: Look) -> None:
     require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: a length above 0 is wanted")
 
 
-def _sound_finding(cloud: Cloud, one: Detection) -> None:
-    pixels, centre = np.asarray(one.pixels), np.asarray(one.centre_m)
+def _sound_finding(cloud: Cloud, finding: Detection) -> None:
+    pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
     require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are no (n,) whole numbers")
     require(len(pixels) > 0, "a finding has no pixels")
     require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
@@ -210,13 +214,14 @@ def _sound_finding(cloud: Cloud, one: Detection) -> None:
     require(inside, f"a finding's centre {np.round(centre, 4).tolist()} m lies outside the cloud")
 
 
-def _measured(look: Look, one: Detection) -> Measurement:
+def _measured(look: Look, finding: Detection) -> Measurement:
     with no_crash("`measure`"):
-        measured = look.detector.measure(look.cloud, look.evidence, one)
+        measured = look.detector.measure(look.cloud, look.evidence, finding)
     diameter, centre = measured.extent_diameter_m, np.asarray(measured.extent_centre_m)
     require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
     require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is no (3,) finite numbers")
-    require(measured.score == one.score, f"`measure` says score {measured.score:g} of a finding of {one.score:g}")
+    told = f"`measure` says score {measured.score:g} of a finding of {finding.score:g}"
+    require(measured.score == finding.score, told)
     require(measured.points >= 1, f"`measure` says {measured.points} points")
     return measured
 
@@ -225,31 +230,17 @@ def _all_of(look: Look) -> tuple[Any, ...]:
     """Everything that a detector says of a cloud."""
     quiet = look.quiet
     found = look.find(quiet / 2)
-    return look.evidence, quiet, found, [_measured(look, one) for one in found[:STRONGEST]]
-
-
-def _copied(value: T) -> T:
-    """A dataclass whose arrays are copies."""
-    return _with_arrays(value, np.ndarray.copy)
-
-
-def _protected(value: T) -> T:
-    """A dataclass whose arrays refuse to be written to."""
-
-    def view(array: np.ndarray) -> np.ndarray:
-        seen = array.view()
-        seen.setflags(write=False)
-        return seen
-
-    return _with_arrays(value, view)
+    return look.evidence, quiet, found, [_measured(look, finding) for finding in found[:STRONGEST]]
 
 
 def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
-    held = {one.name: getattr(value, one.name) for one in fields(cast(Any, value))}
+    """A dataclass whose arrays are changed."""
+    held = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
     changed = {name: change(array) for name, array in held.items() if isinstance(array, np.ndarray)}
     return cast(T, replace(cast(Any, value), **changed))
 
 
-def _pickled(value: T, what: str) -> T:
-    with no_crash(f"pickling {what}"):
-        return cast(T, pickle.loads(pickle.dumps(value)))
+def _read_only(array: np.ndarray) -> np.ndarray:
+    seen = array.view()
+    seen.setflags(write=False)
+    return seen

@@ -1,4 +1,4 @@
-"""What the checks share: how a detector is made, what one look at a cloud gives, and how a breach is told."""
+"""Parts that the checks share: making a detector, a look at a cloud, comparing values, reporting a breach."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ class Look:
             return float(self.detector.quiet_threshold(self.cloud, self.evidence))
 
     def find(self, threshold: float) -> tuple[Detection, ...]:
-        """What is found above a threshold."""
+        """Return the findings above a threshold."""
         with no_crash(f"`find` at a threshold of {threshold:g}"):
             return tuple(self.detector.find(self.cloud, self.evidence, threshold))
 
     def thresholds(self) -> tuple[float, ...]:
-        """From 0 to the quiet one, in rising order, where findings change: at the scores of pixels."""
+        """Return rising thresholds from 0 to the quiet threshold at scores of pixels, where findings change."""
         scores = self.evidence.score[np.isfinite(self.evidence.score)]
         high = np.quantile(scores, [0.5, 0.9, 0.99, 0.999]) if len(scores) else np.zeros(0)
         steps = (0.0, *map(float, high), *(share * self.quiet for share in (0.25, 0.5, 0.75, 0.95)))
@@ -83,11 +83,13 @@ class Look:
 
 def pixels_of(found: tuple[Detection, ...]) -> np.ndarray:
     """Flat indices of all findings' pixels together."""
-    return np.unique(np.concatenate([np.asarray(one.pixels) for one in found])) if found else np.zeros(0, np.int64)
+    return (
+        np.unique(np.concatenate([np.asarray(finding.pixels) for finding in found])) if found else np.zeros(0, np.int64)
+    )
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values hold the same bits: arrays, numbers, text, and dataclasses or mappings of them."""
+    """Return whether two values hold the same bits: arrays, numbers, text, and dataclasses or mappings of them."""
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         a, b = np.asarray(a), np.asarray(b)
         numbers = a.dtype.kind == "f" and b.dtype.kind == "f"

@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from detectors.interface import Detection
 from harness.testing.contract import Look, Make, no_crash, require
 from harness.vocabulary.capture import Cloud, MapViews
 from harness.vocabulary.geometry import Region, transform_points
 from harness.vocabulary.lens import Lens
 
 SCORE_TOLERANCE = 0.01
-"""Of the highest score: robust fits stop at a tolerance of their own, and sums in another order round otherwise."""
+"""Share of the highest score: robust fits stop at a tolerance of their own; sums in another order round otherwise."""
 CROP_TOLERANCE = 0.01
-"""Of the pixels: a crop may come to another decision at the target's rim."""
+"""Share of the pixels: a crop may come to another decision at the target's rim."""
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
 QUARTER_TURN = np.array([[0.0, 1.0, 0, 0], [-1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
@@ -49,11 +48,18 @@ def turned_once(cloud: Cloud) -> Cloud:
     names = ("reason", "count", "variance_m2", "rgb", "amplitude", "mean_variance_m2")
     images = {name: getattr(cloud, name) for name in names}
     turned = {name: _grid_turned(cloud, image) for name, image in images.items() if image is not None}
-    points = _grid_turned(cloud, transform_points(QUARTER_TURN, cloud.points_m))
-    lens = None if cloud.lens is None or not cloud.organised else _lens_turned(cloud.lens)
-    views = None if cloud.map_views is None else _views_turned(cloud.map_views)
-    region = _region_turned(cloud) if cloud.organised else cloud.region
-    more: dict[str, Any] = {"points_m": points, "lens": lens, "map_views": views, "region": region, **turned}
+    turned["points_m"] = _grid_turned(cloud, transform_points(QUARTER_TURN, cloud.points_m))
+    lens, region, views = cloud.lens, cloud.region, cloud.map_views
+    if cloud.organised:
+        width = lens.width if lens is not None else region.col1
+        region = Region(width - region.col1, width - region.col0, region.row0, region.row1)
+    if lens is not None:
+        k1, k2, p1, p2, *further = lens.distortion
+        distortion = (k1, k2, -p2, p1, *further)
+        lens = Lens(lens.height, lens.width, lens.fy, lens.fx, lens.cy, lens.width - 1 - lens.cx, distortion)
+    if views is not None:
+        views = MapViews(QUARTER_TURN @ views.T_cloud_cameras, views.shares, views.pixel_m[::-1])
+    more: dict[str, Any] = {"lens": lens if cloud.organised else None, "map_views": views, "region": region, **turned}
     return replace(cloud, **more)
 
 
@@ -62,28 +68,8 @@ def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.rot90(image)) if cloud.organised else image
 
 
-def _lens_turned(lens: Lens) -> Lens:
-    k1, k2, p1, p2, *further = lens.distortion
-    distortion = (k1, k2, -p2, p1, *further)
-    return Lens(lens.height, lens.width, lens.fy, lens.fx, lens.cy, lens.width - 1 - lens.cx, distortion)
-
-
-def _views_turned(views: MapViews) -> MapViews:
-    along_x, along_y = views.pixel_m
-    return MapViews(QUARTER_TURN @ views.T_cloud_cameras, views.shares, (along_y, along_x))
-
-
-def _region_turned(cloud: Cloud) -> Region:
-    region = cloud.region
-    width = cloud.lens.width if cloud.lens is not None else region.col1
-    return Region(width - region.col1, width - region.col0, region.row0, region.row1)
-
-
-# ---------------------------------------------------------------- the comparison
-
-
 def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, how: str) -> None:
-    """``pixels`` (h, w): of each pixel afterwards, its flat index before."""
+    """Compare scores and findings; ``pixels`` (h, w): of each pixel afterwards, its flat index before."""
     was, now = before.evidence.score.reshape(-1)[pixels], after.evidence.score
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(changed <= CROP_TOLERANCE * now.size, f"{how}, {changed} of {now.size} pixels gained or lost their score")
@@ -92,43 +78,34 @@ def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.n
     require(difference <= tolerance, f"{how}, a score changed by {difference:g} (allowed {tolerance:g})")
     quiet = abs(before.quiet - after.quiet)
     require(quiet <= tolerance, f"{how}, the quiet threshold changed by {quiet:g} (allowed {tolerance:g})")
-    threshold = _between_scores(before.evidence.score, before.quiet, 2 * tolerance)
-    if threshold is not None:
-        _compare_findings(before, after, threshold, pixels, T_after_before, how)
 
-
-def _between_scores(score: np.ndarray, quiet: float, least: float) -> float | None:
-    """The middle of the widest gap between scores from a fifth of the quiet threshold to it; None where none is wider
-    than ``least``, so that a tolerable change of a score can change findings."""
-    scores = np.unique(score[np.isfinite(score)])
-    scores = scores[(scores >= 0.2 * quiet) & (scores <= quiet)]
+    # findings in the middle of the widest gap between scores from a fifth of the quiet threshold to it; where none is
+    # wider than the tolerance on both sides, a tolerable change of a score can change findings
+    scores = np.unique(before.evidence.score[np.isfinite(before.evidence.score)])
+    scores = scores[(scores >= 0.2 * before.quiet) & (scores <= before.quiet)]
     if len(scores) < 2:
-        return None
+        return
     widest = int(np.argmax(np.diff(scores)))
     low, high = scores[widest], scores[widest + 1]
-    return float(low + high) / 2 if high - low > least else None
+    if high - low > 2 * tolerance:
+        _compare_findings(before, after, float(low + high) / 2, pixels.reshape(-1), T_after_before, how)
 
 
 def _compare_findings(
-    before: Look, after: Look, threshold: float, pixels: np.ndarray, T_after_before: np.ndarray, how: str
+    before: Look, after: Look, threshold: float, flat: np.ndarray, T_after_before: np.ndarray, how: str
 ) -> None:
-    flat = pixels.reshape(-1)
-    was = {frozenset(one.pixels.tolist()): one for one in before.find(threshold)}
-    now = {frozenset(flat[one.pixels].tolist()): one for one in after.find(threshold)}
+    was = {frozenset(finding.pixels.tolist()): finding for finding in before.find(threshold)}
+    now = {frozenset(flat[finding.pixels].tolist()): finding for finding in after.find(threshold)}
     there, lost = len(was), len(was.keys() - now.keys())
     require(was.keys() == now.keys(), f"{how}, {lost} of {there} findings have other pixels, and there are {len(now)}")
-    for key, one in was.items():
-        apart = _apart_m(transform_points(T_after_before, one.centre_m), now[key].centre_m)
+    for key, finding in was.items():
+        moved_to = transform_points(T_after_before, finding.centre_m)
+        apart = float(np.linalg.norm(np.asarray(moved_to) - np.asarray(now[key].centre_m)))
         require(apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre lies {1e3 * apart:.2f} mm off")
-        sizes = [_diameter_m(look, found) for look, found in ((before, one), (after, now[key]))]
+        with no_crash("`measure`"):
+            sizes = [
+                float(look.detector.measure(look.cloud, look.evidence, found).extent_diameter_m)
+                for look, found in ((before, finding), (after, now[key]))
+            ]
         grown = abs(sizes[1] - sizes[0])
         require(grown <= PLACE_TOLERANCE_M, f"{how}, a finding's extent changed by {1e3 * grown:.2f} mm")
-
-
-def _apart_m(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
-
-
-def _diameter_m(look: Look, one: Detection) -> float:
-    with no_crash("`measure`"):
-        return float(look.detector.measure(look.cloud, look.evidence, one).extent_diameter_m)

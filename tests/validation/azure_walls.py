@@ -21,9 +21,8 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from detectors.recordings import open_capture
-from harness.scorecard.pattern import FixedPattern, fixed_pattern
+from harness.scorecard.noise import LAGS, FixedPattern, correlation, deviations, fixed_pattern, temporal_sigma_m
 from harness.scorecard.planes import fit_plane
-from harness.scorecard.temporal import correlation, deviations, temporal_sigma_m
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import Region
@@ -205,7 +204,7 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
         sigma_bins(wall, z_m, wall.inner, average, BIN_M),
         sigma_bins(wall, z_m, wall.mask, wall.angle_deg, 2.0),
         {
-            (who, jitter): correlation(deviations(z, wall.mask, jitter), wall.mask)
+            (who, jitter): correlations(deviations(z, wall.mask, jitter), wall.mask)
             for who, z in (("measured", wall.z_m), ("simulated", z_m))
             for jitter in (True, False)
         },
@@ -215,6 +214,12 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
         [fixed_pattern(z, wall.mask, wall.slopes) for z in patterned],
         float(1 - outside[wall.mask].mean()),
     )
+
+
+def correlations(d: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(x and y, lags 1 to `LAGS`) correlation of deviations."""
+    along = ([(lag, 0) for lag in range(1, LAGS + 1)], [(0, lag) for lag in range(1, LAGS + 1)])
+    return np.array([[correlation(d, where, *lags) for lags in axis] for axis in along])
 
 
 def check_folder(folder: Path) -> list[WallCheck]:

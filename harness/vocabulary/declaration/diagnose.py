@@ -1,4 +1,4 @@
-"""From pydantic's errors to problems with a place: what is wrong, what is legal there, the nearest legal word."""
+"""Turning pydantic's errors into problems with a place: what is wrong, what is legal there, the nearest legal word."""
 
 from __future__ import annotations
 
@@ -66,26 +66,32 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
     return config
 
 
-def settings_of(model: type[C], data: Mapping[str, Any], what: str, prefix: str = "") -> C:
+def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str | None = None) -> C:
     """Plain data that options of the command line state, as a declaration.
 
-    Raises UserError with every problem at once, under ``what``; ``prefix``: what stands before each path in the option.
+    Raises UserError with every problem at once, under ``what``; ``within``: the key that stands before each path there.
     """
     try:
         return model.from_data(data)
     except ValidationError as error:
         # there is no text to point into: a path alone says which option is wrong
-        source = Source(what, "", data, {(): Place(what, 0, 1, "")}, {})
-        problems = [replace(each, place=None) for each in problems_of(error, Declared(model, data, {}), source)]
-        told = [str(each).replace("`", f"`{prefix}", 1).replace("\n", "\n  ") for each in in_order(problems)]
+        base: KeyPath = () if within is None else (within,)
+        whole = data if within is None else {within: data}
+        source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
+        declared = Declared(Config if base else model, whole, {base: model} if base else {})
+        problems = [replace(each, place=None) for each in problems_of(error, declared, source, base)]
+        told = [str(each).replace("\n", "\n  ") for each in in_order(problems)]
         raise UserError(f"{what}:\n  " + "\n  ".join(told)) from error
 
 
-def _with_spliced(config: C, path: KeyPath, filled: BaseModel) -> C:
-    """The declaration with free data at ``path`` replaced by its completed form."""
-    head, rest = str(path[0]), path[1:]
-    value = _with_spliced(getattr(config, head), rest, filled) if rest else filled.model_dump(mode="json")
-    return config.model_copy(update={head: value})
+def _with_spliced(config: Any, path: KeyPath, filled: BaseModel) -> Any:
+    """The declaration (or a tuple or mapping in it) with free data at ``path`` replaced by its completed form."""
+    if not path:
+        return filled.model_dump(mode="json")
+    head, rest = path[0], path[1:]
+    if isinstance(config, tuple) and isinstance(head, int):
+        return (*config[:head], _with_spliced(config[head], rest, filled), *config[head + 1 :])
+    return config.model_copy(update={str(head): _with_spliced(getattr(config, str(head)), rest, filled)})
 
 
 @dataclass(frozen=True)

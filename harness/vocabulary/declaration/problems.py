@@ -1,4 +1,4 @@
-"""What is wrong with an experiment and where: problems are collected and shown all at once."""
+"""Problems of a declaration with their places: they are collected and shown all at once."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ SHOWN_COLUMNS = 110
 """Characters of a source line that a message shows; longer lines are cut around the caret."""
 
 MAX_PROBLEMS = 100
-"""That a message tells, and that are looked for in one mapping: who wrote more reads no further."""
+"""Most problems that a message lists, and that are looked for in a single mapping."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where something is written: ``line`` and ``column`` count from 1, in characters; ``width`` for the caret.
+    """Position of something written: ``line`` and ``column`` count from 1, in characters; ``width`` is the caret's.
 
     ``line`` 0 means an argument of the command line, whose ``line_text`` is the whole argument.
     """

@@ -60,7 +60,7 @@ class Declared:
 
 
 DeclaredOf = Callable[[Any], Declared]
-"""From data to what is declared for it (which detector's settings belong in it depends on the data)."""
+"""Function from data to what is declared for it (which detector's settings belong in it depends on the data)."""
 
 
 class _Generator(GenerateJsonSchema):
@@ -206,7 +206,7 @@ def choices_of(schema: Schema | None) -> tuple[Any, ...]:
 
 
 def legal_at(schema: Schema | None) -> str | None:
-    """What a place accepts in words: type, bounds, choices, and what the field's description says of it."""
+    """Say in words what a place accepts: type, bounds, choices, and what the field's description says of it."""
     words, note = _words(schema or {}), (schema or {}).get("description", "")
     return f"{words} ({note})" if words and 0 < len(note) <= LONGEST_NOTE else words or None
 

@@ -11,6 +11,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from ruamel.yaml.reader import ReaderError
 from harness.vocabulary.declaration.problems import MAX_PROBLEMS, DeclarationError, Place, Problem
 
 KeyPath = tuple[str | int, ...]
-"""Where a value is in the data: keys of mappings and indices of lists."""
+"""Position of a value in the data: keys of mappings and indices of lists."""
 
 MAX_BYTES = 500_000
 """An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte."""
@@ -70,14 +71,38 @@ class Source:
 
 def read_yaml(path: Path) -> Source:
     """Read a file whose top level is a mapping. Raises DeclarationError with every problem of the text, and places."""
-    origin = str(path)
-    text = _decoded(origin, _bytes_of(Path(path)))
+    path, origin = Path(path), str(path)
+
+    def refused(
+        message: str, place: Place | None = None, legal: str | None = None, fix: str | None = None
+    ) -> DeclarationError:
+        return DeclarationError(origin, [Problem(message, place, legal=legal, fix=fix)])
+
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        found = sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        raise refused("there is no such file", legal=", ".join(found[:10]) or None) from None
+    except IsADirectoryError:
+        raise refused("this is a folder, not a YAML file") from None
+    except OSError as error:
+        raise refused(f"cannot be read ({error.strerror})") from error
+    if len(content) > MAX_BYTES:
+        raise refused("the file is too large for a declaration", legal=f"at most {MAX_BYTES} bytes")
+    try:
+        text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        before = content[: error.start].decode("utf-8", errors="replace")
+        rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
+        start = before.rfind("\n") + 1
+        place = Place(origin, before.count("\n") + 1, len(before) - start + 1, before[start:] + rest)
+        message = f"byte 0x{content[error.start]:02x} is not UTF-8"
+        raise refused(message, place, fix="save the file as UTF-8") from None
     source = parse_yaml(text, origin)
     if not isinstance(source.data, dict):
         kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
-        raise DeclarationError(
-            origin, [Problem(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: thesis`")]
-        )
+        raise refused(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: thesis`")
     return source
 
 
@@ -86,12 +111,25 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
     ``is_argument``: the text is an argument of the command line, so that places have no line number.
     """
-    place = _places_in(text, origin, start, is_argument)
+    line_starts = [0, *(match.end() for match in re.finditer("\n", text))]
+    lines: dict[int, str] = {}
+    """Each line once: its places share it, however many they are and however long it is."""
+
+    def place(index: int, end: int) -> Place:
+        """The place of the characters from ``index`` to ``end``, counted after ``start``."""
+        index, end = min(index + start, len(text)), end + start
+        line = bisect_right(line_starts, index) - 1
+        first = line_starts[line]
+        if line not in lines:
+            line_end = text.find("\n", first)
+            lines[line] = text[first:] if line_end < 0 else text[first:line_end]
+        width = max(1, min(end, first + len(lines[line])) - index)
+        return Place(origin, 0 if is_argument else line + 1, index - first + 1, lines[line], width)
+
     version = _OTHER_VERSION.search(text)
     if version:
-        raise DeclarationError(
-            origin, [Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))]
-        )
+        problem = Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))
+        raise DeclarationError(origin, [problem])
     root = _composed(text[start:], origin, place)
     builder = _Builder(place)
     data = builder.build(root, (), ()) if root is not None else None
@@ -103,8 +141,6 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
 def to_yaml(data: Any) -> str:
     """Plain data as YAML 1.2, in its own order of keys; `parse_yaml` inverts it."""
-    from io import StringIO
-
     writer = YAML()
     writer.default_flow_style = False
     writer.width = 120
@@ -119,66 +155,25 @@ def _innermost(places: Mapping[KeyPath, Place], path: KeyPath) -> Place:
     return places[path]
 
 
-def _bytes_of(path: Path) -> bytes:
-    origin = str(path)
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        found = sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        beside = ", ".join(found[:10]) or None
-        raise DeclarationError(origin, [Problem("there is no such file", None, legal=beside)]) from None
-    except IsADirectoryError:
-        raise DeclarationError(origin, [Problem("this is a folder, not a YAML file", None)]) from None
-    except OSError as error:
-        raise DeclarationError(origin, [Problem(f"cannot be read ({error.strerror})", None)]) from error
-    if len(content) > MAX_BYTES:
-        raise DeclarationError(
-            origin, [Problem("the file is too large for a declaration", None, legal=f"at most {MAX_BYTES} bytes")]
-        )
-    return content
-
-
-def _decoded(origin: str, content: bytes) -> str:
-    try:
-        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except UnicodeDecodeError as error:
-        before = content[: error.start].decode("utf-8", errors="replace")
-        rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
-        line_start = before.rfind("\n") + 1
-        where = Place(origin, before.count("\n") + 1, len(before) - line_start + 1, before[line_start:] + rest)
-        problem = Problem(f"byte 0x{content[error.start]:02x} is not UTF-8", where, fix="save the file as UTF-8")
-        raise DeclarationError(origin, [problem]) from None
-
-
-def _places_in(text: str, origin: str, start: int, is_argument: bool) -> Callable[[int, int], Place]:
-    """A function from (index, end index) after ``start`` to the place."""
-    line_starts = [0, *(match.end() for match in re.finditer("\n", text))]
-    lines: dict[int, str] = {}
-    """Each line once: its places share it, however many they are and however long it is."""
-
-    def place(index: int, end: int) -> Place:
-        index, end = min(index + start, len(text)), end + start
-        line = bisect_right(line_starts, index) - 1
-        first = line_starts[line]
-        line_text = lines.get(line)
-        if line_text is None:
-            line_end = text.find("\n", first)
-            line_text = lines[line] = text[first:] if line_end < 0 else text[first:line_end]
-        width = max(1, min(end, first + len(line_text)) - index)
-        return Place(origin, 0 if is_argument else line + 1, index - first + 1, line_text, width)
-
-    return place
-
-
 def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Node | None:
-    """ruamel.yaml's node tree; its errors become a problem with a place."""
+    """ruamel.yaml's node tree; its errors become a problem with a place.
+
+    Too deep and too long texts are refused first: composing recurses, scanning slows with depth, nodes take memory.
+    """
+    depth, nodes, problem = 0, 0, None
     try:
-        too_much = _first_too_much(text)
-        if too_much is None:
+        for event in YAML(typ="safe", pure=True).parse(text):
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            nodes += isinstance(event, NodeEvent)
+            at = int(event.start_mark.index)
+            if depth > MAX_DEPTH:
+                problem = Problem("nested too deep", place(at, at + 1), legal=f"at most {MAX_DEPTH} levels")
+            elif nodes > 2 * MAX_NODES:  # keys are nodes, too
+                problem = Problem("too many values", place(at, at + 1), legal=f"at most {MAX_NODES} values")
+            if problem is not None:
+                break
+        else:
             return YAML(typ="safe", pure=True).compose(text)
-        index, what, legal = too_much
-        problem = Problem(what, place(index, index + 1), legal=legal)
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -191,20 +186,6 @@ def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Nod
     except YAMLError as error:
         problem = Problem(f"no valid YAML: {error}", place(0, 1))
     raise DeclarationError(origin, [problem]) from None
-
-
-def _first_too_much(text: str) -> tuple[int, str, str] | None:
-    """The index of the first mapping or list beyond `MAX_DEPTH`, or of the first value beyond `MAX_NODES`, with what it
-    is and what is legal: composing recurses, scanning slows with depth, and nodes take memory."""
-    depth, nodes = 0, 0
-    for event in YAML(typ="safe", pure=True).parse(text):
-        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        nodes += isinstance(event, NodeEvent)
-        if depth > MAX_DEPTH:
-            return int(event.start_mark.index), "nested too deep", f"at most {MAX_DEPTH} levels"
-        if nodes > 2 * MAX_NODES:  # keys are nodes, too
-            return int(event.start_mark.index), "too many values", f"at most {MAX_NODES} values"
-    return None
 
 
 @dataclass
@@ -234,69 +215,56 @@ class _Builder:
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
             return [self.build(item, (*path, index), (*within, node)) for index, item in enumerate(node.value)]
-        if isinstance(node, ScalarNode):
-            return self._scalar(node, here)
-        return self._problem(f"the tag {_short(node.tag)} is not read", here, "plain mappings, lists, text and numbers")
+        return self._scalar(node, here)
 
     def _mapping(self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
             if len(self.problems) >= MAX_PROBLEMS:
                 break
-            at = self._place(key_node)
-            key = self._key(key_node, at)
-            if key is None:
+            at, before = self._place(key_node), len(self.problems)
+            if key_node.tag == _TAG + "merge":
+                fix = "write the keys out, or an alias for a whole value"
+                self._problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix)
                 continue
-            if key in result:
+            key = self._scalar(key_node, at) if isinstance(key_node, ScalarNode) else None
+            if not isinstance(key, str):
+                if len(self.problems) == before:
+                    self._problem("a key must be text", at, "text; put quotes around numbers")
+            elif key in result:
                 first = self.keys[(*path, key)]
                 self.problems.append(
                     Problem(f"duplicate key `{key}`", at, other=first, other_says="already written at", fix="keep one")
                 )
-                continue
-            self.keys[(*path, key)] = at
-            result[key] = self.build(value_node, (*path, key), within)
+            else:
+                self.keys[(*path, key)] = at
+                result[key] = self.build(value_node, (*path, key), within)
         return result
 
-    def _key(self, node: Node, at: Place) -> str | None:
-        if node.tag == _TAG + "merge":
-            fix = "write the keys out, or an alias for a whole value"
-            self.problems.append(Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix))
-            return None
-        key = self._scalar(node, at) if isinstance(node, ScalarNode) else None
-        if not isinstance(key, str):
-            if not self.problems or self.problems[-1].place != at:
-                self.problems.append(Problem("a key must be text", at, legal="text; put quotes around numbers"))
-            return None
-        return key
-
-    def _scalar(self, node: ScalarNode, here: Place) -> Any:
+    def _scalar(self, node: Node, here: Place) -> Any:
         kind, text = str(node.tag).removeprefix(_TAG), node.value
+        plain = text.lower().replace("_", "") if isinstance(node, ScalarNode) else ""
         try:
-            if kind == "null":
+            if not isinstance(node, ScalarNode):
+                kind = ""
+            elif kind == "null":
                 return None
-            if kind == "bool":
+            elif kind == "bool":
                 return {"true": True, "false": False}[text.lower()]
-            if kind == "int":
-                return int(_plain_number(text), 0) if re.match(r"[-+]?0[ox]", text) else int(_plain_number(text))
-            if kind == "float":
-                return float(_plain_number(text).replace(".inf", "inf").replace(".nan", "nan"))
-            if kind in ("str", "timestamp"):  # YAML 1.2 has no dates: they are text
+            elif kind == "int":
+                return int(plain, 0) if re.match(r"[-+]?0[ox]", text) else int(plain)
+            elif kind == "float":
+                return float(plain.replace(".inf", "inf").replace(".nan", "nan"))
+            elif kind in ("str", "timestamp"):  # YAML 1.2 has no dates: they are text
                 text.encode()
                 return text
         except (ValueError, KeyError):
             return self._problem(f"{text[:40]!r} cannot be read as {kind}", here)
-        return self._problem(f"the tag {_short(node.tag)} is not read", here, "plain mappings, lists, text and numbers")
+        tag = str(node.tag).replace(_TAG, "!!")
+        return self._problem(f"the tag {tag} is not read", here, "plain mappings, lists, text and numbers")
 
-    def _problem(self, message: str, place: Place, legal: str | None = None) -> None:
-        self.problems.append(Problem(message, place, legal=legal))
+    def _problem(self, message: str, place: Place, legal: str | None = None, fix: str | None = None) -> None:
+        self.problems.append(Problem(message, place, legal=legal, fix=fix))
 
     def _place(self, node: Node) -> Place:
         return self.place(node.start_mark.index, node.end_mark.index)
-
-
-def _plain_number(text: str) -> str:
-    return text.lower().replace("_", "")
-
-
-def _short(tag: str | None) -> str:
-    return str(tag).replace(_TAG, "!!")
