@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness import detect
-from harness.inspection import steps
+from harness.inspection.arguments import crop_from_text
 from harness.report.findings import COLUMNS, FILES
 from harness.report.findings_picture import Mark, label_places
 from harness.vocabulary.errors import UserError
@@ -353,7 +353,7 @@ def test_numbers_in_the_picture_never_cover_each_other(circles: list[tuple[float
 @given(st.text(max_size=30))
 def test_a_crop_is_read_or_refused(text: str) -> None:
     try:
-        assert steps.crop_from_text(text)["kind"] in ("auto", "none", "box", "polygon")
+        assert crop_from_text(text)["kind"] in ("auto", "none", "box", "polygon")
     except UserError as mistake:
         assert "auto" in (mistake.legal or "")
 

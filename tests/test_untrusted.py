@@ -17,8 +17,8 @@ from detectors.recordings.intrinsics import read_lens
 from harness.evaluation.pod.inspection_file import read_inspections
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
+from harness.inspection.arguments import assign
 from harness.inspection.poses import read_poses
-from harness.inspection.steps import assign
 from harness.scorecard.capture_program import read_mask
 from harness.scorecard.judge import read_baseline
 from harness.vocabulary.declaration.yaml_source import read_yaml
