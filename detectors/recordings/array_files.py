@@ -82,7 +82,7 @@ MATRIX, COMPRESSED = 14, 15
 NUMERIC, OPAQUE = range(6, 16), 17
 """Classes of arrays of numbers, mxDOUBLE to mxUINT64; and of objects of MATLAB's classes, such as ``pointCloud``."""
 BEGINNING_BYTES = 4096
-"""What flags, dimensions (numpy knows 64 at most) and a name (63 letters in MATLAB) of a variable take at most."""
+"""Bytes that the flags, dimensions (numpy knows 64 at most) and name (63 letters) of a variable take at most."""
 
 
 class _Variable(NamedTuple):
