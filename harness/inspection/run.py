@@ -165,7 +165,7 @@ def _merged(
     from detectors.mapping.map_views import Mapped, prepare
     from detectors.mapping.merge import merge
     from detectors.registration.by_marks import held_out_error_m, register_by_marks
-    from detectors.registration.register import register
+    from detectors.registration.register import loop_errors, register
     from detectors.registration.registered import predicted_error_m
     from detectors.registration.sampling import plane_through, thinned
 
@@ -207,11 +207,8 @@ def _merged(
     # checks that need no truth: marks held out, errors predicted over the reference's target, and loops
     points_m = thinned(reference.points_m)
     _, normal = plane_through(points_m)
-    loops: tuple[Any, ...] = ()
-    if config.registration.method in LOOPING and len(prepared) > 2:
-        from detectors.registration.loops import loop_errors
-
-        loops = loop_errors(mapped.views, config.registration)
+    is_looping = config.registration.method in LOOPING and len(prepared) > 2
+    loops = loop_errors(mapped.views, config.registration) if is_looping else ()
     checks = told.Checks(
         held_out_m=(None, *(held_out_error_m(reference, each) for each in prepared[1:])),
         predicted_m=tuple(predicted_error_m(each, points_m, normal) for each in registrations),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from detectors.interface import Evidence
     from detectors.mapping.map_views import Mapped
     from detectors.recordings import Recording
-    from detectors.registration.loops import LoopError
+    from detectors.registration.register import LoopError
     from detectors.target import Choice
     from detectors.views import PreparedView
     from harness.report.findings import Finding
