@@ -37,10 +37,9 @@ ArraysLoader = Callable[[Path], Mapping[str, np.ndarray]]
 
 @contextmanager
 def _readable(path: Path, kind: str, legal: str, fix: str) -> Iterator[None]:
-    """Turn whatever a damaged file raises in a library, of any type, into one UserError, and limit its memory."""
+    """Turn whatever a damaged file raises in a library, of any type, into one UserError."""
     try:
-        with limited_memory():
-            yield
+        yield
     except UserError:
         raise
     except Exception as error:
@@ -60,7 +59,8 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
     Raises UserError where it is broken, holds objects, or would unpack to more than `limits.ARRAYS_BYTES`.
     """
-    with _readable(path, "arrays", LEGAL_ARRAYS, "save it again, or copy it again if it was cut off"):
+    fix = "save it again, or copy it again if it was cut off"
+    with _readable(path, "arrays", LEGAL_ARRAYS, fix), limited_memory():
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
         if len(entries) > ARRAYS_COUNT:
@@ -106,7 +106,8 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     if HDF5_SIGNATURE in (head[:8], head[512:520]) or b"MATLAB 7.3" in head[:116]:
         fix = "save it with '-v7' in place of '-v7.3', for a cloud: " + EXPORT
         raise UserError(f"{path}: is a -v7.3 file (HDF5)", legal=LEGAL_MAT, fix=fix)
-    with _readable(path, "a MATLAB file", LEGAL_MAT, "save it again with '-v7', or copy it again if it was cut off"):
+    fix = "save it again with '-v7', or copy it again if it was cut off"
+    with _readable(path, "a MATLAB file", LEGAL_MAT, fix), limited_memory():
         variables = list(_variables(path))
         names = [each.name for each in variables if each.kind in NUMERIC]
         loaded = scipy.io.loadmat(str(path), squeeze_me=False, variable_names=names) if names else {}
@@ -136,7 +137,7 @@ def _variables(path: Path) -> Iterator[_Variable]:
         order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:128])
         if order is None:
             raise ValueError("it does not begin as MATLAB 5 files do")
-        for _ in range(ARRAYS_COUNT):
+        for _ in range(ARRAYS_COUNT + 1):
             if not (head := file.read(8)):
                 return
             kind, length = struct.unpack(f"{order}II", head)
@@ -159,7 +160,7 @@ def _variables(path: Path) -> Iterator[_Variable]:
                     words.append(word)
                 yield _Variable(name.decode("latin1"), kind, b"".join(words[2:]).decode("latin1"))
             file.seek(end)
-        raise UserError(f"{path}: holds {ARRAYS_COUNT} variables or more", legal=LEGAL_MAT)
+        raise UserError(f"{path}: holds more than {ARRAYS_COUNT} variables", legal=LEGAL_MAT)
 
 
 def _element(content: bytes, order: str) -> tuple[bytes, bytes]:

@@ -6,6 +6,7 @@ All limits stand here. Somebody with more memory and a file that is really so la
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,11 +68,16 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
     return content
 
 
+_LOCK, _BEFORE = threading.Lock(), list[tuple[int, int]]()
+"""The limits before `limited_memory`, once for each place that is inside."""
+
+
 @contextmanager
 def limited_memory() -> Iterator[None]:
     """Limit the memory that the process may take inside to `READING_BYTES` more; beyond, MemoryError is raised.
 
-    The limit (RLIMIT_AS) holds for all threads. Systems without it or without /proc (macOS, Windows) set none.
+    The limit (RLIMIT_AS) holds for all threads, from the first that enters to the last that leaves. Systems without it
+    or without /proc (macOS, Windows) set none.
     """
     try:
         import resource
@@ -80,11 +86,17 @@ def limited_memory() -> Iterator[None]:
     except (ImportError, OSError):
         yield
         return
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    wanted = pages * resource.getpagesize() + READING_BYTES
-    least = min(limit for limit in (wanted, *before) if limit != resource.RLIM_INFINITY)
-    resource.setrlimit(resource.RLIMIT_AS, (least, before[1]))
+    with _LOCK:
+        before = _BEFORE[0] if _BEFORE else resource.getrlimit(resource.RLIMIT_AS)
+        if not _BEFORE:
+            wanted = pages * resource.getpagesize() + READING_BYTES
+            least = min(limit for limit in (wanted, *before) if limit != resource.RLIM_INFINITY)
+            resource.setrlimit(resource.RLIMIT_AS, (least, before[1]))
+        _BEFORE.append(before)
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        with _LOCK:
+            before = _BEFORE.pop()
+            if not _BEFORE:
+                resource.setrlimit(resource.RLIMIT_AS, before)
