@@ -18,7 +18,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -286,7 +286,7 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
 
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
     content = content.translate(bytes.maketrans(b",;", b". " if is_decimal_comma else b"  "))
-    options = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
+    options: Any = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
     try:
         values: np.ndarray = pandas.read_csv(io.BytesIO(content), skiprows=skipped, **options).to_numpy()
     except (ValueError, OverflowError, MemoryError) as error:  # pandas' own errors derive from ValueError

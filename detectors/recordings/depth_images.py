@@ -47,8 +47,9 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
     colours: list[Path | None] = []
     for number in map(_last_number, depths):
-        best = min(stamps, key=lambda stamp, n=number: abs(stamp - n)) if stamps and number is not None else None
-        is_near = best is not None and number is not None and abs(best - number) <= (TUM_MATCH_S if is_tum else 0.0)
+        apart = {stamp: abs(stamp - number) for stamp in stamps} if number is not None else {}
+        best = min(apart, key=apart.__getitem__, default=None)
+        is_near = best is not None and apart[best] <= (TUM_MATCH_S if is_tum else 0.0)
         colours.append(stamps[best] if best is not None and is_near else None)
     without = colours.count(None)
     notes = []

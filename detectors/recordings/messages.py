@@ -177,5 +177,5 @@ def _points(name: str, message: Any) -> np.ndarray:
         if key in ("rgb", "rgba") and types[key].itemsize == 4:
             types[key] = np.dtype(order + "u4")  # four packed bytes, whatever the field calls them
     offsets = [single[key].offset for key in types]
-    layout = {"names": list(types), "formats": list(types.values()), "offsets": offsets, "itemsize": step}
+    layout: Any = {"names": list(types), "formats": list(types.values()), "offsets": offsets, "itemsize": step}
     return np.ndarray((height, width), np.dtype(layout), data.data, strides=(row, step))
