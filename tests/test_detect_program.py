@@ -266,7 +266,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
         (("--crop", "box:a,2,3,4,5,6"), "not all of its values are numbers"),
         (("--crop", "box:-500,500,-500,500,5000,9000"), "holds none of the cloud's"),
         (("--crop", "polygon:200,1,300,1,200,90"), "none of the cloud's 6911 points"),
-        (("--set", "surface.degre=3"), "surface.degre"),
+        (("--set", "surface.degre=3"), "unknown key `degre` in `surface`"),
         (("--set", "surface"), "KEY=VALUE"),
         (("--set", "min_points=0"), "min_points"),
         (("--detector", "thesys"), "did you mean 'thesis'"),
