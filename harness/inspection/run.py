@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from detectors.interface import Detector
-    from detectors.mapping.map_views import Mapped
+    from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
     from detectors.target import Choice
@@ -162,8 +162,7 @@ def _merged(
 
     Raises UserError where a view has no target, or names each view that cannot be placed, and why.
     """
-    from detectors.mapping.map_views import Mapped, prepare
-    from detectors.mapping.merge import merge
+    from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import held_out_error_m, register_by_marks
     from detectors.registration.register import loop_errors, register
     from detectors.registration.registered import predicted_error_m

@@ -14,7 +14,7 @@ from harness.vocabulary.units import MM
 
 if TYPE_CHECKING:
     from detectors.interface import Evidence
-    from detectors.mapping.map_views import Mapped
+    from detectors.mapping.merge import Mapped
     from detectors.recordings import Recording
     from detectors.registration.register import LoopError
     from detectors.target import Choice
