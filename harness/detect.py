@@ -4,19 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from harness.inspection import several_arguments, steps
-from harness.inspection.steps import DEFAULT_FALSE_CALLS, LEGAL_CROP
+from harness.inspection.arguments import LEGAL_CROP, MARKS, MERGES, METHODS
+from harness.inspection.judging import DEFAULT_FALSE_CALLS
 from harness.vocabulary.errors import exit_code_of
-
-if TYPE_CHECKING:
-    from detectors.interface import Detector
-    from detectors.recordings import Recording
-    from harness.report.findings import Judged
-    from harness.vocabulary.capture import Cloud
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -108,7 +100,29 @@ def _parser() -> argparse.ArgumentParser:
     add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
     add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
     add("--frames-report", action="store_true", help="list every frame with its valid part and median distance")
-    several_arguments.add_to(parser)
+    add = parser.add_argument_group(
+        "several views of one target",
+        "Each PATH is then one view. --crop cuts the target out of each; the detector judges all that is merged, unless"
+        " --set crop.kind=.. says otherwise. --set mapping.KEY=VALUE sets what the arguments below do not name, such as"
+        " mapping.merge.cell_mm=1, mapping.marks.dictionary=DICT_4X4_50 or mapping.registration.points=target (icp and"
+        " cpd then use the whole target; else the points of the marks, which need colour).",
+    ).add_argument
+    add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
+    add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
+    add(
+        "--marks",
+        choices=MARKS,
+        metavar="KIND",
+        help="the fiducial marks: colour (strips of any colour that stands apart; default), red (the thesis' rule),"
+        " coded (ArUco, AprilTag)",
+    )
+    add(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="where the views are thought to stand: JSON, a list of 4x4 matrices to one common frame in metres, or"
+        " lines of TUM's groundtruth.txt, one a view; only a start for the registration",
+    )
     return parser
 
 
@@ -119,89 +133,9 @@ def _number(text: str) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    if arguments.register is not None:
-        from harness.inspection.several_views import inspect_views
+    from harness.inspection.run import inspect
 
-        return inspect_views(arguments)
-    several_arguments.refuse_without_register(arguments)
-    return _inspect_capture(arguments)
-
-
-def _inspect_capture(arguments: argparse.Namespace) -> int:
-    from harness.inspection import printed
-    from harness.inspection.target import choice_by, choice_facts, pictures, print_choice
-    from harness.report.findings import write_findings
-
-    detector, settings = steps.detector_of(arguments, arguments.crop, arguments.set)
-    recording = steps.opened(arguments, arguments.paths)
-    wants_quiet = arguments.quiet_capture is not None and arguments.threshold is arguments.false_calls is None
-    quiet = steps.opened(arguments, [arguments.quiet_capture]) if wants_quiet else None
-    if arguments.frames_report:
-        printed.print_frames(recording)
-    cloud = steps.averaged(arguments, recording)
-    choice = choice_by(getattr(detector, "settings", None), cloud)
-    evidence = steps.analysed(detector, cloud)
-    threshold, origin, evidence = steps.threshold_of(
-        arguments, detector, cloud, evidence, lambda: _quiet_on(quiet, arguments, detector, cloud)
-    )
-    judged = steps.with_faint_told(steps.judged(detector, cloud, evidence, threshold), threshold)
-    evidence = judged.evidence
-    printed.print_warnings((*recording.warnings, *(choice.warnings if choice else ()), *evidence.warnings))
-    print_choice(choice)
-    printed.print_capture(recording, cloud, evidence, arguments.crop)
-    if judged.missing is not None:
-        print(judged.missing.blind_text)
-    print(printed.threshold_text(threshold, evidence, origin))
-    printed.print_findings(judged.findings)
-    if arguments.out is not None:
-        about = _about(arguments, recording, quiet, judged, detector, settings, threshold, origin)
-        about = {"target": choice_facts(choice), **about}
-        title = f"{recording.name}: {len(judged.detections)} findings beyond {printed.beyond_text(threshold, evidence)}"
-        for path in write_findings(arguments.out, judged, about, title, beside=pictures(choice)):
-            print(f"wrote {path}")
-    return 0
-
-
-# ---- one capture -----------------------------------------------------------------------------------------------------
-
-
-def _quiet_on(
-    recording: Recording | None, arguments: argparse.Namespace, detector: Detector, cloud: Cloud
-) -> tuple[float, str]:
-    """The threshold that is silent on a capture of an undamaged target, and what to say of it."""
-    assert recording is not None
-    quiet = steps.averaged(arguments, recording)
-    threshold = detector.quiet_threshold(quiet, detector.analyse(quiet))
-    frames = f"{quiet.n_frames} frames, here {cloud.n_frames}"
-    return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
-
-
-def _about(
-    arguments: argparse.Namespace,
-    recording: Recording,
-    quiet: Recording | None,
-    judged: Judged,
-    detector: Detector,
-    settings: dict[str, Any],
-    threshold: float,
-    origin: str,
-) -> Mapping[str, Any]:
-    """What the JSON says beside the findings."""
-    evidence = judged.evidence
-    mm = None if evidence.unit else 1e3 * threshold * evidence.scale_m
-    return {
-        "capture": steps.capture_facts(recording, judged.cloud),
-        "threshold": {"k": threshold, "mm": mm, "from": origin},
-        "warnings": evidence.warnings,
-        "missing_returns": None if judged.missing is None else judged.missing.facts,
-        "surface": {"one_unit_of_score_mm": 1e3 * evidence.scale_m, **evidence.notes},
-        "settings": {
-            "average": arguments.average,
-            "unit": arguments.unit,
-            "detector": {"name": detector.name, "version": detector.version, "settings": settings},
-        },
-        "provenance": steps.provenance([recording] if quiet is None else [recording, quiet]),
-    }
+    return inspect(arguments)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from harness.exchange.views import ExportedView
     from harness.experiment.points import Experiment
     from harness.experiment.schema import SimulatedSource
@@ -71,65 +69,51 @@ def _count(text: str) -> int:
 
 
 def _run(arguments: argparse.Namespace, given: list[str]) -> int:
+    from harness.exchange.views import in_turn
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import SimulatedSource
     from harness.vocabulary.files import atomic_folder
+    from scenes.perspectives import poses_of
+    from scenes.sensor.camera import camera_of
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
     source = experiment.config.source
     if not isinstance(source, SimulatedSource):
         raise UserError(f"{arguments.experiment}: its source is a real capture, which needs no export")
-    targets = _targets(arguments, source)
-    with atomic_folder(arguments.out) as folder:
-        views = _simulated(arguments, experiment, source, targets)
-        _write(folder, arguments.format, views)
-        _write_beside(folder, arguments, experiment, source, targets, views, given)
-    _conclude(arguments, experiment, views)
-    return 0
-
-
-# ---- the steps -------------------------------------------------------------------------------------------------------
-
-
-def _targets(arguments: argparse.Namespace, source: SimulatedSource) -> tuple[TargetConfig, ...]:
-    """The target before the camera of each view, the first being the reference."""
-    from scenes.perspectives import poses_of
-
     target = source.target.declare()
     target = target.hole_free() if arguments.hole_free else target
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
     if arguments.views is not None and arguments.views > len(poses):
         raise UserError(f"--views {arguments.views}: the experiment has {len(poses)}", legal=f"1 to {len(poses)}")
-    return tuple(target.model_copy(update={"pose": pose}) for pose in poses[: arguments.views])
-
-
-def _simulated(
-    arguments: argparse.Namespace,
-    experiment: Experiment,
-    source: SimulatedSource,
-    targets: tuple[TargetConfig, ...],
-) -> tuple[ExportedView, ...]:
-    """Every view with its own frames, which are made only when they are written."""
-    from harness.exchange.views import in_turn
-    from scenes.sensor.camera import camera_of
-
+    # the target before the camera of each view, the first being the reference
+    targets = [target.model_copy(update={"pose": pose}) for pose in poses[: arguments.views]]
     frames = arguments.frames or experiment.config.capture.frames
-    captures = [
-        _captured(arguments, experiment, source, target, number, frames) for number, target in enumerate(targets)
-    ]
-    rate = camera_of(source.camera).unit.frames_per_second.value
-    return in_turn(captures, [target.pose.T_camera_board for target in targets], frames, rate)
+    with atomic_folder(arguments.out) as folder:
+        captures = [_captured(arguments, experiment, source, each, number) for number, each in enumerate(targets)]
+        rate = camera_of(source.camera).unit.frames_per_second.value
+        views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
+        if arguments.format == "tum":
+            from harness.exchange.tum import write_tum
+
+            write_tum(folder, views)
+        else:
+            from harness.exchange.bags import write_bag
+
+            for view in views:
+                write_bag(folder / view.name, view, "mcap" if arguments.format == "mcap" else "sqlite3")
+        _write_beside(folder, arguments, experiment, source, targets, views, given)
+    swept = [path for path in experiment.config.sweep if path.startswith("source.")]
+    if swept:
+        print(f"note: {', '.join(swept)} as the file's source states it, not as swept; --set chooses another value")
+    size_mb = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file()) / 1e6
+    print(f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with truth.json")
+    return 0
 
 
 def _captured(
-    arguments: argparse.Namespace,
-    experiment: Experiment,
-    source: SimulatedSource,
-    target: TargetConfig,
-    number: int,
-    frames: int,
+    arguments: argparse.Namespace, experiment: Experiment, source: SimulatedSource, target: TargetConfig, number: int
 ) -> SimulatedCapture:
-    """The frames of one view, equal to those of the experiment's first trial."""
+    """Return the frames of one view, equal to those of the experiment's first trial; they are made when written."""
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import camera_of
     from scenes.sensor.source import SimulatedUnit
@@ -138,21 +122,13 @@ def _captured(
     cache = arguments.results / ".cache" / "renders"
     view, found = cached_view(target, camera.optics, source.render, cache)
     print(f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}")
-    role = "hole_free" if arguments.hole_free else "damaged"
-    labels: tuple[str | int, ...] = (role, REPEAT) if number == 0 else (role, REPEAT, "view", number)
+    labels: tuple[str | int, ...] = (_role(arguments), REPEAT, *(("view", number) if number else ()))
+    frames = arguments.frames or experiment.config.capture.frames
     return SimulatedUnit(camera, source.camera, view).capture(frames, experiment.config.seed, *labels)
 
 
-def _write(folder: Path, form: str, views: tuple[ExportedView, ...]) -> None:
-    if form == "tum":
-        from harness.exchange.tum import write_tum
-
-        write_tum(folder, views)
-        return
-    from harness.exchange.bags import write_bag
-
-    for view in views:
-        write_bag(folder / view.name, view, "mcap" if form == "mcap" else "sqlite3")
+def _role(arguments: argparse.Namespace) -> str:
+    return "hole_free" if arguments.hole_free else "damaged"
 
 
 def _write_beside(
@@ -160,84 +136,56 @@ def _write_beside(
     arguments: argparse.Namespace,
     experiment: Experiment,
     source: SimulatedSource,
-    targets: tuple[TargetConfig, ...],
+    targets: list[TargetConfig],
     views: tuple[ExportedView, ...],
     given: list[str],
 ) -> None:
-    """The truth, the nominal poses that a registration may start from, the declaration, and where all this is from."""
+    """Write the truth, the nominal poses that a registration may start from, the declaration, and the provenance."""
     from harness.experiment.load import resolved_yaml
     from harness.inspection.poses import POSES_KEY
     from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import record
-
-    nominal = {POSES_KEY: _nominal(source, targets, arguments.hole_free)}
-    write_text(folder / "truth.json", _json(_truth(targets, views)))
-    write_text(folder / "nominal_poses.json", _json(nominal))
-    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
-    facts = {
-        **record("python -m harness.export " + shlex.join(given)),
-        "experiment": experiment.config.name,
-        "seed": experiment.config.seed,
-        "hole_free": arguments.hole_free,
-        "format": arguments.format,
-        "frames_per_view": views[0].n_frames,
-        "frames_per_second": views[0].frames_per_second,
-        "rounding_step_mm": 1e3 * views[0].source.z_step_m,
-        "notes": [
-            "The room stands still before the camera and the target is turned, as on a table: only the target agrees"
-            " with the poses from view to view, what is behind it does not.",
-            "Outside the simulated region of each image there is no range and black.",
-            "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
-        ],
-    }
-    write_text(folder / "provenance.json", _json(facts))
-
-
-def _truth(targets: tuple[TargetConfig, ...], views: tuple[ExportedView, ...]) -> dict[str, Any]:
-    """Damages in the board's frame and, of the first view, in the camera's; each view's pose."""
+    from harness.vocabulary.versions import RESULTS_VERSION
+    from scenes.perspectives import guessed_T_reference_view
     from scenes.target.truth import truth_of
 
-    return {
-        "frames": {
-            "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
-            "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
+    nominal = [[[float(row == column) for column in range(4)] for row in range(4)]]
+    if source.views is not None:
+        poses = tuple(target.pose for target in targets)
+        numbers = range(len(poses))
+        role = _role(arguments)
+        nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT).tolist() for n in numbers]
+    files: dict[str, dict[str, Any]] = {
+        "truth.json": {
+            "frames": {
+                "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
+                "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
+            },
+            "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
+            "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
-        "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
-        "views": [{"name": view.name, "T_board_camera": _rows(view.T_board_camera)} for view in views],
+        "nominal_poses.json": {POSES_KEY: nominal},
+        "provenance.json": {
+            **record("python -m harness.export " + shlex.join(given)),
+            "experiment": experiment.config.name,
+            "seed": experiment.config.seed,
+            "hole_free": arguments.hole_free,
+            "format": arguments.format,
+            "frames_per_view": views[0].n_frames,
+            "frames_per_second": views[0].frames_per_second,
+            "rounding_step_mm": 1e3 * views[0].source.z_step_m,
+            "notes": [
+                "The room stands still before the camera and the target is turned, as on a table: only the target"
+                " agrees with the poses from view to view, what is behind it does not.",
+                "Outside the simulated region of each image there is no range and black.",
+                "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
+            ],
+        },
     }
-
-
-def _nominal(source: SimulatedSource, targets: tuple[TargetConfig, ...], hole_free: bool) -> list[list[list[float]]]:
-    """For each view the pose from which the experiment's registration starts, ``T_reference_view`` 4 x 4, metres."""
-    from scenes.perspectives import guessed_T_reference_view
-
-    if source.views is None:
-        return [[[float(row == column) for column in range(4)] for row in range(4)]]
-    poses = tuple(target.pose for target in targets)
-    role = "hole_free" if hole_free else "damaged"
-    guesses = (guessed_T_reference_view(source.views, poses, number, role, REPEAT) for number in range(len(poses)))
-    return [_rows(guess) for guess in guesses]
-
-
-def _rows(matrix: np.ndarray) -> list[list[float]]:
-    rows: list[list[float]] = matrix.tolist()
-    return rows
-
-
-def _json(data: dict[str, Any]) -> str:
-    from harness.vocabulary.versions import RESULTS_VERSION
-
-    return json.dumps({"results_version": RESULTS_VERSION, **data}, indent=2, allow_nan=False) + "\n"
-
-
-def _conclude(arguments: argparse.Namespace, experiment: Experiment, views: tuple[ExportedView, ...]) -> None:
-    """What was written, and what of the experiment was not."""
-    swept = [path for path in experiment.config.sweep if path.startswith("source.")]
-    if swept:
-        print(f"note: {', '.join(swept)} as the file's source states it, not as swept; --set chooses another value")
-    size_mb = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file()) / 1e6
-    frames = views[0].n_frames
-    print(f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with truth.json")
+    for name, data in files.items():
+        text = json.dumps({"results_version": RESULTS_VERSION, **data}, indent=2, allow_nan=False)
+        write_text(folder / name, text + "\n")
+    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
 
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
-    from scenes.target.declaration import AnyTargetConfig
-    from scenes.target.mesh import Target
 
 NAMED_TARGETS = ("thesis",)
 
@@ -52,31 +50,32 @@ def _run(arguments: argparse.Namespace) -> int:
         if path is not None:
             write(target, path)
             print(f"wrote {path}")
-    print(_summary(target))
-    return 0
-
-
-def _summary(target: Target) -> str:
-    """The truth as a table, one damage a line, and what else was built."""
     titles = ("id", "kind", "diameter mm", "depth mm", "volume mm3", "x camera mm", "y camera mm", "z camera mm")
-    lines = ["  ".join(f"{title:>11}" for title in titles)]
+    print("  ".join(f"{title:>11}" for title in titles) if target.truth else "no holes, no dents")
     for damage in target.truth:
         row = damage.to_row()
         numbers = [row["diameter_mm"], row["depth_mm"], row["volume_mm3"], *(row[f"{a}_camera_mm"] for a in "xyz")]
-        lines.append("  ".join([f"{row['id']:>11}  {row['kind']:>11}", *(f"{number:11.3f}" for number in numbers)]))
-    if not target.truth:
-        lines = ["no holes, no dents"]
+        print("  ".join([f"{row['id']:>11}  {row['kind']:>11}", *(f"{number:11.3f}" for number in numbers)]))
     triangles = sum(len(part.mesh.faces) for part in target.parts)
-    return "\n".join([*lines, f"{triangles} triangles: {', '.join(part.name for part in target.parts)}"])
-
-
-# ---- reading a declaration -------------------------------------------------------------------------------------------
+    print(f"{triangles} triangles: {', '.join(part.name for part in target.parts)}")
+    return 0
 
 
 def _declared(name_or_path: str, board: int) -> TargetConfig:
+    """Read a declaration, and draw the board asked for where it declares a family."""
+    from harness.vocabulary.declaration.diagnose import read_as
+    from harness.vocabulary.declaration.yaml_source import read_yaml
+    from scenes.target.declaration import TARGETS
     from scenes.target.drawn import DrawnTargetConfig
 
-    config = _target(name_or_path)
+    if name_or_path in NAMED_TARGETS:
+        config = TARGETS[name_or_path].from_data({"name": name_or_path})
+    elif not Path(name_or_path).exists():
+        raise UserError(
+            f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
+        )
+    else:
+        config = read_as(TARGETS, "name", read_yaml(Path(name_or_path)))
     if isinstance(config, DrawnTargetConfig):
         if board < 0:
             raise UserError(f"--board {board}: boards are numbered from 0")
@@ -84,20 +83,6 @@ def _declared(name_or_path: str, board: int) -> TargetConfig:
     if board:
         raise UserError(f"--board {board}: {name_or_path} declares one board, not a family", legal="--board 0")
     return config.declare()
-
-
-def _target(name_or_path: str) -> AnyTargetConfig:
-    from harness.vocabulary.declaration.diagnose import read_as
-    from harness.vocabulary.declaration.yaml_source import read_yaml
-    from scenes.target.declaration import TARGETS
-
-    if name_or_path in NAMED_TARGETS:
-        return TARGETS[name_or_path].from_data({"name": name_or_path})
-    if not Path(name_or_path).exists():
-        raise UserError(
-            f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
-        )
-    return read_as(TARGETS, "name", read_yaml(Path(name_or_path)))
 
 
 if __name__ == "__main__":

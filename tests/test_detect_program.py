@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness import detect
-from harness.inspection import steps
+from harness.inspection.arguments import crop_from_text
 from harness.report.findings import COLUMNS, FILES
 from harness.report.findings_picture import Mark, label_places
 from harness.vocabulary.errors import UserError
@@ -166,7 +166,8 @@ def test_the_cloud_has_the_damage_in_magenta(capture: Path, tmp_path: Path) -> N
 
 def test_the_picture_is_a_picture(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert detect.main([str(capture), "--out", str(out)]) == 0
+    named = capture.rename(capture.with_name("board $x_$"))  # which is wrong as mathematics
+    assert detect.main([str(named), "--out", str(out)]) == 0
     picture = cv2.imread(str(out / "annotated.png"))
     assert picture is not None and picture.shape[1] == 1650
     magenta = (picture == (255, 0, 255)).all(axis=-1)
@@ -261,10 +262,11 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
     (
         (("--crop", "circle"), "--crop circle"),
         (("--crop", "box:1,2,3"), "box:x0,x1,y0,y1,z0,z1"),
+        (("--crop", "box:500,-500,-500,500,100,900"), "x0 = 500 is not below x1 = -500"),
         (("--crop", "box:a,2,3,4,5,6"), "not all of its values are numbers"),
         (("--crop", "box:-500,500,-500,500,5000,9000"), "holds none of the cloud's"),
         (("--crop", "polygon:200,1,300,1,200,90"), "none of the cloud's 6911 points"),
-        (("--set", "surface.degre=3"), "surface.degre"),
+        (("--set", "surface.degre=3"), "unknown key `degre` in `surface`"),
         (("--set", "surface"), "KEY=VALUE"),
         (("--set", "min_points=0"), "min_points"),
         (("--detector", "thesys"), "did you mean 'thesis'"),
@@ -353,7 +355,7 @@ def test_numbers_in_the_picture_never_cover_each_other(circles: list[tuple[float
 @given(st.text(max_size=30))
 def test_a_crop_is_read_or_refused(text: str) -> None:
     try:
-        assert steps.crop_from_text(text)["kind"] in ("auto", "none", "box", "polygon")
+        assert crop_from_text(text)["kind"] in ("auto", "none", "box", "polygon")
     except UserError as mistake:
         assert "auto" in (mistake.legal or "")
 

@@ -255,7 +255,7 @@ def test_views_without_overlap_are_refused(
         (("--register", "marks", "--poses", "nowhere"), "nowhere: cannot be read"),
         (("--register", "marks", "--set", "mapping.merge.cell=1"), "mapping.merge.fusion.cell"),
         (("--register", "marks", "--set", "mapping.registration.tolerance=1"), "mapping.registration.marks.tolerance"),
-        (("--register", "marks", "--set", "surface.degre=1"), "surface.degre"),
+        (("--register", "marks", "--set", "surface.degre=1"), "unknown key `degre` in `surface`"),
         (("--register", "marks", "--crop", "box:0,1,0,1,0,1"), "view view_0: the crop box"),
         (("--register", "marks", "--threshold", "0"), "above 0"),
         (("--register", "marks", "--topic", "points2"), "is no ROS bag"),

@@ -15,7 +15,7 @@ from detectors import load_detector
 from detectors.interface import Detection, Evidence
 from detectors.missing import ALPHA, measure_missing, missing_returns, one_damage_once
 from harness.evaluation.study.limit import limit_of
-from harness.inspection.steps import judged as judged_cloud
+from harness.inspection.judging import judged as judged_cloud
 from harness.report.findings import write_findings
 from harness.report.study_rows import limit_rows
 from harness.testing.clouds import LENS, SHAPE, plane, without

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors.recordings import Recording, open_capture
-from detectors.recordings.distances import frame_from_points, metres_per_unit, rounding_step_m
+from detectors.recordings.distances import frame_of, metres_per_unit, rounding_step_m
 from detectors.recordings.intrinsics import read_lens
 from harness import detect
 from harness.vocabulary.capture import Frame, Reason
@@ -209,7 +209,7 @@ def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
 
 def test_a_cloud_behind_or_beside_the_lens_keeps_a_reason() -> None:
     stored = np.array([[[0.0, 0, 1], [0, 0, 0], [np.inf, 0, 1], [0, 0, np.nan], [0, 0, -1], [0, 0, 2]]])
-    frame = frame_from_points("a", stored, 1.0)
+    frame = frame_of("a", stored, 1.0)
     valid, none, odd, out = Reason.VALID, Reason.NO_RETURN, Reason.NOT_FINITE, Reason.OUT_OF_RANGE
     assert frame.reason.tolist() == [[valid, none, odd, odd, out, valid]]
     np.testing.assert_array_equal(np.isfinite(frame.z_m), frame.reason == Reason.VALID)
@@ -219,7 +219,7 @@ def test_a_cloud_behind_or_beside_the_lens_keeps_a_reason() -> None:
 @given(st.sampled_from(("mm", "m", "cm", "um", "tum", "4000/m")), st.floats(0.06, 19.0))
 def test_a_unit_turns_stored_numbers_into_metres_and_back(unit: str, distance_m: float) -> None:
     stored = np.full((2, 2, 3), distance_m / metres_per_unit(unit))
-    assert frame_from_points("a", stored, metres_per_unit(unit)).z_m[0, 0] == pytest.approx(distance_m, rel=1e-6)
+    assert frame_of("a", stored, metres_per_unit(unit)).z_m[0, 0] == pytest.approx(distance_m, rel=1e-6)
 
 
 @settings(max_examples=30, deadline=None)

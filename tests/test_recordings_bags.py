@@ -19,14 +19,17 @@ from rosbags.rosbag2 import CompressionMode
 from detectors.average import AverageConfig, average
 from detectors.recordings import bag_files, open_capture
 from detectors.recordings.bags import lens_of_info
-from detectors.recordings.image_messages import stored_depth
-from detectors.recordings.point_messages import frame_from_message
+from detectors.recordings.messages import frame_of_message, stored_depth
+from harness.vocabulary import limits
 from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 
 POINTS = plane.points_m(plane.depth_mm())
 VALID = np.isfinite(POINTS[..., 2])
+BOMB_BYTES = 1 << 28
+MAGIC_BYTES, CHUNK_INDEX = 8, 8
+"""MCAP: the length of its first and last bytes, and the code of a chunk's entry in the index."""
 
 
 def refusal(path: Path, **options: Any) -> str:
@@ -63,7 +66,7 @@ def test_every_layout_of_one_cloud_is_one_frame(
         rgb=rgb if coloured else None,
         packed_as=packed_as,
     )
-    frame = frame_from_message("m", message, 1.0)
+    frame = frame_of_message("m", message, 1.0)
     shape = VALID.shape if organised else (1, VALID.size)
     assert frame.z_m.dtype == np.float32 and frame.xy_m is not None
     np.testing.assert_array_equal(frame.z_m, POINTS[..., 2].astype(np.float32).reshape(shape))
@@ -77,7 +80,7 @@ def test_every_layout_of_one_cloud_is_one_frame(
 
 def test_whole_millimetres_are_read_in_their_unit() -> None:
     stored = np.rint(1e3 * np.nan_to_num(POINTS)).astype(int)
-    frame = frame_from_message("m", bags.cloud(stored, number="i2"), 1e-3)
+    frame = frame_of_message("m", bags.cloud(stored, number="i2"), 1e-3)
     np.testing.assert_array_equal(frame.z_m, np.where(VALID, POINTS[..., 2], np.nan).astype(np.float32))
     assert frame.reason[plane.NO_RETURN] == Reason.NO_RETURN
 
@@ -92,7 +95,7 @@ def test_whole_millimetres_are_read_in_their_unit() -> None:
 )
 def test_a_broken_cloud_is_refused(options: dict[str, Any], told: str) -> None:
     with pytest.raises(UserError, match="the cloud: ") as caught:
-        frame_from_message("the cloud", bags.cloud(POINTS, **options), 1.0)
+        frame_of_message("the cloud", bags.cloud(POINTS, **options), 1.0)
     assert told in str(caught.value)
 
 
@@ -102,7 +105,7 @@ def test_layouts_that_contradict_themselves_are_refused() -> None:
         for key, value in changes.items():
             setattr(message, key, value)
         with pytest.raises(UserError) as caught:
-            frame_from_message("m", message, 1.0)
+            frame_of_message("m", message, 1.0)
         return str(caught.value)
 
     message = bags.cloud(POINTS)
@@ -347,16 +350,16 @@ def test_a_changed_byte_of_ros_1_is_read_or_told(
         assert str(mistake)
 
 
-def test_a_chunk_of_ros_1_may_not_unpack_to_more_than_it_says(tmp_path: Path) -> None:
-    path = bags.write_ros1(tmp_path / "a.bag", bags.clouds(1), "bz2")
-    content = bytearray(path.read_bytes())
-    at = content.index(b"size=") + 5
-    struct.pack_into("<I", content, at, 1000)
-    path.write_bytes(content)
-    assert "unpacks to more than the" in refusal(path)
-    struct.pack_into("<I", content, at, bag_files.MAX_CHUNK_BYTES + 1)
-    path.write_bytes(content)
-    assert "up to 1024 MiB" in refusal(path)
+@pytest.mark.parametrize("compression", ("bz2", "lz4"))
+def test_a_chunk_of_ros_1_may_not_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str
+) -> None:
+    zeros = bags.image()
+    zeros.data = np.zeros(BOMB_BYTES, np.uint8)
+    path = bags.write_ros1(tmp_path / "a.bag", [(DEPTH, bags.IMAGE, zeros)], compression)
+    assert path.stat().st_size < BOMB_BYTES // 100
+    monkeypatch.setattr(limits, "READING_BYTES", BOMB_BYTES // 4)
+    assert "unpacks to more than the memory holds" in refusal(path)
 
 
 # ---- what it refuses -------------------------------------------------------------------------------------------------
@@ -441,18 +444,29 @@ def test_a_changed_byte_is_read_or_told(
     shutil.rmtree(folder)
 
 
-def test_a_chunk_may_not_unpack_to_more_than_it_says(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", (CompressionMode.STORAGE, CompressionMode.MESSAGE))
+def test_a_chunk_or_message_may_not_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
+) -> None:
+    zeros = bags.image()
+    zeros.data = np.zeros(BOMB_BYTES, np.uint8)
+    folder = bags.write_bag(tmp_path / "bag", [(DEPTH, bags.IMAGE, zeros)], mcap=True, compression=mode)
+    assert (folder / "bag.mcap").stat().st_size < BOMB_BYTES // 100
+    monkeypatch.setattr(limits, "READING_BYTES", BOMB_BYTES // 4)
+    assert "unpacks to more than the memory holds" in refusal(folder)
+
+
+def test_a_chunk_that_unpacks_to_another_size_than_it_states_is_refused(tmp_path: Path) -> None:
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(1), mcap=True, compression=CompressionMode.STORAGE)
     file = folder / "bag.mcap"
     content = bytearray(file.read_bytes())
-    start = next(at for at in _records(content) if content[at] == bag_files.MCAP_CHUNK)
-    (promised,) = struct.unpack_from("<Q", content, start + 9 + 16)
-    struct.pack_into("<Q", content, start + 9 + 16, promised - 1)
+    # the index repeats the size: op 8, eight bytes of length, .., and at its end the sizes, packed and unpacked
+    start = next(at for at in _records(content) if content[at] == CHUNK_INDEX)
+    end = start + 9 + struct.unpack_from("<Q", content, start + 1)[0]
+    (promised,) = struct.unpack_from("<Q", content, end - 8)
+    struct.pack_into("<Q", content, end - 8, promised - 1)
     file.write_bytes(content)
-    assert f"unpacks to more than the {promised - 1} bytes" in refusal(file)
-    struct.pack_into("<Q", content, start + 9 + 16, bag_files.MAX_CHUNK_BYTES + 1)
-    file.write_bytes(content)
-    assert "up to 1024 MiB" in refusal(file)
+    assert "is truncated or damaged" in refusal(file)
 
 
 def test_a_message_may_not_be_larger_than_a_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -464,8 +478,8 @@ def test_a_message_may_not_be_larger_than_a_cloud(tmp_path: Path, monkeypatch: p
 
 def _records(content: bytearray) -> list[int]:
     """Where the records of an MCAP begin."""
-    at, found = len(bag_files.MCAP_MAGIC), []
-    while at < len(content) - len(bag_files.MCAP_MAGIC):
+    at, found = MAGIC_BYTES, []
+    while at < len(content) - MAGIC_BYTES:
         found.append(at)
         at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
     return found

@@ -121,6 +121,7 @@ def test_a_declaration_from_a_file(suffix: str, tmp_path: Path, capsys: pytest.C
         (DECLARATION.replace("width_mm", "widht_mm"), "board.yaml:3:9: unknown key `widht_mm` in `board`"),
         (DECLARATION.replace("10,", "true,"), "`holes.0.diameter_mm` is true: it should be a valid number"),
         (DECLARATION.replace("[0, 0]", "[0, .inf]"), "`holes.0.centre_mm.1` is .inf: it should be a finite number"),
+        (DECLARATION.replace("name: ", "name: [a] #"), "`name` is"),
         (DECLARATION.replace("id: 1, ", ""), "`holes.0` lacks the key `id`"),
         (DECLARATION + "name: thesis\n", "board.yaml:6:1: "),
         (DECLARATION.replace("name: custom", "name: [custom"), "board.yaml:"),

@@ -17,8 +17,8 @@ from detectors.recordings.intrinsics import read_lens
 from harness.evaluation.pod.inspection_file import read_inspections
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
+from harness.inspection.arguments import assign
 from harness.inspection.poses import read_poses
-from harness.inspection.steps import assign
 from harness.scorecard.capture_program import read_mask
 from harness.scorecard.figures import read_baseline
 from harness.vocabulary.declaration.yaml_source import read_yaml
@@ -211,6 +211,7 @@ def test_a_mask_that_states_more_pixels_than_a_picture_has(tmp_path):
     path = tmp_path / "mask.png"
     header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
     content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    content += struct.pack(">I4sI", 0, b"IDAT", zlib.crc32(b"IDAT"))
     path.write_bytes(content)
     assert "no image that can be read (30000 x 30000 pixels)" in refusal(lambda: read_mask(path))
 

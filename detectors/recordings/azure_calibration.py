@@ -52,7 +52,7 @@ class ColourCamera:
 
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
-    """The calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     try:
         data = strict_json(content.rstrip(b"\0"))
@@ -67,32 +67,31 @@ def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
 
 
 def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
-    """The lens of a depth mode (``NFOV_UNBINNED`` and its like). Raises UserError for an unknown mode or a bad file."""
+    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode or a bad file."""
     if mode not in DEPTH_MODES:
         raise UserError(f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES))
-    camera = _camera(name, cameras, "Depth")
+    camera, numbers = _camera(name, cameras, "Depth")
     if (camera["SensorWidth"], camera["SensorHeight"]) != (1024, 1024):
         raise UserError(
             f"{name}: calibration of a sensor that is not 1024 x 1024", legal="an Azure Kinect's depth camera"
         )
-    return _lens(name, _parameters(name, camera), DEPTH_MODES[mode])
+    return _lens(name, numbers, DEPTH_MODES[mode])
 
 
 def depth_mode_of_size(width: int, height: int) -> str | None:
-    """The depth mode whose image has this size, None where there is none."""
+    """Return the depth mode whose image has this size, None where there is none."""
     return next((name for name, mode in DEPTH_MODES.items() if mode.image == (width, height)), None)
 
 
 def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
-    """The colour camera in the mode whose image has this size; None where the size is of no mode.
+    """Return the colour camera in the mode whose image has this size; None where the size is of no mode.
 
     Raises UserError where the calibration lacks the colour camera.
     """
     mode = next((mode for mode in COLOUR_MODES if mode.image == (width, height)), None)
     if mode is None:
         return None
-    camera = _camera(name, cameras, "PhotoVideo")
-    parameters = _parameters(name, camera)
+    camera, parameters = _camera(name, cameras, "PhotoVideo")
     if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
         # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
@@ -106,17 +105,13 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
     return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
 
 
-def _camera(name: str, cameras: dict[str, Any], purpose: str) -> dict[str, Any]:
+def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str, Any], list[float]]:
+    """Return a camera and its 14 numbers cx, cy, fx, fy, k1..k6, codx, cody, p2, p1."""
     if purpose not in cameras:
         raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
     camera: dict[str, Any] = cameras[purpose]
     if not all(isinstance(camera.get(key), int) for key in ("SensorWidth", "SensorHeight")):
         raise UserError(f"{name}: the calibration states no size of the sensor for {purpose}")
-    return camera
-
-
-def _parameters(name: str, camera: dict[str, Any]) -> list[float]:
-    """The 14 numbers cx, cy, fx, fy, k1..k6, codx, cody, p2, p1."""
     try:
         model, numbers = camera["Intrinsics"]["ModelType"], [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     except (KeyError, TypeError, ValueError) as error:
@@ -133,7 +128,7 @@ def _parameters(name: str, camera: dict[str, Any]) -> list[float]:
             legal="codx = cody = 0, as in every published Azure Kinect calibration",
             fix="give a lens with --intrinsics FILE",
         )
-    return numbers
+    return camera, numbers
 
 
 def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:

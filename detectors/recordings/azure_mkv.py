@@ -8,8 +8,8 @@ depth point into the colour camera; a point that the colour camera cannot see ta
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from detectors.recordings.azure_calibration import (
     depth_mode_of_size,
     parse_calibration,
 )
-from detectors.recordings.distances import UNITS_M, frame_from_depth
-from detectors.recordings.intrinsics import lens_of_size, no_lens, read_lens
-from detectors.recordings.recording import Recording
+from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.intrinsics import lens_for
+from detectors.recordings.recording import Asked, Recording, slopes_of
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import transform_points
@@ -39,77 +39,63 @@ WAITING = 4
 """Captures held while their other pictures may still come; the recorder interleaves its tracks within one frame."""
 
 
-@dataclass(frozen=True)
-class MkvReader:
-    """Streams the captures of one recording. ``lens`` of the depth pixels; ``colour`` None leaves the colour out."""
-
-    path: Path
-    scale_m: float
-    lens: Lens
-    colour: ColourCamera | None
-
-    @cached_property
-    def slopes(self) -> np.ndarray:
-        """(h, w, 2) x/z and y/z of the depth pixels."""
-        return self.lens.region_slopes(self.lens.whole)
-
-    def frames(self) -> Iterator[Frame]:
-        """One frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
-        for number, pictures in enumerate(_captures(self.path, with_colour=self.colour is not None)):
-            depth = pictures["DEPTH"]
-            name = f"{self.path.name} frame {number}"
-            amplitude = pictures.get("IR")
-            frame = frame_from_depth(
-                name,
-                depth,
-                self.scale_m,
-                amplitude=amplitude.astype(np.float32) if amplitude is not None else None,
-            )
-            if self.colour is not None and "COLOR" in pictures:
-                rgb = colour_on_depth(frame.z_m, self.slopes, self.colour, pictures["COLOR"])
-                frame = Frame(frame.name, frame.z_m, frame.reason, rgb=rgb, amplitude=frame.amplitude)
-            yield frame
-
-
-def open_mkv(path: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None) -> Recording:
+def open_mkv(path: Path, asked: Asked) -> Recording:
     """Open a recording. Without another lens given, its own calibration counts.
 
     Raises UserError where the file is no recording, has no depth, or carries no calibration.
     """
     _refuse_truncated(path)
-    header = _header(path)
-    size = header.depth_size
-    notes: list[str] = []
-    colour = None
-    if intrinsics is not None:
-        lens = read_lens(intrinsics, *size)
-    if header.calibration is not None:
-        cameras = parse_calibration(f"{path} (calibration.json)", header.calibration)
-        lens = lens or depth_lens(str(path), cameras, header.depth_mode)
-        colour = colour_camera(str(path), cameras, *header.colour_size) if header.colour_size else None
-    if lens is None:
-        raise no_lens(str(path))
-    lens = lens_of_size(str(path), lens, *size)
-    if colour is not None:
-        notes.append("colour sampled at each depth point's place in the colour picture, without a test for occlusion")
-    scale_m = scale_m or UNITS_M["mm"]
-    files = (path,) if intrinsics is None else (path, intrinsics)
-    reader = MkvReader(path, scale_m, lens, colour)
+    with _opened(path) as container:
+        tracks = _tracks(container)
+        if "DEPTH" not in tracks:
+            found = ", ".join(sorted(tracks)) or "none"
+            raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
+        sizes = {title: (t.codec_context.width, t.codec_context.height) for title, t in tracks.items()}
+        for title in sizes:
+            refuse_pixels(f"{path}: its track {title}", *sizes[title])
+        width, height = sizes["DEPTH"]
+        # recorders of other makers (Orbbec's Femto) may leave the tag out; each mode has its own size
+        stated = tracks["DEPTH"].metadata.get("K4A_DEPTH_MODE") or container.metadata.get("K4A_DEPTH_MODE")
+        attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
+        calibration = bytes(attached[0].data) if attached else None
+    cameras = None if calibration is None else parse_calibration(f"{path} (calibration.json)", calibration)
+
+    def own() -> tuple[Lens | None, None]:
+        mode = stated or depth_mode_of_size(width, height) or "(not stated)"
+        return None if cameras is None else depth_lens(str(path), cameras, mode), None
+
+    lens, lens_files = lens_for(str(path), asked, width, height, own)
+    has_colour = cameras is not None and "COLOR" in sizes
+    colour = colour_camera(str(path), cameras, *sizes["COLOR"]) if cameras is not None and has_colour else None
+    note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
+    scale_m = asked.scale_m or UNITS_M["mm"]
     return Recording(
-        path.name,
-        reader,
-        lens.whole,
-        scale_m,
+        name=path.name,
+        read=partial(_frames, path, scale_m, lens, colour),
+        shape=(height, width),
+        scale_m=scale_m,
         z_step_m=scale_m,
-        files=files,
+        files=(path, *lens_files),
         lens=lens,
-        notes=tuple(notes),
+        notes=() if colour is None else (note,),
         unit_from="k4arecorder, which writes millimetres",
     )
 
 
+def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
+    """Yield a frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
+    slopes = slopes_of(lens, lens.whole)
+    for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
+        infrared = pictures.get("IR")
+        amplitude = infrared.astype(np.float32) if infrared is not None else None
+        frame = frame_of(f"{path.name} frame {number}", pictures["DEPTH"], scale_m, amplitude=amplitude)
+        if colour is not None and "COLOR" in pictures:
+            frame = replace(frame, rgb=colour_on_depth(frame.z_m, slopes, colour, pictures["COLOR"]))
+        yield frame
+
+
 def colour_on_depth(z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, picture: np.ndarray) -> np.ndarray:
-    """The colour (h, w, 3) uint8 at each depth pixel, bilinear; black where there is no depth or no colour picture.
+    """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour is missing.
 
     Not modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect).
     """
@@ -123,14 +109,6 @@ def colour_on_depth(z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, p
     steep = np.abs(points_colour[..., :2] / np.where(seen, points_colour[..., 2], 1.0)[..., None]) > 1.2 * corner.max(0)
     at[steep.any(axis=-1)] = -1e3
     return cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-
-
-@dataclass(frozen=True)
-class _Header:
-    depth_size: tuple[int, int]
-    depth_mode: str
-    colour_size: tuple[int, int] | None
-    calibration: bytes | None
 
 
 def _opened(path: Path) -> Any:
@@ -147,56 +125,27 @@ def _opened(path: Path) -> Any:
         ) from error
 
 
-def _header(path: Path) -> _Header:
-    """What the recording says of itself before its frames."""
-    with _opened(path) as container:
-        tracks = _tracks(container)
-        if "DEPTH" not in tracks:
-            found = ", ".join(sorted(tracks)) or "none"
-            raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
-        depth, colour = tracks["DEPTH"], tracks.get("COLOR")
-        attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
-        for track in filter(None, (depth, colour)):
-            refuse_pixels(f"{path}: its track", track.codec_context.width, track.codec_context.height)
-        size = (depth.codec_context.width, depth.codec_context.height)
-        # recorders of other makers (Orbbec's Femto) may leave the tag out; each mode has its own size
-        stated = depth.metadata.get("K4A_DEPTH_MODE") or container.metadata.get("K4A_DEPTH_MODE")
-        return _Header(
-            depth_size=size,
-            depth_mode=stated or depth_mode_of_size(*size) or "(not stated)",
-            colour_size=(colour.codec_context.width, colour.codec_context.height) if colour else None,
-            calibration=bytes(attached[0].data) if attached else None,
-        )
-
-
 def _tracks(container: Any) -> dict[str, Any]:
     return {s.metadata["title"]: s for s in container.streams.video if s.metadata.get("title") in TITLES}
 
 
-@dataclass
-class _Capture:
-    """Pictures of one instant, by track title."""
-
-    time_s: float
-    pictures: dict[str, np.ndarray] = field(default_factory=dict)
-
-
 def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
-    """Pictures that belong together (within half a frame period), in order of time; those without depth are skipped."""
-    waiting: list[_Capture] = []
+    """Yield the pictures of one instant (within half a frame period) by track title, in order of time; instants without
+    depth are skipped."""
+    waiting: list[tuple[float, dict[str, np.ndarray]]] = []
     for title, time_s, period_s, picture in _pictures(path, with_colour):
-        home = next((c for c in waiting if abs(c.time_s - time_s) < period_s / 2 and title not in c.pictures), None)
+        home = next((held for at_s, held in waiting if abs(at_s - time_s) < period_s / 2 and title not in held), None)
         if home is None:
-            home = _Capture(time_s)
-            waiting = sorted([*waiting, home], key=lambda c: c.time_s)
-        home.pictures[title] = picture
-        if len(waiting) > WAITING and "DEPTH" in (ready := waiting.pop(0)).pictures:
-            yield ready.pictures
-    yield from (c.pictures for c in waiting if "DEPTH" in c.pictures)
+            home = {}
+            waiting = sorted([*waiting, (time_s, home)], key=lambda capture: capture[0])
+        home[title] = picture
+        if len(waiting) > WAITING and "DEPTH" in (ready := waiting.pop(0)[1]):
+            yield ready
+    yield from (held for _, held in waiting if "DEPTH" in held)
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
-    """(title, time in s, frame period in s, picture) as the file interleaves them. Raises UserError where it breaks."""
+    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError where it breaks."""
     with _opened(path) as container:
         tracks = {title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"}
         title_of = {s.index: title for title, s in tracks.items()}

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag, messages, topics_of
-from detectors.recordings.distances import UNITS_M, default_metres, frame_from_depth, rounding_step_m
-from detectors.recordings.image_messages import DEPTH_NUMBERS, encoding_of, stored_depth
-from detectors.recordings.intrinsics import KNOWN_MODELS, lens_of_size, no_lens, read_lens
-from detectors.recordings.point_messages import frame_from_message
-from detectors.recordings.recording import Recording, slopes_of
-from harness.vocabulary.capture import Frame, Reason
+from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag
+from detectors.recordings.distances import UNITS_M, default_metres, rounding_step_m
+from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
+from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
+from detectors.recordings.recording import NO_GRID, Asked, Recording, slopes_of
+from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -38,84 +37,65 @@ RAY_TOLERANCE_PX = 0.01
 """A lens counts where each point lies within this of its pixel's ray: 14 um at 0.7 m with the Azure Kinect's focal
 length, three hundred times what float32 leaves of it."""
 
-
-@dataclass(frozen=True)
-class BagReader:
-    """Streams the clouds of one topic, one frame a message. ``has_lens``: x and y come from the lens."""
-
-    bag: Bag
-    topic: str
-    scale_m: float
-    has_lens: bool
-
-    def frames(self) -> Iterator[Frame]:
-        for name, message in messages(self.bag, self.topic):
-            frame = frame_from_message(name, message, self.scale_m)
-            yield replace(frame, xy_m=None) if self.has_lens else frame
+Topics = dict[str, str]
+"""Topic to message type."""
 
 
-@dataclass(frozen=True)
-class BagImageReader:
-    """Streams the depth images of one topic, one frame a message."""
-
-    bag: Bag
-    topic: str
-    scale_m: float
-
-    def frames(self) -> Iterator[Frame]:
-        for name, message in messages(self.bag, self.topic):
-            frame = frame_from_depth(name, stored_depth(name, message), self.scale_m)
-            # NaN is this message's code for "no return" (REP 118), which other files write as 0
-            frame.reason[frame.reason == Reason.NOT_FINITE] = Reason.NO_RETURN
-            yield frame
-
-
-def open_bag(
-    path: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None, topic: str | None
-) -> Recording:
-    """Open a bag's depth images or clouds. ``topic``: which of several. A lens that is given must fit clouds' points.
+def open_bag(path: Path, asked: Asked) -> Recording:
+    """Open a bag's depth images or clouds. A lens that is given must fit clouds' points.
 
     Raises UserError where the bag is broken or empty, has no such topic, or the topic holds something else.
     """
     bag = find_bag(path)
-    topics = topics_of(bag)
-    chosen, notes = _chosen_topic(path, bag, topics, topic, has_lens=bool(intrinsics or lens))
+    topics = bag.topics()
+    chosen, notes = _chosen_topic(path, bag, topics, asked)
     opened = _open_clouds if topics[chosen] == CLOUD_TYPE else _open_images
-    recording = opened(path, bag, topics, chosen, scale_m, intrinsics, lens)
-    return replace(
-        recording,
-        files=(*bag.files, *((bag.metadata,) if bag.metadata else ()), *((intrinsics,) if intrinsics else ())),
-        notes=(*notes, *recording.notes),
-    )
+    recording = opened(path, bag, topics, chosen, asked)
+    files = (*bag.files, *filter(None, (bag.metadata, asked.intrinsics)))
+    return replace(recording, files=files, notes=(*notes, *recording.notes))
 
 
-def _open_clouds(
-    path: Path,
-    bag: Bag,
-    topics: dict[str, str],
-    topic: str,
-    scale_m: float | None,
-    intrinsics: Path | None,
-    lens: Lens | None,
-) -> Recording:
-    scale_m = scale_m or UNITS_M["m"]
-    first = next(BagReader(bag, topic, scale_m, has_lens=False).frames(), None)
+def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Frame]:
+    """Yield the images or clouds of one topic, a frame a message. ``by_lens``: x and y come from the lens."""
+    for name, message in bag.messages(topic):
+        frame = frame_of_message(name, message, scale_m)
+        yield replace(frame, xy_m=None) if by_lens else frame
+
+
+def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
+    scale_m = asked.scale_m or UNITS_M["m"]
+    first = next(_frames(bag, topic, scale_m, by_lens=False), None)
     if first is None:
         raise UserError(f"{path}: no message on {topic}", legal="at least one cloud", fix="record again")
     height, width = first.z_m.shape
-    lens = read_lens(intrinsics, width, height) if intrinsics else lens
+    lens = read_lens(asked.intrinsics, width, height) if asked.intrinsics else asked.lens
     notes: tuple[str, ...] = ()
     if lens is not None:
-        _refuse_other_rays(path, lens, first)
+        if (lens.height, lens.width) != (height, width):
+            what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
+            raise UserError(f"{path}: {what}")
+        if (off := _off_ray_px(lens, first)) > RAY_TOLERANCE_PX:
+            raise UserError(
+                f"{path}: the named lens is not that of these points: they lie up to {off:.2g} pixels beside its rays",
+                fix="leave --intrinsics out: the points are used as they stand",
+            )
+    elif height == 1:
+        notes = (NO_GRID,)
     else:
-        lens, notes = _lens_in_bag(bag, topics, first)
+        for info in (name for name, kind in topics.items() if kind == INFO_TYPE):
+            message = bag.first(info)
+            found = lens_of_info(message, (height, width)) if message is not None else ""
+            if isinstance(found, Lens) and _off_ray_px(found, first) <= RAY_TOLERANCE_PX:
+                lens = found
+                break
+        else:
+            notes = ("no CameraInfo in the bag fits the points; each frame's own x and y are averaged",)
     return Recording(
         name=bag.name,
-        reader=BagReader(bag, topic, scale_m, has_lens=lens is not None),
-        region=Region(0, height, 0, width),
+        read=partial(_frames, bag, topic, scale_m, lens is not None),
+        shape=(height, width),
         scale_m=scale_m,
         z_step_m=rounding_step_m(first.z_m),
-        files=(),
         lens=lens,
         organised=height > 1,
         unit_from="ROS, whose clouds are in metres",
@@ -123,64 +103,57 @@ def _open_clouds(
     )
 
 
-def _open_images(
-    path: Path,
-    bag: Bag,
-    topics: dict[str, str],
-    topic: str,
-    scale_m: float | None,
-    intrinsics: Path | None,
-    lens: Lens | None,
-) -> Recording:
-    name, message = next(messages(bag, topic), ("", None))
+def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
+    name, message = next(bag.messages(topic), ("", None))
     if message is None:
         raise UserError(f"{path}: no message on {topic}", legal="at least one depth image", fix="record again")
     stored = stored_depth(name, message)
     height, width = stored.shape
-    if intrinsics is not None:
-        lens = read_lens(intrinsics, width, height)
-    if lens is None:
-        lens = _lens_of_images(path, bag, topics, topic, stored.shape)
-    lens = lens_of_size(str(path), lens, width, height)
-    unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
-    if scale_m is None and stored.dtype.kind == "u":
-        scale_m, unit_topic = _stated_unit(bag, topics, topic)
-        unit_from = unit_topic or unit_from
-    scale_m = scale_m or default_metres(stored.dtype)
-    reader = BagImageReader(bag, topic, scale_m)
     is_whole = stored.dtype.kind == "u"
-    return Recording(
-        name=bag.name,
-        reader=reader,
-        region=lens.whole,
-        scale_m=scale_m,
-        z_step_m=scale_m if is_whole else rounding_step_m(next(reader.frames()).z_m),
-        files=(),
-        lens=lens,
-        unit_from=unit_from,
+
+    def own() -> tuple[Lens, None]:
+        return _lens_of_images(path, bag, topics, topic, (height, width)), None
+
+    lens, _ = lens_for(str(path), asked, width, height, own)
+    scale_m, unit_from = (
+        asked.scale_m,
+        "ROS, which sets millimetres for integers and metres for floating point (REP 118)",
     )
+    for name, kind in topics.items():
+        # RealSense's viewer states the unit beside a sensor's streams
+        sensor, _, option = name.partition("/option/")
+        is_stated = kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/")
+        if scale_m is None and is_whole and is_stated:
+            message = bag.first(name)
+            if message is not None and 1e-6 <= message.data <= 1:
+                # the option is a float32: 0.00025 is stored as 0.00025000001
+                scale_m, unit_from = float(f"{message.data:.6g}"), name
+    scale_m = scale_m or default_metres(stored.dtype)
+    read = partial(_frames, bag, topic, scale_m, by_lens=False)
+    step_m = scale_m if is_whole else rounding_step_m(next(read()).z_m)
+    return Recording(bag.name, read, (height, width), scale_m, step_m, lens=lens, unit_from=unit_from)
 
 
 # ---- which topic -----------------------------------------------------------------------------------------------------
 
 
-def _chosen_topic(
-    path: Path, bag: Bag, topics: dict[str, str], asked: str | None, has_lens: bool
-) -> tuple[str, tuple[str, ...]]:
-    """The topic to read, and what the user should know of the others: the depth image with its lens, else the cloud."""
+def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[str, tuple[str, ...]]:
+    """Return the topic to read, and what the user should know of the others: the depth image with its lens, else the
+    cloud."""
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
+    images = _depth_topics(bag, topics)
     held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
-    if asked is not None:
-        name = asked if asked in topics else f"/{asked}"
+    if asked.topic is not None:
+        name = asked.topic if asked.topic in topics else f"/{asked.topic}"
         if name not in topics:
-            legal = ", ".join([*clouds, *_depth_topics(bag, topics)])
-            raise UserError(f"{path}: no topic {asked}; its topics: {held}", legal=legal or LEGAL_BAG)
+            legal = ", ".join([*clouds, *images])
+            raise UserError(f"{path}: no topic {asked.topic}; its topics: {held}", legal=legal or LEGAL_BAG)
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ()
-    images = _depth_topics(bag, topics)
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
+    has_lens = bool(asked.intrinsics or asked.lens)
     if len(images) == 1 and (not clouds or has_lens or _infos_of(topics, images[0])):
         others = ", ".join(clouds)
         note = f"the depth images on {images[0]} are read, with their lens, not the clouds on {others}; --topic chooses"
@@ -203,14 +176,14 @@ def _chosen_topic(
     )
 
 
-def _depth_topics(bag: Bag, topics: dict[str, str]) -> list[str]:
-    """Topics whose first picture may be depth. 16-bit grey counts as depth only under a name that says so, and a
-    compressed copy only where the pictures themselves are not in the bag."""
+def _depth_topics(bag: Bag, topics: Topics) -> list[str]:
+    """Return the topics whose first picture may be depth. 16-bit grey counts as depth only under a name that says so,
+    and a compressed copy only where the pictures themselves are not in the bag."""
     found = []
     for topic, kind in topics.items():
         if kind not in IMAGE_TYPES or NOT_DEPTH.search(topic):
             continue
-        _, message = next(messages(bag, topic), ("", None))
+        message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
             found.append(topic)
@@ -218,7 +191,7 @@ def _depth_topics(bag: Bag, topics: dict[str, str]) -> list[str]:
 
 
 def _of_pictures(topic: str) -> str:
-    """A topic without the name of its transport."""
+    """Return a topic without the name of its transport."""
     transport = next((end for end in TRANSPORTS if topic.endswith(end)), "")
     return topic.removesuffix(transport)
 
@@ -226,20 +199,20 @@ def _of_pictures(topic: str) -> str:
 # ---- the lens and the unit -------------------------------------------------------------------------------------------
 
 
-def _infos_of(topics: dict[str, str], topic: str) -> list[str]:
-    """The CameraInfo that belongs to a picture by its name: camera_info beside it; info/camera_info beside its folder
-    (RealSense)."""
+def _infos_of(topics: Topics, topic: str) -> list[str]:
+    """Return the CameraInfo topics that belong to a picture by name: camera_info beside it; info/camera_info beside its
+    folder (RealSense)."""
     folder = _of_pictures(topic).rpartition("/")[0]
     names = (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info", f"{topic}/camera_info")
     return [name for name in names if topics.get(name) == INFO_TYPE]
 
 
-def _lens_of_images(path: Path, bag: Bag, topics: dict[str, str], topic: str, shape: tuple[int, ...]) -> Lens:
-    """The lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
+def _lens_of_images(path: Path, bag: Bag, topics: Topics, topic: str, shape: tuple[int, ...]) -> Lens:
+    """Return the lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
     every = [name for name, kind in topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     for info in _infos_of(topics, topic) or (every if len(every) == 1 else []):
-        _, message = next(messages(bag, info), ("", None))
+        message = bag.first(info)
         if message is None:
             continue
         lens = lens_of_info(message, shape, is_rectified="rect" in _of_pictures(topic).rpartition("/")[2])
@@ -247,13 +220,15 @@ def _lens_of_images(path: Path, bag: Bag, topics: dict[str, str], topic: str, sh
             return lens
         why.append(f"{info} {lens}")
     told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
-    lacking = no_lens(f"{path}: {told}")
-    fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
-    raise UserError(lacking.message, legal=lacking.legal, fix=fix)
+    raise UserError(
+        f"{path}: {told}: nothing says which lens took these depth images, and without it they are no points",
+        legal=LEGAL_LENS,
+        fix=f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}",
+    )
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """The lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs.
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs.
 
     A rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and the region of
     interest are taken off. ROS 1 writes the matrices in capitals.
@@ -285,32 +260,8 @@ def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = Fals
     )
 
 
-def _stated_unit(bag: Bag, topics: dict[str, str], topic: str) -> tuple[float | None, str]:
-    """Metres in one stored unit as RealSense's viewer states them beside a sensor's streams, and the topic."""
-    for name, kind in topics.items():
-        sensor, _, option = name.partition("/option/")
-        if kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/"):
-            _, message = next(messages(bag, name), ("", None))
-            if message is not None and 1e-6 <= message.data <= 1:
-                # the option is a float32: 0.00025 is stored as 0.00025000001
-                return float(f"{message.data:.6g}"), name
-    return None, ""
-
-
-def _lens_in_bag(bag: Bag, topics: dict[str, str], frame: Frame) -> tuple[Lens | None, tuple[str, ...]]:
-    """The first CameraInfo's lens that fits the points of a cloud, and what the user should know."""
-    if frame.z_m.shape[0] == 1:
-        return None, ("the cloud has no pixel grid; it is treated as single points",)
-    for topic in (topic for topic, kind in topics.items() if kind == INFO_TYPE):
-        _, message = next(messages(bag, topic), ("", None))
-        lens = lens_of_info(message, frame.z_m.shape) if message is not None else ""
-        if isinstance(lens, Lens) and _off_ray_px(lens, frame) <= RAY_TOLERANCE_PX:
-            return lens, ()
-    return None, ("no CameraInfo in the bag fits the points; each frame's own x and y are averaged",)
-
-
 def _off_ray_px(lens: Lens, frame: Frame) -> float:
-    """How far the worst point of a frame lies from its pixel's ray."""
+    """Return the distance of a frame's worst point from its pixel's ray."""
     assert frame.xy_m is not None
     valid = np.isfinite(frame.z_m)
     if not valid.any():
@@ -319,16 +270,3 @@ def _off_ray_px(lens: Lens, frame: Frame) -> float:
     off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (lens.fx, lens.fy)
     worst = float(off.max())
     return worst if np.isfinite(worst) else float("inf")
-
-
-def _refuse_other_rays(path: Path, lens: Lens, frame: Frame) -> None:
-    """Raise UserError where a lens that the user named is not the one that the points were made with."""
-    if (lens.height, lens.width) != frame.z_m.shape:
-        height, width = frame.z_m.shape
-        raise UserError(f"{path}: clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}")
-    off = _off_ray_px(lens, frame)
-    if off > RAY_TOLERANCE_PX:
-        raise UserError(
-            f"{path}: the named lens is not that of these points: they lie up to {off:.2g} pixels beside its rays",
-            fix="leave --intrinsics out: the points are used as they stand",
-        )

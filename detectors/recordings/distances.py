@@ -1,4 +1,4 @@
-"""From stored numbers to distances: which of them mean "no return", what one of them is in metres, and who says so.
+"""Stored numbers as distances: which of them mean "no return", what one of them is in metres, and who says so.
 
 Codes for no return are decided frame by frame (`no_return_codes`), the unit once for a capture (`decided_unit`).
 """
@@ -17,62 +17,17 @@ from harness.vocabulary.errors import UserError
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "tum": 1 / 5000}
 """Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
-
+LEGAL_UNITS = "mm, cm, m, um, tum (5000 to the metre), or N/m for N to the metre (4000/m)"
 NEAREST_M, FARTHEST_M = 0.05, 20.0
 """Bounds of a plausible median distance: nearer than any time-of-flight camera works, farther than any of them sees."""
-
-LEGAL_UNITS = "mm, cm, m, um, tum (5000 to the metre), or N/m for N to the metre (4000/m)"
-
-UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfactor", "pngdepthscale", "zunits")
-UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
-
+COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
+"""Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
 TURNED_SHARE = 0.99
 """Part of the points that must have z below 0 before they are turned: no camera measures behind itself."""
 
-SHARED_CODE = 20
-"""Pixels that must share a number before it can be a full scale."""
-ISOLATED = 4.0
-"""Times that codes lie beyond all distances: a wall four times as far as all else has more than a few distances."""
-FEW_CODES = 8
-
-READINGS = {
-    "mm": (0.867, 0.15),
-    "4000/m": (0.08, 0.0),
-    "tum": (0.03, 0.0),
-    "10000/m": (0.015, 0.0),
-    "cm": (0.003, 0.04),
-    "um": (0.005, 0.01),
-    "m": (0.0, 0.8),
-}
-"""Units and how common each is among integers and floating-point numbers: guesses, in which a factor of 2 moves no
-decision by more than a fifth of the distance. 0.25 mm: RealSense L515, Helios; 0.1 mm: structured light, Orbbec."""
-NEAR_M = (0.8, 1.8)
-"""Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
-NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
-"""Beyond the first, any distance keeps so much of the weight of the commonest."""
-SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: above the first nothing is said but the unit, below the second the user is asked, below the third a
-reading is not offered."""
-MILLIMETRE_SIZES = {
-    (640, 576): 4.5,
-    (320, 288): 6.0,
-    (512, 512): 3.5,
-    (1024, 1024): 3.0,
-    (512, 424): 8.0,
-    (256, 192): 8.0,
-}
-"""Image sizes of cameras that all store 1 mm (Azure Kinect and Femto, Kinect v2, iPhone) and the median distance in
-metres that they can reach: the data sheets' range and what bright walls add to it."""
-
-QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
-"""Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
-
-COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
-"""Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
-
 
 def metres_per_unit(unit: str) -> float:
-    """Metres in one stored unit. Raises UserError for a unit that is not known."""
+    """Return metres in one stored unit. Raises UserError for a unit that is not known."""
     if unit in UNITS_M:
         return UNITS_M[unit]
     counted = re.fullmatch(r"(\d+(?:\.\d+)?)/m", unit)
@@ -82,7 +37,7 @@ def metres_per_unit(unit: str) -> float:
 
 
 def default_metres(dtype: np.dtype) -> float:
-    """The usual unit of stored numbers: millimetres for integers, metres for floating point."""
+    """Return the usual unit of stored numbers: millimetres for integers, metres for floating point."""
     return UNITS_M["mm"] if dtype.kind in "iu" else UNITS_M["m"]
 
 
@@ -98,32 +53,15 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
         raise UserError(f"{name}: holds {dtype}, not numbers", legal="integers of 16 bits or more, or floating point")
 
 
-def frame_from_depth(
+def frame_of(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
-    """A frame from stored depth (h, w) in units of ``scale_m`` metres; 0 and `no_return_codes` mean no return.
+    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres.
 
-    Depth that is negative throughout is turned. Raises UserError where points lie both before and behind the camera.
+    A distance of 0 and `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError
+    where points lie both in front of and behind the camera.
     """
-    z_m, reason, notes, _ = _judged(name, stored, scale_m)
-    return Frame(name=name, z_m=z_m, reason=reason, rgb=rgb, amplitude=amplitude, notes=notes)
-
-
-def frame_from_points(
-    name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
-) -> Frame:
-    """A frame from stored points (h, w, 3) in units of ``scale_m`` metres; a pixel with z = 0 means no return."""
-    z_m, reason, notes, turned = _judged(name, stored[..., 2], scale_m)
-    sideways = ~np.isfinite(stored[..., :2]).all(axis=-1) & (reason == Reason.VALID)
-    reason[sideways] = Reason.NOT_FINITE
-    z_m[sideways] = np.nan
-    xy_m = stored[..., :2].astype(np.float64) * (scale_m, -scale_m if turned else scale_m)
-    xy_m[reason != Reason.VALID] = np.nan
-    return Frame(name=name, z_m=z_m, reason=reason, xy_m=xy_m, rgb=rgb, amplitude=amplitude, notes=notes)
-
-
-def _judged(name: str, stored_z: np.ndarray, scale_m: float) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], bool]:
-    """Distances (h, w) float32 with NaN where invalid, each pixel's reason, what to say, and whether z was turned."""
+    stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
     if stored_z.dtype.kind == "f":
@@ -149,74 +87,94 @@ def _judged(name: str, stored_z: np.ndarray, scale_m: float) -> tuple[np.ndarray
             fix="turn the cloud before saving it (a cloud with y up and z back: negate y and z)",
         )
     reason[behind] = Reason.OUT_OF_RANGE
+    xy_m = None
+    if stored.ndim == 3:
+        reason[~np.isfinite(stored[..., :2]).all(axis=-1) & (reason == Reason.VALID)] = Reason.NOT_FINITE
+        xy_m = stored[..., :2].astype(np.float64) * (scale_m, -scale_m if turned else scale_m)
+        xy_m[reason != Reason.VALID] = np.nan
     z_m = (stored_z * np.float64(-scale_m if turned else scale_m)).astype(np.float32)
     z_m[reason != Reason.VALID] = np.nan
-    return z_m, reason, tuple(notes), bool(turned)
+    return Frame(name, z_m, reason, xy_m=xy_m, rgb=rgb, amplitude=amplitude, notes=tuple(notes))
 
 
 # ---- numbers that mean no return -------------------------------------------------------------------------------------
 
+SHARED_CODE = 20
+"""Pixels that must share a number before it can be a full scale."""
+ISOLATED = 4.0
+"""Factor between codes and all distances: a wall four times as far as all else has more than a few distances."""
+FEW_CODES = 8
+
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
-    """The numbers among ``stored`` (n,), finite and not 0, that no surface explains: they stand for "no return".
+    """Return the numbers among ``stored`` (n,), finite and not 0, that no surface explains: they mean "no return".
 
     Four kinds: the largest number that the type can hold; a full scale of fewer bits (4095, 65534 ..) that many pixels
     share, well beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than all
     others, or of integers as much nearer; at most three different negative ones. Not found: a code amid the distances.
     """
     codes: list[float] = []
+    is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
-    if SHARED_CODE <= negative.size < stored.size:
-        # A surface's distances differ from pixel to pixel; codes do not.
-        few = _fewest(negative, 3)
-        codes += few if few is not None else []
+    if SHARED_CODE <= negative.size < stored.size and (few := np.unique(negative)).size <= 3:
+        # a surface's distances differ from pixel to pixel; codes do not
+        codes += [float(code) for code in few]
     rest = stored[stored > 0]
     while rest.size:
         top = rest.max().item()
         below = rest[rest < top]
-        if not (_is_largest(stored.dtype, top) or _is_full_scale(top, rest.size - below.size, below)):
+        is_largest = is_integer and top == np.iinfo(stored.dtype).max
+        bits = math.log2(top + 3) if top < 2**32 else 0
+        below_power = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
+        shared = rest.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+        if not (is_largest or (below_power and shared)):
             break
         codes.append(float(top))
         rest = below
     # An octave without a number lies between any two neighbours that differ four times: most frames need no sorting.
     if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
-        codes += _isolated(np.unique(rest))
+        different = np.unique(rest)
+        ratios = different[1:] / different[:-1].astype(np.float64)
+        far = np.flatnonzero(ratios >= ISOLATED)
+        far = far[(far >= FEW_CODES) & (far >= len(different) - 1 - FEW_CODES)]
+        isolated = different[far[0] + 1 :] if far.size else different[:0]
+        near = np.flatnonzero(ratios[:FEW_CODES] >= ISOLATED)
+        if is_integer and near.size and len(different) - near[-1] - 1 > FEW_CODES:
+            isolated = np.concatenate([different[: near[-1] + 1], isolated])
+        codes += [float(code) for code in isolated]
     return tuple(codes)
 
 
-def _fewest(values: np.ndarray, most: int) -> list[float] | None:
-    """The different numbers among the values; None where there are more than ``most``."""
-    found: list[float] = []
-    while values.size and len(found) <= most:
-        found.append(float(values[0]))
-        values = values[values != values[0]]
-    return None if len(found) > most else found
-
-
-def _is_largest(dtype: np.dtype, top: float) -> bool:
-    return dtype.kind in "iu" and top == np.iinfo(dtype).max
-
-
-def _is_full_scale(top: float, count: int, below: np.ndarray) -> bool:
-    """Whether many pixels share a number just below a power of two that is a quarter beyond all others."""
-    bits = math.log2(top + 3) if top < 2**32 else 0
-    near = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
-    return near and count >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
-
-
-def _isolated(different: np.ndarray) -> list[float]:
-    """Of sorted positive numbers those few beyond an empty gap, where the others are too many to be codes."""
-    ratios = different[1:] / different[:-1].astype(np.float64)
-    far = np.flatnonzero(ratios >= ISOLATED)
-    far = far[(far >= FEW_CODES) & (far >= len(different) - 1 - FEW_CODES)]
-    codes = different[far[0] + 1 :] if far.size else different[:0]
-    near = np.flatnonzero(ratios[:FEW_CODES] >= ISOLATED)
-    if different.dtype.kind in "iu" and near.size and len(different) - near[-1] - 1 > FEW_CODES:
-        codes = np.concatenate([different[: near[-1] + 1], codes])
-    return [float(code) for code in codes]
-
-
 # ---- the unit --------------------------------------------------------------------------------------------------------
+
+UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfactor", "pngdepthscale", "zunits")
+UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
+READINGS = {
+    "mm": (0.867, 0.15),
+    "4000/m": (0.08, 0.0),
+    "tum": (0.03, 0.0),
+    "10000/m": (0.015, 0.0),
+    "cm": (0.003, 0.04),
+    "um": (0.005, 0.01),
+    "m": (0.0, 0.8),
+}
+"""Units and how common each is among integers and floating-point numbers: guesses, in which a factor of 2 moves no
+decision by more than a fifth of the distance. 0.25 mm: RealSense L515, Helios; 0.1 mm: structured light, Orbbec."""
+NEAR_M = (0.8, 1.8)
+"""Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
+NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
+"""Any distance above the first keeps at least the second as its part of the commonest distance's weight."""
+SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
+"""Probabilities: above the first nothing is said but the unit, below the second the user is asked, below the third a
+reading is not offered."""
+MILLIMETRE_SIZES = {
+    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0},
+    **{(512, 424): 8.0, (256, 192): 8.0},
+}
+"""Image sizes of cameras that all store 1 mm (Azure Kinect and Femto, Kinect v2, iPhone) and the median distance in
+metres that they can reach: the data sheets' range and what bright walls add to it."""
+QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +187,7 @@ class Unit:
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Metres in one stored number as names with values state it, None where they do not.
+    """Return metres in one stored number as names with values state it, None where they do not.
 
     Values are metres (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000, ORB-SLAM: 5000)
     or a unit's name; they are three powers of ten apart, and the ``median`` stored number tells which it is.
@@ -253,7 +211,7 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
-    """The unit of numbers (n,), without those that mean no return, that nothing states.
+    """Decide the unit of numbers (n,), without those that mean no return, that nothing states.
 
     Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
     where targets are: 0.8 m within a factor of 1.8 (`NEAR_M`). A common divisor of all numbers speaks for the unit in
@@ -265,42 +223,12 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     """
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
-    weights = _weights(near, median, integers, _divisor(stored) if integers else 1, size)
-    best = max(weights, key=lambda unit: weights[unit], default=None)
-    shown = [
-        f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)"
-        for unit in sorted(weights, key=lambda unit: -weights[unit])
-        if weights[unit] > SHOWN
-    ]
-    if best is None or weights[best] < LIKELY:
-        what = "several units are plausible" if best else "no usual unit is plausible"
-        raise UserError(
-            f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})",
-            fix=f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}",
-        )
-    scale_m = metres_per_unit(best)
-    usual = math.isclose(scale_m, usual_m)
-    kind = "integers" if integers else "floating-point numbers"
-    origin = f"what is usual for {kind}" if usual else f"the data: in the usual unit of {kind}, {1e3 * usual_m:g} mm,"
-    origin += "" if usual else f" the median distance would be {median * usual_m:.4g} m"
-    if usual and weights[best] >= SURE:
-        return Unit(scale_m, origin)
-    others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
-    return Unit(
-        scale_m,
-        origin,
-        f"nothing states the depth unit; {1e3 * scale_m:.4g} mm is taken, which puts the median at"
-        f" {median * scale_m:.3g} m{others}; state it with --unit {best}",
-    )
-
-
-def _weights(near: float, median: float, integers: bool, divisor: int, size: tuple[int, int]) -> dict[str, float]:
-    """Probability of each reading that is possible."""
+    divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
     reach_m = MILLIMETRE_SIZES.get(size) if integers else None
     weights = {}
-    for unit, (for_integers, for_floats) in READINGS.items():
+    for unit, commonness in READINGS.items():
         metres = metres_per_unit(unit)
-        weight = for_integers if integers else for_floats
+        weight = commonness[0 if integers else 1]
         if reach_m is not None and unit == "mm":
             weight = 0.0 if median * metres > reach_m else 10 * weight
         if integers and unit == "4000/m":
@@ -312,16 +240,33 @@ def _weights(near: float, median: float, integers: bool, divisor: int, size: tup
         off = math.log(max(near * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
         weights[unit] = weight * (math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M))
     total = sum(weights.values())
-    return {unit: weight / total for unit, weight in weights.items()} if total > 0 else {}
-
-
-def _divisor(stored: np.ndarray) -> int:
-    """The greatest common divisor of all numbers."""
-    return int(np.gcd.reduce(stored.astype(np.int64)))
+    ranked = sorted(weights, key=lambda unit: -weights[unit])
+    best, chance = ranked[0], weights[ranked[0]] / total if total > 0 else 0.0
+    likely = [unit for unit in ranked if total > 0 and weights[unit] / total > SHOWN]
+    shown = [f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)" for unit in likely]
+    if chance < LIKELY:
+        what = "several units are plausible" if shown else "no usual unit is plausible"
+        raise UserError(
+            f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})",
+            fix=f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}",
+        )
+    scale_m = metres_per_unit(best)
+    usual = math.isclose(scale_m, usual_m)
+    kind = "integers" if integers else "floating-point numbers"
+    origin = f"what is usual for {kind}" if usual else f"the data: in the usual unit of {kind}, {1e3 * usual_m:g} mm,"
+    origin += "" if usual else f" the median distance would be {median * usual_m:.4g} m"
+    if usual and chance >= SURE:
+        return Unit(scale_m, origin)
+    others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
+    warning = (
+        f"nothing states the depth unit; {1e3 * scale_m:.4g} mm is taken, which puts the median at"
+        f" {median * scale_m:.3g} m{others}; state it with --unit {best}"
+    )
+    return Unit(scale_m, origin, warning)
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:
-    """The coarsest common rounding step that all valid distances are multiples of; 0 where they follow none.
+    """Return the coarsest common rounding step that all valid distances are multiples of; 0 where they follow none.
 
     A cloud in floating-point metres that came from a camera with 1 mm output still has steps of 1 mm.
     """
@@ -335,21 +280,16 @@ def rounding_step_m(z_m: np.ndarray) -> float:
 
 
 def refuse_implausible(frame: Frame, scale_m: float) -> None:
-    """Raise UserError where the frame's median distance speaks for a wrong unit. Says nothing about an empty frame.
+    """Raise UserError where the median distance of a frame with a valid pixel speaks for a wrong unit.
 
     A factor that leaves the distance plausible (5000 to the metre read as millimetres) cannot be noticed here.
     """
     valid = frame.z_m[np.isfinite(frame.z_m)]
-    if valid.size == 0:
-        return
     median_m = float(np.median(valid[:: max(1, valid.size // 50_000)]))
     if NEAREST_M <= median_m <= FARTHEST_M:
         return
-    fitting = [
-        f"--unit {unit} (then {median_m / scale_m * metres:.3g} m)"
-        for unit, metres in UNITS_M.items()
-        if NEAREST_M <= median_m / scale_m * metres <= FARTHEST_M
-    ]
+    in_each = {unit: median_m / scale_m * metres for unit, metres in UNITS_M.items()}
+    fitting = [f"--unit {unit} (then {m:.3g} m)" for unit, m in in_each.items() if NEAREST_M <= m <= FARTHEST_M]
     raise UserError(
         f"{frame.name}: the median distance would be {median_m:.4g} m, which speaks for a wrong unit",
         legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from detectors.recordings.azure_calibration import depth_lens, depth_mode_of_size, parse_calibration
 from detectors.recordings.pictures import png_texts
+from detectors.recordings.recording import Asked
 from harness.vocabulary.declaration.problems import DeclarationError
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, parse_yaml
 from harness.vocabulary.errors import UserError
@@ -22,35 +23,67 @@ LEGAL_LENS = (
     "OpenCV's or ROS' camera_info YAML; an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
-    "intrinsic",
-    "intrinsics",
-    "camera_intrinsic",
-    "camera_intrinsics",
-    "camera",
-    "camera_info",
-    "calibration",
+    *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
     "rtabmap_calib",
 )
 """Stems of the files that are taken for the lens of the frames beside or below them."""
-
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 BESIDE = 20
 """Files beside a capture that are asked for its unit."""
 SHOWN_KEYS = 20
 LARGEST = 1e12
-"""Of any number of a lens, in any unit."""
+"""Largest number that a lens may state, in any unit."""
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
 
+Own = Callable[[], tuple[Lens | None, Path | None]]
+"""Finds the lens that comes with a capture, and the file that it was read from, where it has one of its own."""
 
-def lens_file_beside(folder: Path) -> Path | None:
-    """The file in ``folder`` that holds its frames' lens, None where there is none."""
-    candidates = (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml"))
-    return next((path for path in candidates if path.is_file()), None)
+
+def lens_for(
+    name: str, asked: Asked, width: int, height: int, own: Own, hint: str = ""
+) -> tuple[Lens, tuple[Path, ...]]:
+    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, or ``own``.
+
+    Raises UserError where nobody states a lens (``hint`` ends its advice), or the one stated is of other images.
+    """
+    lens, file = asked.lens, asked.intrinsics
+    if file is not None:
+        lens = read_lens(file, width, height)
+    elif lens is None:
+        lens, file = own()
+    if lens is None:
+        raise UserError(
+            f"{name}: nothing says which lens took these depth images, and without it they are no points",
+            legal=LEGAL_LENS,
+            fix="pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough" + hint,
+        )
+    files = (file,) if file else ()
+    modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
+    found = next((mode for mode in modes if (mode.width, mode.height) == (width, height)), None)
+    if found is not None:
+        return found, files
+    known = [f"{mode.mode} {mode.width} x {mode.height}" for mode in modes[1:] if isinstance(mode, OtherLens)]
+    raise UserError(
+        f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
+        legal=f"the modes of this camera: {', '.join(known)}" if known else None,
+        fix="pass --intrinsics FILE with the lens of these images"
+        + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
+    )
+
+
+def lens_beside(folders: Sequence[Path], width: int, height: int) -> tuple[Lens | None, Path | None]:
+    """Read the first file in ``folders`` that is named like a lens. Raises UserError as `read_lens` does."""
+    for folder in folders:
+        for path in (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")):
+            if path.is_file():
+                return read_lens(path, width, height), path
+    return None, None
 
 
 def statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """What the JSON and YAML files in and above the folder of a capture's first file say, and the text in that file
-    where it is a PNG. Files that cannot be read say nothing here: they may belong to something else."""
+    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file, and the
+    text in that file where it is a PNG. Files that cannot be read are passed over: they may belong to something else.
+    """
     folders = dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ())
     if files and files[0].suffix.lower() == ".png":
         yield files[0], png_texts(bounded_bytes(files[0], PICTURE_BYTES))
@@ -63,17 +96,8 @@ def statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, A
                 continue
 
 
-def no_lens(name: str) -> UserError:
-    """The message for depth images whose lens nobody stated."""
-    return UserError(
-        f"{name}: nothing says which lens took these depth images, and without it they are no points",
-        legal=LEGAL_LENS,
-        fix="pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough",
-    )
-
-
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """The lens in a file, for images of ``width`` x ``height``.
+    """Return the lens in a file, for images of ``width`` x ``height``.
 
     Raises UserError where the file is missing, unreadable, of another image size, or of a lens model that is not known.
     """
@@ -84,16 +108,32 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
             raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
         return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
     data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
-    stated = _stated_size(data)
+    stated = None
+    for keys in (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px")):
+        if stated is None and all(key in data for key in keys):
+            if not all(isinstance(data[key], int) for key in keys):
+                raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
+            stated = data[keys[0]], data[keys[1]]
     if stated is not None and stated != (width, height) and stated[0] * height != stated[1] * width:
         raise UserError(
             f"{path}: is for images of {stated[0]} x {stated[1]} pixels, but the depth images have {width} x {height}",
             fix="give the lens of the depth images themselves (or of the colour camera that they are aligned to)",
         )
-    fx, fy, cx, cy = _centre_and_focal(path, data)
+    fx, fy, cx, cy = _focal_and_centre(path, data)
     side = stated[0] / width if stated else 1.0
     fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
-    _refuse_odd_numbers(path, (fx, fy, cx, cy), width, height)
+    # no lens of these images has a mirrored or normalised focal length, or a centre far outside
+    if not (0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
+        raise UserError(
+            f"{path}: focal length fx = {fx:g}, fy = {fy:g} for an image {width} pixels wide",
+            legal=f"pixels, {0.1 * width:g} to {100 * width:g}",
+            fix="multiply a normalised focal length by the image's width",
+        )
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise UserError(
+            f"{path}: principal point cx = {cx:g}, cy = {cy:g} for {width} x {height} pixels",
+            legal="pixels from the centre of the first one, near the image's centre",
+        )
     distortion = _distortion(path, data)
     if stated in (None, (width, height)):
         return Lens(width, height, fx, fy, cx, cy, distortion)
@@ -104,72 +144,38 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     return OtherLens(width, height, fx, fy, cx, cy, distortion, warning=warning)
 
 
-def lens_of_size(name: str, lens: Lens, width: int, height: int) -> Lens:
-    """The lens for images of ``width`` x ``height``: the one given, or of the same camera the mode of that size.
-
-    Raises UserError where it is of another size.
-    """
-    modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
-    found = next((mode for mode in modes if (mode.width, mode.height) == (width, height)), None)
-    if found is not None:
-        return found
-    known = [f"{mode.mode} {mode.width} x {mode.height}" for mode in modes[1:] if isinstance(mode, OtherLens)]
-    raise UserError(
-        f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
-        legal=f"the modes of this camera: {', '.join(known)}" if known else None,
-        fix="pass --intrinsics FILE with the lens of these images"
-        + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
-    )
-
-
 def _parsed(path: Path) -> dict[str, Any]:
-    """The file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
+    """Return the file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
     try:
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
+        if text.lstrip().startswith("{"):
+            data = strict_json(text, nan=True)  # `_number` names the key that is no number
+        else:
+            refuse_bytes(str(path), len(text), MAX_BYTES)
+            # OpenCV's first line, "%YAML:1.0", is no directive of YAML; its matrices are plain mappings under a tag
+            body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+            data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS) from error
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read ({error})", legal=LEGAL_LENS) from error
-    data = _parse_json(path, text) if text.lstrip().startswith("{") else _parse_yaml(path, text)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
+    except DeclarationError as error:
+        first = error.problems[0]
+        where = first.place.head if first.place else str(path)
+        raise UserError(f"{where}: {first.message}", legal=LEGAL_LENS) from error
+    except ValueError as error:
+        raise UserError(f"{path}: {error}", legal=LEGAL_LENS) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: holds no names with values", legal=LEGAL_LENS)
     return data
 
 
-def _parse_json(path: Path, text: str) -> Any:
-    try:
-        return strict_json(text, nan=True)  # `_number` says which
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
-    except ValueError as error:
-        raise UserError(f"{path}: {error}", legal=LEGAL_LENS) from error
-
-
-def _parse_yaml(path: Path, text: str) -> Any:
-    refuse_bytes(str(path), len(text), MAX_BYTES)
-    # OpenCV's first line, "%YAML:1.0", is no directive of YAML, and its matrices are plain mappings under a tag.
-    body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
-    try:
-        return parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
-    except DeclarationError as error:
-        first = error.problems[0]
-        where = first.place.head if first.place else str(path)
-        raise UserError(f"{where}: {first.message}", legal=LEGAL_LENS) from error
-
-
-def _stated_size(data: dict[str, Any]) -> tuple[int, int] | None:
-    for across, down in (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px")):
-        if across in data and down in data:
-            if not all(isinstance(data[key], int) for key in (across, down)):
-                raise UserError("the lens' width and height are no whole numbers", legal=LEGAL_LENS)
-            return data[across], data[down]
-    return None
-
-
-def _centre_and_focal(path: Path, data: dict[str, Any]) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy from whichever of the known forms the file has."""
+def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
+    """Return fx, fy, cx, cy from whichever of the known forms the file has."""
     if all(key in data for key in ("fx", "fy", "cx", "cy")):
-        return tuple(_number(path, key, data[key]) for key in ("fx", "fy", "cx", "cy"))  # type: ignore[return-value]
+        return tuple(_number(path, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
     if "intrinsic_matrix" in data:  # Open3D: column by column
         m = _numbers(path, "intrinsic_matrix", data["intrinsic_matrix"], 9)
         return m[0], m[4], m[6], m[7]
@@ -182,7 +188,7 @@ def _centre_and_focal(path: Path, data: dict[str, Any]) -> tuple[float, float, f
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
-    """OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
+    """Return OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
     model = str(data.get("distortion_model", ""))
     if model.lower() not in KNOWN_MODELS:
         raise UserError(f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:]))
@@ -192,7 +198,9 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     if isinstance(data[key], dict) and "data" not in data[key]:
         unknown = set(data[key]) - set(DISTORTION_NAMES)
         if unknown:
-            raise UserError(f"{path}: {key} has {', '.join(sorted(unknown))}", legal=", ".join(DISTORTION_NAMES))
+            raise UserError(
+                f"{path}: {key} has {', '.join(sorted(map(str, unknown)))}", legal=", ".join(DISTORTION_NAMES)
+            )
         return tuple(_number(path, f"{key}.{name}", data[key].get(name, 0.0)) for name in DISTORTION_NAMES)
     numbers = _numbers(path, key, data[key], None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):
@@ -204,7 +212,7 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
 
 
 def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float, ...]:
-    """Numbers from a flat list, a list of rows, or an OpenCV matrix (``data``)."""
+    """Return the numbers of a flat list, a list of rows, or an OpenCV matrix (``data``)."""
     value = value.get("data") if isinstance(value, dict) else value
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [x for row in value for x in row]
@@ -219,19 +227,3 @@ def _number(path: Path, key: str, value: Any) -> float:
         shown = repr(value)[:40] if isinstance(value, str | bool | float | None) else type(value).__name__
         raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")
     return float(value)
-
-
-def _refuse_odd_numbers(path: Path, numbers: tuple[float, ...], width: int, height: int) -> None:
-    """Refuse what no lens of these images has: a mirrored or normalised focal length, a centre far outside."""
-    fx, fy, cx, cy = numbers
-    if not (0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        raise UserError(
-            f"{path}: focal length fx = {fx:g}, fy = {fy:g} for an image {width} pixels wide",
-            legal=f"pixels, {0.1 * width:g} to {100 * width:g}",
-            fix="multiply a normalised focal length by the image's width",
-        )
-    if not (-width < cx < 2 * width and -height < cy < 2 * height):
-        raise UserError(
-            f"{path}: principal point cx = {cx:g}, cy = {cy:g} for {width} x {height} pixels",
-            legal="pixels from the centre of the first one, near the image's centre",
-        )

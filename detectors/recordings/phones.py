@@ -2,7 +2,7 @@
 
 Both store ARKit's depth (256 x 192, z along the optical axis), a confidence 0 to 2 of each pixel, the lens of the
 colour camera at its own resolution, and the camera's poses. Pixels of confidence 0 are no return. The phone is held by
-hand: how far it moved during the selected frames is told from the poses, and warned of where it blurs their average.
+hand: its movement during the selected frames is computed from the poses, and warned of where it blurs their average.
 """
 
 from __future__ import annotations
@@ -10,68 +10,57 @@ from __future__ import annotations
 import re
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from detectors.recordings.depth_images import depth_files, read_depth_png
-from detectors.recordings.distances import UNITS_M, frame_from_depth
-from detectors.recordings.intrinsics import read_lens
+from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.intrinsics import lens_for
 from detectors.recordings.pictures import read_picture
-from detectors.recordings.recording import Recording
-from harness.vocabulary.archives import DAMAGES, METHODS, refuse_long_list
+from detectors.recordings.recording import Asked, Recording
 from harness.vocabulary.capture import Frame
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.lens import Lens
-from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels
+from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes, limited_memory, refuse_bytes, refuse_pixels
 
 LEGAL_STRAY = "Stray Scanner's folder: depth/*.png, confidence/*.png, camera_matrix.csv, odometry.csv"
 LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
 COLOUR_WIDTHS = (1920, 1280, 640, 3840)
-"""Of the pictures that ARKit's lens may be of; all are 4 : 3, as its depth is."""
+"""Widths of the pictures that ARKit's lens may be of; all are 4 : 3, as its depth is."""
 BLUR_PX = 0.5
 """Motion over this much of a pixel spreads an edge further than the sensor itself does."""
 LZFSE_BLOCKS = 64
-"""In a frame: the coder fills a block with at least 10 kB of an iPhone's 196. A block unpacks to 24 MB at most."""
+"""Most blocks in a frame: the coder fills a block with at least 10 kB of an iPhone's 196. A block unpacks to 24 MB at
+most."""
 
 
-@dataclass(frozen=True)
-class StrayReader:
-    """Streams a folder's depth pictures, each with its confidence where there is one."""
-
-    depths: tuple[Path, ...]
-    confidences: tuple[Path | None, ...]
-    scale_m: float
-
-    def frames(self) -> Iterator[Frame]:
-        for depth, confidence in zip(self.depths, self.confidences, strict=True):
-            sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
-            yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, self.scale_m)
+# ---- Stray Scanner ---------------------------------------------------------------------------------------------------
 
 
 def is_stray(folder: Path) -> bool:
+    """Return whether a folder is Stray Scanner's."""
     return (folder / "camera_matrix.csv").is_file() and (folder / "depth").is_dir()
 
 
-def open_stray(
-    folder: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None, frames: slice | None
-) -> Recording:
+def open_stray(folder: Path, asked: Asked) -> Recording:
     """Open Stray Scanner's folder. Raises UserError where a file is broken or the lens' resolution cannot be told."""
     depths = depth_files(folder / "depth")
     stored = read_depth_png(depths[0])
     height, width = stored.shape
     beside = [folder / "confidence" / path.name for path in depths]
     confidences = tuple(path if path.is_file() else None for path in beside)
+    scale_m = asked.scale_m or UNITS_M["mm"]
+    matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
     notes: list[str] = []
-    matrix = folder / "camera_matrix.csv"
-    if intrinsics is not None:
-        lens = read_lens(intrinsics, width, height)
-    if lens is None:
+
+    def own() -> tuple[Lens, None]:
         k = _table(matrix)
         if k.shape != (3, 3):
             raise UserError(f"{matrix}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
@@ -82,93 +71,173 @@ def open_stray(
                 legal=f"the lens of pictures {', '.join(map(str, COLOUR_WIDTHS))} pixels wide",
                 fix="pass --intrinsics FILE with the lens of the depth pictures",
             )
-        lens = _scaled(str(matrix), k, (across, across * 3 // 4), (width, height))
         notes.append(f"lens scaled from {across} x {across * 3 // 4} colour pixels to {width} x {height}")
+        return _scaled(str(matrix), k, (across, across * 3 // 4), (width, height)), None
+
+    lens, lens_files = lens_for(str(folder), asked, width, height, own)
     if not all(confidences):
         notes.append(f"{confidences.count(None)} of {len(depths)} depth pictures have no confidence picture")
-    odometry = folder / "odometry.csv"
-    poses = _table(odometry)[:, 2:9] if odometry.is_file() else np.zeros((0, 7))
     # x y z, then the quaternion
-    warnings = _of_motion(
-        poses[:, :3], poses[:, 3:], frames, lens, _median_m(stored, scale_m or UNITS_M["mm"]), odometry.name
-    )
-    files = (*depths, *(path for path in confidences if path), intrinsics or matrix)
-    reader = StrayReader(depths, confidences, scale_m or UNITS_M["mm"])
+    poses = _table(odometry)[:, 2:9] if odometry.is_file() else np.zeros((0, 7))
+    median_m = scale_m * float(np.median(stored[stored > 0])) if (stored > 0).any() else 1.0
+    lens_files = lens_files or (matrix,)
     return Recording(
         name=folder.name,
-        reader=reader,
-        region=lens.whole,
-        scale_m=reader.scale_m,
-        z_step_m=reader.scale_m,
-        files=(*files, odometry) if odometry.is_file() else files,
+        read=partial(_stray_frames, depths, confidences, scale_m),
+        shape=(height, width),
+        scale_m=scale_m,
+        z_step_m=scale_m,
+        files=(*depths, *filter(None, confidences), *lens_files, *([odometry] if odometry.is_file() else [])),
         lens=lens,
         unit_from="Stray Scanner, which writes millimetres",
         notes=tuple(notes),
-        warnings=warnings,
+        warnings=_motion_warnings(poses[:, :3], poses[:, 3:], asked.frames, lens, median_m, odometry.name),
     )
 
 
-@dataclass(frozen=True)
-class R3dReader:
-    """Streams the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
-
-    path: Path
-    size: tuple[int, int]
-    scale_m: float
-
-    def frames(self) -> Iterator[Frame]:
-        width, height = self.size
-        with _archive(self.path) as archive:
-            names = {entry.filename: entry for entry in archive.infolist()}
-            for name in _depth_names(names):
-                packed = _content(self.path, archive, names[name])
-                stored = np.frombuffer(_lzfse(f"{self.path}: {name}", packed, 4 * width * height), "<f4")
-                sure = None
-                if (beside := f"{name.removesuffix('.depth')}.conf") in names:
-                    packed = _content(self.path, archive, names[beside])
-                    sure = np.frombuffer(_lzfse(f"{self.path}: {beside}", packed, width * height), np.uint8)
-                    sure = sure.reshape(height, width)
-                yield _frame(f"{self.path.name} {name}", stored.reshape(height, width), sure, self.scale_m)
+def _stray_frames(depths: tuple[Path, ...], confidences: tuple[Path | None, ...], scale_m: float) -> Iterator[Frame]:
+    for depth, confidence in zip(depths, confidences, strict=True):
+        sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
+        yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
 
 
-def open_r3d(
-    path: Path, scale_m: float | None, intrinsics: Path | None, lens: Lens | None, frames: slice | None
-) -> Recording:
+def _table(path: Path) -> np.ndarray:
+    """Return the numbers of a small CSV, (rows, columns), without its line of names."""
+    try:
+        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
+        lines = (line.strip(" ,\r") for line in text.splitlines() if re.match(r"\s*[-+.\d]", line))
+        table = np.array([[float(cell) for cell in re.split(r"[,;\s]+", line) if cell] for line in lines], float)
+        if table.ndim != 2 or (path.stem == "odometry" and table.shape[1] < 9):
+            raise ValueError("its lines differ in length or are too short")
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read as a table of numbers ({error})", legal=LEGAL_STRAY) from error
+    return table
+
+
+# ---- Record3D --------------------------------------------------------------------------------------------------------
+
+
+def open_r3d(path: Path, asked: Asked) -> Recording:
     """Open Record3D's .r3d. Raises UserError where it is broken or pyliblzfse, which unpacks its depth, is missing."""
     with _archive(path) as archive:
-        names = {entry.filename: entry for entry in archive.infolist()}
-        if "metadata" not in names or not _depth_names(names):
-            held = ", ".join(list(names)[:6]) or "nothing"
+        if "metadata" not in archive.namelist() or not _depth_names(archive):
+            held = ", ".join(archive.namelist()[:6]) or "nothing"
             raise UserError(f"{path}: holds no capture of Record3D ({held[:200]})", legal=LEGAL_R3D)
-        try:
-            told = strict_json(_content(path, archive, names["metadata"]))
-            k = np.array([float(x) for x in told["K"]]).reshape(3, 3).T
-            size = int(told.get("dw", 192)), int(told.get("dh", 256))
-            colour = int(told["w"]), int(told["h"])
-            poses = np.array(told.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise UserError(
-                f"{path}: its metadata cannot be read ({type(error).__name__}: {error})", legal=LEGAL_R3D
-            ) from error
-    refuse_pixels(str(path), *size)
-    if intrinsics is not None:
-        lens = read_lens(intrinsics, *size)
-    lens = lens or _scaled(f"{path}: metadata", k, colour, size)
-    reader = R3dReader(path, size, scale_m or UNITS_M["m"])
-    first = next(reader.frames())
-    median_m = float(np.median(first.z_m[np.isfinite(first.z_m)])) if np.isfinite(first.z_m).any() else 1.0
+        content = _content(path, archive, "metadata")
+    try:
+        told = strict_json(content)
+        k = np.array([float(x) for x in told["K"]]).reshape(3, 3).T
+        width, height = int(told.get("dw", 192)), int(told.get("dh", 256))
+        colour = int(told["w"]), int(told["h"])
+        poses = np.array(told.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        what = f"{path}: its metadata cannot be read ({type(error).__name__}: {error})"
+        raise UserError(what, legal=LEGAL_R3D) from error
+    refuse_pixels(str(path), width, height)
+
+    def own() -> tuple[Lens, None]:
+        return _scaled(f"{path}: metadata", k, colour, (width, height)), None
+
+    lens, lens_files = lens_for(str(path), asked, width, height, own)
+    scale_m = asked.scale_m or UNITS_M["m"]
+    read = partial(_r3d_frames, path, (width, height), scale_m)
+    z_m = next(read()).z_m
+    median_m = float(np.median(z_m[np.isfinite(z_m)])) if np.isfinite(z_m).any() else 1.0
     return Recording(
         name=path.name,
-        reader=reader,
-        region=lens.whole,
-        scale_m=reader.scale_m,
+        read=read,
+        shape=(height, width),
+        scale_m=scale_m,
         z_step_m=0.0,
-        files=(path, *([intrinsics] if intrinsics else [])),
+        files=(path, *lens_files),
         lens=lens,
         unit_from="Record3D, which writes metres",
-        notes=(f"lens scaled from {colour[0]} x {colour[1]} colour pixels to {size[0]} x {size[1]}",),
-        warnings=_of_motion(poses[:, 4:], poses[:, :4], frames, lens, median_m, "its metadata"),
+        notes=(f"lens scaled from {colour[0]} x {colour[1]} colour pixels to {width} x {height}",),
+        warnings=_motion_warnings(poses[:, 4:], poses[:, :4], asked.frames, lens, median_m, "its metadata"),
     )
+
+
+def _r3d_frames(path: Path, size: tuple[int, int], scale_m: float) -> Iterator[Frame]:
+    """Yield the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
+    width, height = size
+    with _archive(path) as archive:
+        for name in _depth_names(archive):
+            packed = _content(path, archive, name)
+            stored = np.frombuffer(_lzfse(f"{path}: {name}", packed, 4 * width * height), "<f4")
+            sure = None
+            if (beside := f"{name.removesuffix('.depth')}.conf") in archive.namelist():
+                packed = _content(path, archive, beside)
+                sure = np.frombuffer(_lzfse(f"{path}: {beside}", packed, width * height), np.uint8)
+                sure = sure.reshape(height, width)
+            yield _frame(f"{path.name} {name}", stored.reshape(height, width), sure, scale_m)
+
+
+@contextmanager
+def _damage_told(what: str) -> Iterator[None]:
+    """Turn what a damaged archive raises into a UserError that begins with ``what``, and limit its memory."""
+    damages = (OSError, ValueError, EOFError, LookupError, RuntimeError, MemoryError, struct.error, zlib.error)
+    try:
+        with limited_memory():
+            yield
+    except (zipfile.BadZipFile, *damages) as error:
+        raise UserError(f"{what} ({error})", legal=LEGAL_R3D, fix="copy it again") from error
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    with _damage_told(f"{path}: is no archive of Record3D, or is cut off"):
+        return zipfile.ZipFile(path)
+
+
+def _depth_names(archive: zipfile.ZipFile) -> list[str]:
+    found = [name for name in archive.namelist() if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
+    return sorted(found, key=lambda name: int(Path(name).stem))
+
+
+def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return an entry's bytes, no more than `limits.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
+    refuse_bytes(f"{path}: {name}", archive.getinfo(name).file_size, TEXT_BYTES)
+    with _damage_told(f"{path}: {name} cannot be read"), archive.open(name) as stream:
+        return stream.read(TEXT_BYTES)
+
+
+def _lzfse(name: str, packed: bytes, expected: int) -> bytes:
+    """Unpack Apple's LZFSE. Raises UserError where it does not unpack to as many bytes as expected.
+
+    The blocks' headers are read first, as Apple's lzfse_internal.h lays them out: the library unpacks a bomb for
+    minutes before it fails for want of memory.
+    """
+    try:
+        import liblzfse  # type: ignore[import-not-found]
+    except ImportError as error:
+        raise UserError(
+            f"{name}: is compressed by LZFSE, and the package that unpacks it is not installed",
+            fix="pip install pyliblzfse, or export the capture from Record3D as PLY",
+        ) from error
+    at = stated = blocks = 0
+    try:
+        while (magic := packed[at : at + 4]) != b"bvx$" and blocks <= LZFSE_BLOCKS:
+            (raw,) = struct.unpack_from("<I", packed, at + 4)
+            if magic == b"bvx-":
+                at += 8 + raw
+            elif magic == b"bvxn":
+                at += 12 + struct.unpack_from("<I", packed, at + 8)[0]
+            elif magic == b"bvx2":
+                literals, matches, header = struct.unpack_from("<QQQ", packed, at + 8)
+                at += (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (matches >> 40 & 0xFFFFF)
+            else:
+                raise struct.error("no block of LZFSE")
+            stated, blocks = stated + raw, blocks + 1
+    except struct.error:
+        stated, blocks = -1, 0
+    if stated != expected or blocks > LZFSE_BLOCKS:
+        raise UserError(f"{name}: is damaged: {stated} bytes in {blocks} blocks, not {expected} bytes", legal=LEGAL_R3D)
+    try:
+        unpacked: bytes = liblzfse.decompress(packed)
+    except (liblzfse.error, MemoryError) as error:
+        raise UserError(f"{name}: is damaged, its LZFSE data cannot be unpacked", legal=LEGAL_R3D) from error
+    if len(unpacked) != expected:
+        raise UserError(f"{name}: is damaged: {len(unpacked)} bytes, not {expected}", legal=LEGAL_R3D)
+    return unpacked
 
 
 # ---- what both share -------------------------------------------------------------------------------------------------
@@ -179,11 +248,11 @@ def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m
         if confidence.shape != stored.shape:
             raise UserError(f"{name}: its confidence has {confidence.shape} pixels, the depth {stored.shape}")
         stored = np.where(confidence > 0, stored, stored.dtype.type(0))
-    return frame_from_depth(name, stored, scale_m)
+    return frame_of(name, stored, scale_m)
 
 
 def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> Lens:
-    """The lens of a colour picture, scaled to the depth picture of the same view."""
+    """Scale the lens of a colour picture to the depth picture of the same view."""
     across, down = size[0] / max(colour[0], 1), size[1] / max(colour[1], 1)
     fx, fy, cx, cy = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
     good = np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
@@ -197,14 +266,10 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
     return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
 
 
-def _median_m(stored: np.ndarray, scale_m: float) -> float:
-    return scale_m * float(np.median(stored[stored > 0])) if (stored > 0).any() else 1.0
-
-
-def _of_motion(
+def _motion_warnings(
     places_m: np.ndarray, turns: np.ndarray, frames: slice | None, lens: Lens, median_m: float, source: str
 ) -> tuple[str, ...]:
-    """A warning where the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
+    """Warn where the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
     chosen = frames or slice(None)
     places_m, turns = places_m[chosen], turns[chosen]
     if len(places_m) < 2 or not np.isfinite([*places_m.ravel(), *turns.ravel()]).all():
@@ -220,98 +285,3 @@ def _of_motion(
         f" frames ({source}), up to {blur_px:.2g} pixels on the target, so their average is blurred: --max-frames 1"
         " takes the first frame alone",
     )
-
-
-def _table(path: Path) -> np.ndarray:
-    """The numbers of a small CSV, (rows, columns), its line of names left out."""
-    try:
-        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
-        rows = [
-            [float(cell) for cell in re.split(r"[,;\s]+", line.strip(" ,\r")) if cell]
-            for line in text.splitlines()
-            if re.match(r"\s*[-+.\d]", line)
-        ]
-        table = np.array(rows, float)
-        if table.ndim != 2 or (path.stem == "odometry" and table.shape[1] < 9):
-            raise ValueError("its lines differ in length or are too short")
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as a table of numbers ({error})", legal=LEGAL_STRAY) from error
-    return table
-
-
-# ---- Record3D's archive ----------------------------------------------------------------------------------------------
-
-
-def _archive(path: Path) -> zipfile.ZipFile:
-    try:
-        refuse_long_list(path)
-        return zipfile.ZipFile(path)
-    except DAMAGES as error:
-        raise UserError(
-            f"{path}: is no archive of Record3D, or is cut off ({error})", legal=LEGAL_R3D, fix="copy it again"
-        ) from error
-
-
-def _depth_names(names: dict[str, Any]) -> list[str]:
-    found = [name for name in names if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
-    return sorted(found, key=lambda name: int(Path(name).stem))
-
-
-def _content(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """An entry's bytes, no more than `limits.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
-    refuse_bytes(f"{path}: {entry.filename}", entry.file_size, TEXT_BYTES)
-    try:
-        if entry.compress_type not in METHODS:
-            raise ValueError(f"packed by method {entry.compress_type}")
-        with archive.open(entry) as stream:
-            return stream.read(TEXT_BYTES)
-    except DAMAGES as error:
-        raise UserError(
-            f"{path}: {entry.filename} cannot be read ({error})", legal=LEGAL_R3D, fix="copy it again"
-        ) from error
-
-
-def _lzfse(name: str, packed: bytes, expected: int) -> bytes:
-    """Unpacked bytes of Apple's LZFSE. Raises UserError where they are not as many as expected."""
-    try:
-        import liblzfse  # type: ignore[import-not-found]
-    except ImportError as error:
-        raise UserError(
-            f"{name}: is compressed by LZFSE, and the package that unpacks it is not installed",
-            fix="pip install pyliblzfse, or export the capture from Record3D as PLY",
-        ) from error
-    stated, blocks = _lzfse_sizes(packed)
-    if stated != expected or blocks > LZFSE_BLOCKS:
-        raise UserError(f"{name}: is damaged: {stated} bytes in {blocks} blocks, not {expected} bytes", legal=LEGAL_R3D)
-    try:
-        unpacked: bytes = liblzfse.decompress(packed)
-    except (liblzfse.error, MemoryError) as error:
-        raise UserError(f"{name}: is damaged, its LZFSE data cannot be unpacked", legal=LEGAL_R3D) from error
-    if len(unpacked) != expected:
-        raise UserError(f"{name}: is damaged: {len(unpacked)} bytes, not {expected}", legal=LEGAL_R3D)
-    return unpacked
-
-
-def _lzfse_sizes(packed: bytes) -> tuple[int, int]:
-    """(bytes that the blocks say they unpack to, number of blocks) by their headers, as Apple's lzfse_internal.h lays
-    them out; (-1, 0) where they are none."""
-    at = stated = blocks = 0
-    try:
-        while (magic := packed[at : at + 4]) != b"bvx$":
-            (raw,) = struct.unpack_from("<I", packed, at + 4)
-            if magic == b"bvx-":
-                at += 8 + raw
-            elif magic == b"bvxn":
-                at += 12 + struct.unpack_from("<I", packed, at + 8)[0]
-            elif magic == b"bvx2":
-                literals, matches, header = struct.unpack_from("<QQQ", packed, at + 8)
-                at += (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (matches >> 40 & 0xFFFFF)
-            else:
-                return -1, 0
-            stated += raw
-            blocks += 1
-            if blocks > LZFSE_BLOCKS:
-                break
-    except struct.error:
-        return -1, 0
-    return stated, blocks

@@ -12,9 +12,8 @@ from detectors.average import prefix_averages
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment, Point, recording_of
 from harness.experiment.schema import CaptureSource
-from harness.inspection.printed import print_warnings
-from harness.inspection.steps import judged as judged_cloud
-from harness.inspection.target import choice_by, choice_facts, pictures
+from harness.inspection.judging import judged as judged_cloud
+from harness.inspection.told import choice_by, choice_facts, pictures, print_warnings
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text

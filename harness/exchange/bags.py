@@ -11,22 +11,19 @@ import errno
 import sqlite3
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from harness.exchange.views import BOARD_FRAME, ExportedView, Exposure, quaternion_of
 from harness.vocabulary.lens import Lens
 
-if TYPE_CHECKING:
-    from rosbags.rosbag2 import Writer
-
 Storage = Literal["sqlite3", "mcap"]
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
 BAG_VERSION: Literal[8] = 8
-"""Of metadata.yaml: the oldest that the library writes; later ROS distributions read it too."""
+"""Version of metadata.yaml: the oldest that the library writes; later ROS distributions read it too."""
 FLOAT32 = 7
 """sensor_msgs/PointField's code."""
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
@@ -41,55 +38,50 @@ def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
     MCAP is compressed in chunks (zstd); sqlite3 is not, as rosbag2 knows no such thing. Raises OSError as files do.
     """
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
 
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    types = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(folder, version=BAG_VERSION, storage_plugin=plugin)
     if storage == "mcap":
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+
+    def write(topic: str, stamp_ns: int, message: Any) -> None:
+        writer.write(topics[topic], stamp_ns, types.serialize_cdr(message, topics[topic].msgtype))
+
     try:
         with writer:
-            _write_messages(writer, view)
+            topics = {
+                topic: writer.add_connection(topic, kind, typestore=types, offered_qos_profiles=_qos(latched))
+                for topic, kind, latched in (
+                    (POSE_TOPIC, "tf2_msgs/msg/TFMessage", True),
+                    (INFO_TOPIC, "sensor_msgs/msg/CameraInfo", False),
+                    (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
+                )
+            }
+            slopes = _slopes_of(view.lens)
+            write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
+            for exposure in view.exposures():
+                write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
+                write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
     except sqlite3.OperationalError as error:
         # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
 
 
-def _write_messages(writer: Writer, view: ExportedView) -> None:
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS2_JAZZY)
-    slopes = _slopes_of(view.lens)
-    topics = {
-        topic: writer.add_connection(topic, kind, typestore=types, offered_qos_profiles=_qos(latched))
-        for topic, kind, latched in (
-            (POSE_TOPIC, "tf2_msgs/msg/TFMessage", True),
-            (INFO_TOPIC, "sensor_msgs/msg/CameraInfo", False),
-            (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
-        )
-    }
-
-    def write(topic: str, stamp_ns: int, message: Any) -> None:
-        writer.write(topics[topic], stamp_ns, types.serialize_cdr(message, topics[topic].msgtype))
-
-    write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
-    for exposure in view.exposures():
-        write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
-        write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
-
-
 @lru_cache(maxsize=1)
 def _slopes_of(lens: Lens) -> np.ndarray:
-    """(h, w, 2) of the whole sensor: the views of an export share their lens."""
+    """Return (h, w, 2) of the whole sensor: the views of an export share their lens."""
     return lens.region_slopes(lens.whole)
 
 
 def frame_name(view: ExportedView) -> str:
-    """The optical frame of a view's camera; each view has its own, so that several bags can be played together."""
+    """Return the name of a camera's optical frame; each view has its own, so that bags can be played together."""
     return f"{view.name}_depth_optical_frame"
 
 
 def packed_points(exposure: Exposure, slopes: np.ndarray) -> np.ndarray:
-    """(h, w) of `POINT`: z as it came from the camera, x and y along the lens' rays; all NaN where there is no range.
+    """Return (h, w) of `POINT`: z of the camera, x and y along the lens' rays; all NaN where there is no range.
 
     ``slopes`` (h, w, 2) of the whole sensor. Rounding to float32 moves x and y by 0.03 um a metre.
     """

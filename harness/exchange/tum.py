@@ -15,13 +15,12 @@ not notice.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from harness.exchange.views import ExportedView, Exposure, quaternion_of
+from harness.exchange.views import ExportedView, quaternion_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lens import Lens
 
@@ -29,18 +28,8 @@ UNITS_PER_M = 5000
 """The benchmark's depth scale."""
 FARTHEST_M = (2**16 - 1) / UNITS_PER_M
 CALIBRATION = "rtabmap_calib.yaml"
-OPTICAL_ROTATION = (0, 0, 1, 0, -1, 0, 0, 0, 0, -1, 0, 0)
-"""3x4, row by row: RTAB-Map's base (x forward, z up) from the camera's optical frame (z forward, y down)."""
-
-
-@dataclass
-class Listing:
-    """The lines of the benchmark's text files."""
-
-    rgb: list[str]
-    depth: list[str]
-    associations: list[str]
-    poses: list[str]
+OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
+"""(3, 4): RTAB-Map's base (x forward, z up) from the camera's optical frame (z forward, y down)."""
 
 
 def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
@@ -52,26 +41,41 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         (folder / name).mkdir()
         (folder / f"{name}_sync").symlink_to(name, target_is_directory=True)
     rows, columns, inside = nearest_pixels(lens)
-    listing = Listing([], [], [], [])
+    lines: dict[str, list[str]] = {
+        "rgb.txt": ["# color images", "# timestamp filename"],
+        "depth.txt": ["# depth maps, 5000 to the metre, 0: none", "# timestamp filename"],
+        "groundtruth.txt": ["# camera in the board's frame", "# timestamp tx ty tz qx qy qz qw"],
+        "associations.txt": [],
+    }
     for view in views:
+        pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
+        place = " ".join(f"{value:.9g}" for value in pose)
         for exposure in view.exposures():
             depth = np.where(inside, depth_units(exposure.z_m)[rows, columns], 0).astype(np.uint16)
             colour = np.where(inside[..., None], exposure.rgb[rows, columns], 0).astype(np.uint8)
-            _write_frame(folder, view, exposure, depth, colour, listing)
-    _write_listing(folder, listing)
+            time = seconds_text(exposure.stamp_ns)
+            for name, picture in (("rgb", colour[..., ::-1]), ("depth", depth)):
+                coded, content = cv2.imencode(".png", np.ascontiguousarray(picture))
+                assert coded
+                (folder / name / f"{time}.png").write_bytes(content.tobytes())
+                lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
+            lines["associations.txt"].append(f"{time} rgb/{time}.png {time} depth/{time}.png")
+            lines["groundtruth.txt"].append(f"{time} {place}")
+    for name, text in lines.items():
+        (folder / name).write_text("\n".join((*text, "")), encoding="utf-8")
     (folder / CALIBRATION).write_text(calibration_text(lens), encoding="utf-8")
 
 
 def depth_units(z_m: np.ndarray) -> np.ndarray:
-    """(h, w) uint16 in 0.2 mm; 0 where there is no range or it lies beyond the 13.1 m that 16 bits hold."""
+    """Return (h, w) uint16 in 0.2 mm; 0 where there is no range or it lies beyond the 13.1 m that 16 bits hold."""
     with np.errstate(invalid="ignore"):
         held = (z_m > 0) & (z_m <= FARTHEST_M)
     return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
 
 
 def nearest_pixels(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each pixel of the pinhole image the nearest row and column of the lens' own (both (h, w) int), and whether
-    that pixel exists (bool)."""
+    """Return the nearest row and column of the lens' own image for each pixel of the pinhole image (both (h, w) int),
+    and whether that pixel exists (bool)."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
     columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
@@ -80,61 +84,26 @@ def nearest_pixels(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def seconds_text(stamp_ns: int) -> str:
-    """A time as the benchmark writes it: seconds with six digits, exact to the microsecond."""
+    """Return a time as the benchmark writes it: seconds with six digits, exact to the microsecond."""
     microseconds = (stamp_ns + 500) // 1000
     return f"{microseconds // 10**6}.{microseconds % 10**6:06d}"
 
 
 def calibration_text(lens: Lens) -> str:
-    """The pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
-    numbers = [float(x) for x in lens.matrix.ravel()]
-    pinhole = [*numbers[:3], 0.0, *numbers[3:6], 0.0, *numbers[6:], 0.0]
-    return "\n".join(
-        (
-            "%YAML:1.0",
-            "---",
-            "camera_name: rtabmap_calib",
-            f"image_width: {lens.width}",
-            f"image_height: {lens.height}",
-            *_matrix_text("camera_matrix", 3, 3, numbers),
-            "distortion_model: plumb_bob",
-            *_matrix_text("distortion_coefficients", 1, 5, [0.0] * 5),
-            *_matrix_text("rectification_matrix", 3, 3, [float(x) for x in np.eye(3).ravel()]),
-            *_matrix_text("projection_matrix", 3, 4, pinhole),
-            *_matrix_text("local_transform", 3, 4, [float(x) for x in OPTICAL_ROTATION]),
-            "",
-        )
+    """Return the pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
+
+    def matrix(name: str, values: np.ndarray) -> tuple[str, ...]:
+        data = ", ".join(map(repr, values.astype(float).ravel().tolist()))
+        return f"{name}:", f"   rows: {values.shape[0]}", f"   cols: {values.shape[1]}", f"   data: [ {data} ]"
+
+    lines = (
+        *("%YAML:1.0", "---", "camera_name: rtabmap_calib"),
+        *(f"image_width: {lens.width}", f"image_height: {lens.height}"),
+        *matrix("camera_matrix", lens.matrix),
+        "distortion_model: plumb_bob",
+        *matrix("distortion_coefficients", np.zeros((1, 5))),
+        *matrix("rectification_matrix", np.eye(3)),
+        *matrix("projection_matrix", np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1)),
+        *matrix("local_transform", OPTICAL_ROTATION),
     )
-
-
-def _matrix_text(name: str, rows: int, columns: int, numbers: Sequence[float]) -> tuple[str, ...]:
-    values = ", ".join(map(repr, numbers))
-    return f"{name}:", f"   rows: {rows}", f"   cols: {columns}", f"   data: [ {values} ]"
-
-
-def _write_frame(
-    folder: Path, view: ExportedView, exposure: Exposure, depth: np.ndarray, colour: np.ndarray, listing: Listing
-) -> None:
-    time = seconds_text(exposure.stamp_ns)
-    rgb_name, depth_name = f"rgb/{time}.png", f"depth/{time}.png"
-    for name, picture in ((rgb_name, colour[..., ::-1]), (depth_name, depth)):
-        coded, content = cv2.imencode(".png", np.ascontiguousarray(picture))
-        assert coded
-        (folder / name).write_bytes(content.tobytes())
-    place = " ".join(f"{value:.9g}" for value in (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera)))
-    listing.rgb.append(f"{time} {rgb_name}")
-    listing.depth.append(f"{time} {depth_name}")
-    listing.associations.append(f"{time} {rgb_name} {time} {depth_name}")
-    listing.poses.append(f"{time} {place}")
-
-
-def _write_listing(folder: Path, listing: Listing) -> None:
-    heads = {
-        "rgb.txt": ("color images", "timestamp filename", listing.rgb),
-        "depth.txt": ("depth maps, 5000 to the metre, 0: none", "timestamp filename", listing.depth),
-        "groundtruth.txt": ("camera in the board's frame", "timestamp tx ty tz qx qy qz qw", listing.poses),
-    }
-    for name, (title, columns, lines) in heads.items():
-        text = "\n".join((f"# {title}", f"# {columns}", *lines, ""))
-        (folder / name).write_text(text, encoding="utf-8")
-    (folder / "associations.txt").write_text("\n".join((*listing.associations, "")), encoding="utf-8")
+    return "\n".join((*lines, ""))

@@ -1,4 +1,4 @@
-"""What is handed on: the frames of each view on the whole sensor, with a time and a true pose."""
+"""The frames of each view on the whole sensor, with a time and a true pose, as other programs get them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.vocabulary.capture import FrameSource
-from harness.vocabulary.geometry import Region, invert
+from harness.vocabulary.geometry import invert
 from harness.vocabulary.lens import Lens
 
 START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
 PAUSE_NS = 10**9
-"""Between the last frame of a view and the first of the next, in which the camera is carried on."""
+"""Time between the last frame of a view and the first of the next, in which the camera is carried on."""
 BOARD_FRAME = "board"
 """Name of the world's frame: x along the row of holes, y up the face, z out of it to the camera, origin at its centre.
 """
@@ -47,20 +47,26 @@ class ExportedView:
         return invert(self.T_camera_board)
 
     def stamp_ns(self, frame: int) -> int:
-        """The time of a frame."""
+        """Return the time of a frame."""
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
     def exposures(self) -> Iterator[Exposure]:
-        """The frames, each on the whole sensor: no range, black and no amplitude outside the simulated region."""
+        """Yield the frames, each on the whole sensor: no range, black and no amplitude outside the simulated region."""
         lens, region = self.lens, self.source.region
+
+        def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
+            whole = np.full((lens.height, lens.width, *values.shape[2:]), outside, values.dtype)
+            whole[region.row0 : region.row1, region.col0 : region.col1] = values
+            return whole
+
         for number, frame in enumerate(self.source.frames()):
             rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
             amplitude = frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
             yield Exposure(
                 stamp_ns=self.stamp_ns(number),
-                z_m=_on_sensor(frame.z_m.astype(np.float32), region, lens, np.nan),
-                rgb=_on_sensor(rgb, region, lens, 0),
-                amplitude=_on_sensor(amplitude.astype(np.float32), region, lens, np.nan),
+                z_m=on_sensor(frame.z_m.astype(np.float32), np.nan),
+                rgb=on_sensor(rgb, 0),
+                amplitude=on_sensor(amplitude.astype(np.float32), np.nan),
             )
 
 
@@ -78,7 +84,7 @@ class Exposure:
 def in_turn(
     sources: Sequence[FrameSource], poses: Sequence[np.ndarray], n_frames: int, frames_per_second: float
 ) -> tuple[ExportedView, ...]:
-    """Views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    """Place views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
     return tuple(
@@ -90,14 +96,8 @@ def in_turn(
 
 
 def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
-    """(x, y, z, w) of a rigid transform's rotation, w >= 0, of unit length."""
+    """Return (x, y, z, w) of a rigid transform's rotation, w >= 0, of unit length."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True).tolist()
     return x, y, z, w
-
-
-def _on_sensor(values: np.ndarray, region: Region, lens: Lens, outside: float) -> np.ndarray:
-    whole = np.full((lens.height, lens.width, *values.shape[2:]), outside, values.dtype)
-    whole[region.row0 : region.row1, region.col0 : region.col1] = values
-    return whole

@@ -1,3 +1,3 @@
-"""What `harness.detect` does, step by step: one capture, or several views as one cloud."""
+"""The work of `harness.detect`: from captures and arguments to findings, told and written."""
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,24 +13,23 @@ from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
 from harness.vocabulary.versions import RESULTS_VERSION, check_version
 
 POSES_KEY = "T_reference_view"
-"""Under which `harness.export` writes the list, beside the file's version."""
+"""Key of the list in a file of `harness.export`, beside the file's version."""
 LEGAL_POSES = (
     "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
     f" under the key {POSES_KEY}; or lines of"
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
 RIGID_WITHIN = 1e-4
-"""Of R R' = 1 and of the quaternion's length: poses are written with four digits and more."""
+"""Tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more."""
 FARTHEST_M = 100.0
-"""Between two views of one target: several times any such camera's range. Poses in millimetres lie beyond."""
-
-
+"""Largest distance of two views of one target: several times any such camera's range. Poses in millimetres lie beyond.
+"""
 MOST_KEYS = 10
-"""Named of an object that is no list."""
+"""Keys that a message names of an object that is no list."""
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """``T_first_view`` (4, 4) of each view, the first the identity, whatever common frame the file's poses lead to.
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame.
 
     Raises UserError where the file cannot be read, is larger than `limits.TEXT_BYTES` or of a newer version, holds
     another number of poses, one that is not rigid, or one farther than `FARTHEST_M` from the first.
@@ -64,8 +62,17 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
+    """Parse a list of matrices: bare, or in an object that `harness.export` wrote, or without version by hand."""
     try:
-        poses = [np.array(each, float) for each in _listed(path, strict_json(text))]
+        data = strict_json(text)
+        if isinstance(data, dict):
+            if "results_version" in data:
+                check_version(data["results_version"], RESULTS_VERSION, path, "a file of poses")
+            if POSES_KEY not in data:
+                keys = ", ".join(key[:40] for key in list(data)[:MOST_KEYS])
+                raise TypeError(f"an object with the keys {keys}{', ...' if len(data) > MOST_KEYS else ''}")
+            data = data[POSES_KEY]
+        poses = [np.array(each, float) for each in data]
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path}: holds no list of matrices ({error})", legal=LEGAL_POSES) from error
     for number, pose in enumerate(poses):
@@ -75,20 +82,8 @@ def _from_json(path: Path, text: str) -> list[np.ndarray]:
     return poses
 
 
-def _listed(path: Path, data: Any) -> Any:
-    """The list itself: of a file that `harness.export` wrote, or somebody by hand, who states no version."""
-    if not isinstance(data, dict):
-        return data
-    if "results_version" in data:
-        check_version(data["results_version"], RESULTS_VERSION, path, "a file of poses")
-    if POSES_KEY not in data:
-        keys = ", ".join(key[:40] for key in list(data)[:MOST_KEYS])
-        raise TypeError(f"an object with the keys {keys}{', ...' if len(data) > MOST_KEYS else ''}")
-    return data[POSES_KEY]
-
-
 def _fault(pose: np.ndarray) -> str:
-    """What keeps an array from being a rigid 4x4 transform; empty where nothing does."""
+    """Return the reason why an array is no rigid 4x4 transform; empty where it is."""
     if pose.shape != (4, 4):
         return f"it has the shape {pose.shape}"
     if not np.isfinite(pose).all():

@@ -48,7 +48,7 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
     height_in = min(panels * (WIDTH_IN * 0.82 * down / across + 0.5) + 0.4, 30.0)
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="compressed")
     canvas = FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10, parse_math=False)  # a file may be called $x$
     axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
     if panels == 2:
         axes[0].imshow(_colours(cloud), extent=_edges(cloud), interpolation="nearest")

@@ -14,7 +14,7 @@ from harness.vocabulary.lens import Lens
 
 
 class Reason(IntEnum):
-    """Why a pixel has no range. A recording only says NO_RETURN; a simulated camera names the gate."""
+    """The reason why a pixel has no range. A recording only says NO_RETURN; a simulated camera names the gate."""
 
     VALID = 0
     NO_RETURN = 1
@@ -59,7 +59,7 @@ class Frame:
 
 
 class FrameSource(Protocol):
-    """Where frames come from: a simulated camera or a recording. Frames are streamed, never all held.
+    """A source of frames: a simulated camera or a recording. Frames are streamed, never all held.
 
     ``slopes`` (h, w, 2) are x/z and y/z per pixel, None where each frame carries ``xy_m``. ``organised`` is False for a
     cloud without a pixel grid (then h == 1). ``z_step_m`` is the rounding step of the stored distance (0 if none).

@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage: a message's bytes as stored depth (common_interfaces, REP 118).
+"""ROS' messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
 
 ``compressedDepth`` is image_transport's: twelve bytes (a form, then two numbers of the quantisation of 32FC1), then a
 PNG or an RVL stream (Wilson 2017, "Fast lossless depth image compression").
@@ -12,10 +12,16 @@ from typing import Any
 import cv2
 import numpy as np
 
+from detectors.recordings.distances import frame_of
 from detectors.recordings.pictures import PNG_SIGNATURE, decoded, refuse_broken_png
+from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.limits import refuse_pixels
 
+FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""PointField's codes."""
+AMPLITUDE_FIELDS = ("intensity", "amplitude", "i")
+LEGAL_CLOUD = "sensor_msgs/PointCloud2 with the fields x, y, z, each a single number"
 DEPTH_NUMBERS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings that may hold depth: whole millimetres, or floating-point metres."""
 LEGAL_IMAGE = "sensor_msgs/Image as 16UC1, mono16 or 32FC1; CompressedImage as compressedDepth (PNG or RVL) of these"
@@ -23,7 +29,7 @@ CONFIG_BYTES = 12
 
 
 def encoding_of(message: Any) -> str:
-    """The encoding of a picture's numbers; of a compressed picture that of what was compressed, and "" for colour."""
+    """Return the encoding of a picture's numbers; of a compressed picture that of its content, and "" for colour."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     encoding, _, transport = str(message.format).partition(";")
@@ -31,7 +37,7 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """The stored numbers (h, w), uint16 or float32, whatever their byte order and row padding.
+    """Return the stored numbers (h, w), uint16 or float32, whatever their byte order and row padding.
 
     Raises UserError where the message holds no depth, or less than its size needs.
     """
@@ -58,7 +64,7 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
 
 
 def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
-    """The picture of compressedDepth. Depth of 32FC1 is stored as a / (number - b), and 0 is no return."""
+    """Unpack the picture of compressedDepth. Depth of 32FC1 is stored as a / (number - b), and 0 is no return."""
     if len(data) <= CONFIG_BYTES:
         raise UserError(f"{name}: is truncated ({len(data)} bytes)", legal=LEGAL_IMAGE, fix="record it again")
     _, a, b = struct.unpack_from("<iff", data)
@@ -77,7 +83,7 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
 
 
 def _rvl(name: str, content: bytes) -> np.ndarray:
-    """Width and height, then runs of zeros and of differences in numbers of three bits a nibble.
+    """Unpack width and height, then runs of zeros and of differences in numbers of three bits a nibble.
 
     Words of 32 bits hold their first nibble on top; a nibble's top bit says that the number goes on. Differences are
     folded (0, -1, 1, -2, ..) and count from the last pixel that was not 0.
@@ -108,3 +114,68 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
     stored = np.zeros(filled.size, np.uint16)
     stored[filled] = np.cumsum(differences >> 1 ^ -(differences & 1)).astype(np.uint16)
     return stored.reshape(height, width)
+
+
+def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
+    """Make a frame of a depth image, or of a PointCloud2, (1, n) without a grid. NaN means no return.
+
+    Fields may lie anywhere in a point, be of any numeric type and byte order, and rows may be padded. Raises UserError
+    where x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs.
+    """
+    if not hasattr(message, "point_step"):
+        frame = frame_of(name, stored_depth(name, message), scale_m)
+    else:
+        points = _points(name, message)
+        have: Any = points.dtype.fields
+        stored = np.stack([points[axis] for axis in "xyz"], axis=-1)
+        if stored.dtype.kind == "f":
+            stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
+        rgb = None
+        packed = next((key for key in ("rgb", "rgba") if key in have and have[key][0].str[1:] == "u4"), None)
+        if packed is not None:  # 0x00RRGGBB
+            bits = points[packed].astype(np.uint32)
+            rgb = np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=-1).astype(np.uint8)
+        elif all(key in have and have[key][0] == np.uint8 for key in "rgb"):
+            rgb = np.stack([points[key] for key in "rgb"], axis=-1)
+        amplitude = next((points[field].astype(np.float32) for field in AMPLITUDE_FIELDS if field in have), None)
+        frame = frame_of(name, stored, scale_m, rgb, amplitude)
+    # NaN is these messages' code for "no return" (REP 118), which other files write as 0
+    frame.reason[frame.reason == Reason.NOT_FINITE] = Reason.NO_RETURN
+    return frame
+
+
+def _points(name: str, message: Any) -> np.ndarray:
+    """Return a (height, width) structured array over the message's data: a view, not a copy."""
+    height, width, step, row = (int(n) for n in (message.height, message.width, message.point_step, message.row_step))
+    if height * width == 0:
+        raise UserError(f"{name}: holds no points ({width} x {height})", legal=LEGAL_CLOUD)
+    refuse_pixels(name, width, height)
+    row = row if height > 1 or row else width * step
+    data = np.asarray(message.data, np.uint8)
+    needed = (height - 1) * row + width * step
+    if row < width * step:
+        raise UserError(f"{name}: rows of {row} bytes cannot hold {width} points of {step} bytes", legal=LEGAL_CLOUD)
+    if data.size < needed:
+        raise UserError(
+            f"{name}: is truncated: {data.size} bytes of points, but {width} x {height} points of {step} bytes"
+            f" in rows of {row} need {needed}",
+            legal="height * row_step bytes",
+            fix="record or convert it again",
+        )
+    order = ">" if message.is_bigendian else "<"
+    # some drivers leave count at 0 where they mean 1
+    single = {f.name: f for f in message.fields if f.count <= 1 and f.datatype in FIELD_TYPES}
+    missing = [axis for axis in "xyz" if axis not in single]
+    if missing:
+        held = ", ".join(f"{f.name} (type {f.datatype}, count {f.count})" for f in message.fields) or "none"
+        raise UserError(f"{name}: has no field {' or '.join(missing)}; its fields: {held}", legal=LEGAL_CLOUD)
+    types = {key: np.dtype(order + FIELD_TYPES[f.datatype]) for key, f in single.items()}
+    for key, field in single.items():
+        end = field.offset + types[key].itemsize
+        if end > step:
+            raise UserError(f"{name}: its field {key} ends at byte {end} of points of {step} bytes", legal=LEGAL_CLOUD)
+        if key in ("rgb", "rgba") and types[key].itemsize == 4:
+            types[key] = np.dtype(order + "u4")  # four packed bytes, whatever the field calls them
+    offsets = [single[key].offset for key in types]
+    layout: Any = {"names": list(types), "formats": list(types.values()), "offsets": offsets, "itemsize": step}
+    return np.ndarray((height, width), np.dtype(layout), data.data, strides=(row, step))
