@@ -131,7 +131,8 @@ def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
     """The capture's average as --average says."""
     from itertools import islice
 
-    from detectors.average import REACH_FRAMES, AverageConfig, average, noise_reach_px
+    from detectors.average import AverageConfig, average
+    from detectors.noise import REACH_FRAMES, noise_reach_px
 
     cloud = average(recording, AverageConfig(method=arguments.average))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
@@ -140,7 +141,7 @@ def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Findings beyond a threshold and missing returns, each damage and each object once, with their sizes."""
-    from detectors.measure import measure_extents, on_pixels
+    from detectors.measure import measure_extents
     from detectors.missing import measure_missing, missing_returns, one_damage_once
     from detectors.null import each_object_once
     from harness.report.findings import Judged
@@ -152,8 +153,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
     def measure(one: Detection) -> Measurement:
         if one.kind == "object":
-            whole = measure_extents(cloud, one, "an object that lies on the target: no model of a hole fits it")
-            return on_pixels(cloud, one, whole)
+            return measure_extents(cloud, one, "an object that lies on the target: no model of a hole fits it")
         return (measure_missing if one.kind == "no return" else detector.measure)(cloud, evidence, one)
 
     measured = tuple(measure(one) for one in found)
