@@ -17,9 +17,9 @@ GROUP = "tofpod.detectors"
 """Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and ``C(settings)`` a Detector."""
 
 BUILT_IN = {
-    "blind": "detectors.blind:BlindDetector",
+    "blind": "detectors.controls:BlindDetector",
     "local": "detectors.local:LocalDetector",
-    "oracle": "detectors.oracle:Oracle",
+    "oracle": "detectors.controls:Oracle",
     "thesis": "detectors.thesis:ThesisDetector",
 }
 
@@ -27,12 +27,12 @@ DETECTORS = PlugIns(GROUP, "detector", lambda: BUILT_IN)
 
 
 def detector_names() -> tuple[str, ...]:
-    """Every known name, sorted."""
+    """Return every known name, sorted."""
     return DETECTORS.names()
 
 
 def detector_type(name: str) -> Any:
-    """The class behind a name; its ``settings_type`` is the Config that validates its settings.
+    """Return the class behind a name; its ``settings_type`` is the Config that validates its settings.
 
     Raises UserError on an unknown name (with the nearest one), on a name taken twice, and where a plug-in cannot be
     imported, is no detector, or calls itself otherwise.
@@ -52,7 +52,7 @@ def detector_type(name: str) -> Any:
 
 
 def load_detector(name: str, settings: dict[str, Any]) -> Detector:
-    """The detector of that name with these settings (plain data, as YAML holds it).
+    """Return the detector of that name with these settings (plain data, as YAML holds it).
 
     Raises UserError as `detector_type`, and where the settings are not legal (every problem at once).
     """

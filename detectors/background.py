@@ -13,15 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
 import numba
 import numpy as np
 
-from detectors.median import median_of, median_size_of
+from detectors.masks import grown, on_grid
+from detectors.noise import median_of, sigma_of
 from detectors.shapes import Fit, free_form, picture_places, polynomial, quadric
-from detectors.surface import SurfaceConfig, fit_surface
+from detectors.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
 from detectors.surface_kernels import bisquare_weights
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.units import MM
@@ -30,20 +32,31 @@ MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS = 3600, 16, 64, 600
 """Cells at most, and points in each at least; with more than enough cells, points in each that outlast the correlation
 of noise in cameras that filter over 5 x 5 pixels."""
 FEW_CELLS = 40
-"""Below this nothing can be chosen or judged: a plane, or what degree is stated, is fitted and not questioned."""
+"""Least number by which a shape can be chosen and judged; with fewer a plane, or the stated degree, is fitted and not
+questioned."""
 TILE_CELLS, FOLDS = 3, 5
 """Side of what is predicted together, in cells, and the number of parts that these tiles are dealt to."""
 DEGREES = (1, 2, 3, 4, 5)
-TUNING = 4.685
-"""Tukey's bisquare, 95 % efficient."""
 LEAST_SCALE_M = 0.04
 """Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows it."""
 WORTH = 0.1
-"""Of the noise of a pixel: a shape whose typical error of prediction is no more than this above the best is as good."""
+"""A shape whose typical error of prediction is above the best by no more than this share of a pixel's noise is as
+good."""
 NOISIER = 1.25
 """Five standard errors of the median of 49 deviations of 16 pixels each: below it noise is taken to be even."""
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
+FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
+"""Share of the target with structure beyond the noise: from the first on a free form is tried, from the second on the
+surface is said not to fit."""
+STRUCTURE_CELLS = 5
+"""Side of what is averaged to see structure larger than damage."""
+STRUCTURE_SIGMAS = 4.0
+SEEN = 0.5
+"""Structure below this share of a pixel's noise changes no finding."""
+
+FitTo = Callable[[np.ndarray, np.ndarray], Fit | None]
+"""Function of points (n, 3) and weights (n,) that fits a shape to them; None where it cannot."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +66,7 @@ class Background:
     ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud less the surface; NaN off the mask and
     where the surface cannot be judged. ``noise_m`` (h, w): standard deviation of the pixels' residuals round about, off
     findings, without the surface's own misfit. ``scale_m``: width above which shallow damage is taken for shape; None
-    where the shape is no free form. ``fits``: no structure is left that would pass for damage; else ``warning`` says
-    so in a sentence.
+    where the shape is no free form. ``warning``: a sentence where structure is left that would pass for damage.
     """
 
     surface_z_m: np.ndarray
@@ -62,9 +74,13 @@ class Background:
     noise_m: np.ndarray
     description: str
     scale_m: float | None
-    fits: bool
     warning: str
     notes: dict[str, Any]
+
+    @property
+    def fits(self) -> bool:
+        """True where no structure is left that would pass for damage."""
+        return not self.warning
 
 
 @dataclass(frozen=True)
@@ -84,13 +100,37 @@ class _Cells:
     side_m: float
     central: bool
 
+    def image(self, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
+        """Return cells' values (c,) on their grid."""
+        image = np.full((self.row.max() + 1, self.column.max() + 1), empty)
+        image[self.row, self.column] = values
+        return image
+
+    @property
+    def pixel_noise(self) -> float:
+        """Standard deviation of a pixel: about its cell's median, and of that median."""
+        return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
+
+    def refreshed(self, points: np.ndarray, fit: Fit) -> _Cells:
+        """Return the cells with medians and deviations of the points' residuals to a surface."""
+        medians, deviations = _group_medians(points[:, 2] - fit(points), self.of, len(self.points))
+        z = fit(self.points) + medians
+        known = np.isfinite(z)
+        moved = self.points * (z / self.points[:, 2])[:, None] if self.central else self.points.copy()
+        moved[:, 2] = z
+        # cells that the surface does not reach keep their points and count no more
+        moved[~known] = self.points[~known]
+        weights = np.where(known, self.weights, 0.0)
+        level_noise = _cell_noise(self.image(medians))[0]
+        return replace(self, points=moved, weights=weights, noise=deviations, level_noise=level_noise)
+
 
 @dataclass(frozen=True)
 class _Shape:
-    """A shape fitted to all cells. ``fit_to(points, weights)`` fits it to others; None where it cannot."""
+    """A shape fitted to all cells."""
 
     name: str
-    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None]
+    fit_to: FitTo
     fit: Fit
     weights: np.ndarray
     wavelength: float | None = None
@@ -102,25 +142,87 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     Deterministic. Raises UserError where the points do not determine the surface.
     """
     points = np.ascontiguousarray(cloud.points_m[mask])
-    central = cloud.projection == "central" and float(points[:, 2].min()) > 0
-    cells = _cells(points, central)
+    cells = _cells(points, cloud.projection == "central" and float(points[:, 2].min()) > 0)
     if cells is None:
-        return _unjudged(points, mask, config)
+        # a plane, or the stated polynomial, and nobody can tell whether it fits
+        name, fit = _stated(points, config if config.shape == "polynomial" else SurfaceConfig(degree=1))
+        fitted = fit(points)
+        noise_m = sigma_of(points[:, 2] - fitted)
+        warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
+        z_m, residual_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted))
+        unknown: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
+        return Background(z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, unknown)
+    wavelength = None
     if config.shape == "polynomial":
         name, fit = _stated(points, config)
-        return _judged(points, mask, cells, name, fit, None)
-    shape = _chosen(cells, config)
-    for _ in range(2):
-        cells = _refreshed(cells, points, shape.fit)
-        shape = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
-    return _judged(points, mask, cells, shape.name, shape.fit, shape.wavelength)
+    else:
+        shape = _chosen(cells, config)
+        for _ in range(2):
+            cells = cells.refreshed(points, shape.fit)
+            shape = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
+        name, fit, wavelength = shape.name, shape.fit, shape.wavelength
+
+    fitted = fit(points)
+    unseen = ~np.isfinite(fitted)
+    if cells.central:
+        # few pixels are near enough to the steepest incidence to be looked at each
+        near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
+        looked = np.flatnonzero((cells.of < 0) | near[cells.of])
+        # a ray that misses the surface beside the pixel gives NaN: not below the limit either
+        unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
+    fitted[unseen] = np.nan
+    cells = cells.refreshed(points, fit)
+    warning, notes = _misfit(cells, fit, name)
+    text, scale_m = name, None
+    if wavelength is not None:
+        scale_m = 0.5 * wavelength * cells.side_m / cells.side
+        text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
+    if unseen.mean() > 0.001:
+        text += (
+            f"; {100 * unseen.mean():.1f} % of the target, seen at more than {STEEPEST_DEG:g} degrees, is not judged"
+        )
+    # a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is much more
+    image = cells.image(cells.noise)
+    rows, columns = image.shape
+    padded = np.pad(image, 3, constant_values=np.nan)
+    around = np.stack([padded[i : i + rows, j : j + columns] for i in range(7) for j in range(7)])
+    with np.errstate(all="ignore"):
+        local = np.hypot(np.nanmedian(around[:, cells.row, cells.column], axis=0), cells.level_noise)
+    pixel = cells.pixel_noise
+    noise = np.where(cells.of >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.of], pixel)
+    z_m, residual_m, noise_map_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted, noise))
+    notes.update(shape=name, steep_share=float(unseen.mean()))
+    return Background(z_m, residual_m, noise_map_m, text, scale_m, warning, notes)
+
+
+def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
+    """Return a sentence where a surface that was stated, not chosen, leaves structure that would pass for damage; else
+    "".
+
+    ``residual_m`` (h, w): of the cloud to the surface, NaN where nothing was judged; ``surface``: its name.
+    """
+    mask = np.isfinite(residual_m)
+    points = cloud.points_m[mask]
+    cells = _cells(points, cloud.projection == "central" and len(points) > 0 and float(points[:, 2].min()) > 0)
+    if cells is None:
+        return ""
+    medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
+    level_noise = _cell_noise(cells.image(medians))[0]
+    flat = np.column_stack([cells.points[:, :2], medians])
+    level = replace(cells, points=flat, noise=deviations, level_noise=level_noise)
+    return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
+
+
+def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
+    surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
+    return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
 
 
 # ---------------------------------------------------------------- cells
 
 
 def _cells(points: np.ndarray, central: bool) -> _Cells | None:
-    """None where the points fill too few."""
+    """Return the cells of points (n, 3); None where they fill too few."""
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
     places = picture_places(points, central)
@@ -141,38 +243,18 @@ def _cells(points: np.ndarray, central: bool) -> _Cells | None:
     row, column = np.divmod(held, where[:, 0].max() + 1)
     inside = of >= 0
     middle = np.stack([np.bincount(of[inside], places[inside, k]) / counts[held] for k in (0, 1)], axis=1)
-    strided = points[:: max(1, len(points) // 8192)]
-    start = fit_surface(
-        strided[:, 0], strided[:, 1], strided[:, 2], SurfaceConfig(degree=2, method="bisquare")
-    ).evaluate
-    level = float(np.median(points[:, 2]))
+    _, start = _stated(points[:: max(1, len(points) // 8192)], SurfaceConfig(degree=2, method="bisquare"))
+    side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
     z = _group_medians(points[:, 2], of, len(held))[0]
     first = np.column_stack([middle * (z[:, None] if central else 1.0), z])
-    weights = np.minimum(counts[held] / wanted, 1.0)
-    blank = _Cells(
-        first, weights, np.zeros(len(held)), 0.0, of, row, column, side, side * (level if central else 1.0), central
-    )
-    return _refreshed(blank, points, lambda p: start(p[:, 0], p[:, 1]))
-
-
-def _refreshed(cells: _Cells, points: np.ndarray, fit: Fit) -> _Cells:
-    """The cells with medians and deviations of the points' residuals to a surface."""
-    residual = points[:, 2] - fit(points)
-    medians, deviations = _group_medians(residual, cells.of, len(cells.points))
-    z = fit(cells.points) + medians
-    known = np.isfinite(z)
-    moved = cells.points * (z / cells.points[:, 2])[:, None] if cells.central else cells.points.copy()
-    moved[:, 2] = z
-    # cells that the surface does not reach keep their points and count no more
-    moved[~known] = cells.points[~known]
-    weights = np.where(known, cells.weights, 0.0)
-    level_noise = _cell_noise(_image(cells, medians))[0]
-    return replace(cells, points=moved, weights=weights, noise=deviations, level_noise=level_noise)
+    weights, none = np.minimum(counts[held] / wanted, 1.0), np.zeros(len(held))
+    return _Cells(first, weights, none, 0.0, of, row, column, side, side_m, central).refreshed(points, start)
 
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median of each group's finite values, and their median distance from it over 0.6745; NaN without values."""
+    """Return the median of each group's finite values, and their median distance from it over 0.6745; NaN without
+    values."""
     starts = np.zeros(groups + 1, np.int64)
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
@@ -192,19 +274,37 @@ def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[
     return medians, deviations
 
 
+def _cell_noise(image: np.ndarray) -> tuple[float, float]:
+    """Return the standard deviation of cells' medians, from second differences over every other cell along rows and
+    columns, which are blind to slopes; and the correlation of neighbours, from those over neighbours."""
+
+    def bend(step: int) -> float:
+        twice = 2 * step
+        down = image[twice:] - 2 * image[step:-step] + image[:-twice]
+        across = image[:, twice:] - 2 * image[:, step:-step] + image[:, :-twice]
+        bends = np.concatenate([down.ravel(), across.ravel()])
+        bends = bends[np.isfinite(bends)]
+        return sigma_of(bends) if len(bends) else 0.0
+
+    near, far = bend(1), bend(2)
+    # of cells with variance s^2 and correlation r with their neighbours only: (6 - 8 r) s^2 and 6 s^2
+    deviation = max(near, far) / np.sqrt(6.0)
+    return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
+
+
 # ---------------------------------------------------------------- choice
-
-
-def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
-    surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
-    return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
 
 
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     shapes: list[_Shape] = []
     errors: list[np.ndarray] = []
-    worth = WORTH * _pixel_noise(cells)
-    for name, fit_to in _formulas(cells):
+    worth = WORTH * cells.pixel_noise
+    formulas: list[tuple[str, FitTo]] = [
+        ("plane" if degree == 1 else f"polynomial of degree {degree}", partial(polynomial, degree=degree))
+        for degree in DEGREES
+    ]
+    formulas.insert(2, ("quadric", partial(quadric, central=cells.central)))
+    for name, fit_to in formulas:
         shape = _fitted(cells, name, fit_to, None)
         if shape is not None:
             shapes.append(shape)
@@ -217,55 +317,27 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
         return best
     base = shapes[int(np.argmin([each.mean() for each in errors]))]
     free = [best] if config.shape == "auto" else []
-    for wavelength in _wavelengths(cells, config):
-        made = _fitted(cells, "free form", _of_wavelength(cells, base, wavelength), wavelength)
+    # wavelengths in the picture's units, long ones first: down to twice what is predicted together, or the least scale
+    cells_long: float = max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1
+    ladder = [cells_long * cells.side]
+    while (cells_long := cells_long / 1.6) >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
+        ladder.append(cells_long * cells.side)
+    if config.scale_mm is not None:
+        ladder = [2 * config.scale_mm * MM * cells.side / cells.side_m]
+    for wavelength in ladder:
+        fit_to = partial(free_form, base=base.fit, wavelength=wavelength, cell=cells.side, central=cells.central)
+        made = _fitted(cells, "free form", fit_to, wavelength)
         if made is not None:
             free.append(made)
     return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
 
 
-def _formulas(cells: _Cells) -> list[tuple[str, Callable[[np.ndarray, np.ndarray], Fit | None]]]:
-    """Simple ones first."""
-    named = [("plane" if d == 1 else f"polynomial of degree {d}", _of_degree(d)) for d in DEGREES]
-    named.insert(2, ("quadric", lambda points, weights: quadric(points, weights, cells.central)))
-    return named
-
-
-def _of_degree(degree: int) -> Callable[[np.ndarray, np.ndarray], Fit | None]:
-    return lambda points, weights: polynomial(points, weights, degree)
-
-
-def _of_wavelength(cells: _Cells, base: _Shape, wavelength: float) -> Callable[[np.ndarray, np.ndarray], Fit | None]:
-    def fit_to(points: np.ndarray, weights: np.ndarray) -> Fit | None:
-        return free_form(points, weights, base.fit, wavelength, cells.side, cells.central)
-
-    return fit_to
-
-
-def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
-    """In the picture's units, long ones first: down to twice what is predicted together, or the least scale."""
-    if config.scale_mm is not None:
-        return [2 * config.scale_mm * MM * cells.side / cells.side_m]
-    longest = max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1
-    ladder, cells_long = [], float(longest)
-    while cells_long >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
-        ladder.append(cells_long * cells.side)
-        cells_long /= 1.6
-    return ladder or [longest * cells.side]
-
-
-def _fitted(
-    cells: _Cells,
-    name: str,
-    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None],
-    wavelength: float | None,
-    widened: bool = False,
-) -> _Shape | None:
-    """The shape by bisquare weights; ``widened``: what borders on cells without weight loses its own, for the flank
+def _fitted(cells: _Cells, name: str, fit_to: FitTo, wavelength: float | None, widened: bool = False) -> _Shape | None:
+    """Fit the shape by bisquare weights; ``widened``: what borders on cells without weight loses its own, for the flank
     of a dent departs too little to be noticed and enough to bend the surface. None where it cannot be fitted, or misses
     one cell in fifty."""
     fit: Fit | None = None
-    weights, floor = cells.weights, 0.2 * _pixel_noise(cells) / np.sqrt(CELL_POINTS)
+    weights, floor = cells.weights, 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
     for _ in range(6):
         fit = fit_to(cells.points, weights)
         if fit is None:
@@ -274,37 +346,21 @@ def _fitted(
         known = np.isfinite(error) & (cells.weights > 0)
         if known.sum() < 0.98 * (cells.weights > 0).sum():
             return None
-        scale, before = max(median_size_of(error[known]) / 0.6745, floor), weights
-        robust = bisquare_weights(np.where(known, error, np.inf), TUNING * scale)
-        weights = cells.weights * (robust * ~_beside(cells, robust == 0) if widened else robust)
+        scale, before = max(sigma_of(error[known]), floor), weights
+        robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
+        if widened:
+            # cells without weight together with another beside them, and the neighbours of such pairs
+            image = cells.image((robust == 0).astype(float), 0.0) > 0
+            pairs = cv2.filter2D(image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) >= 3
+            robust = robust * ~grown(image & pairs, 1)[cells.row, cells.column]
+        weights = cells.weights * robust
         if np.abs(weights - before).max() < 0.05:
             break
     return None if fit is None else _Shape(name, fit_to, fit, weights, wavelength)
 
 
-def _beside(cells: _Cells, flagged: np.ndarray) -> np.ndarray:
-    """Cells that are flagged together with another beside them, and the neighbours of such pairs."""
-    image = _image(cells, flagged.astype(float), 0.0) > 0
-    pairs = cv2.filter2D(image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) >= 3
-    grown = cv2.dilate((image & pairs).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    beside: np.ndarray = grown[cells.row, cells.column]
-    return beside
-
-
-def _image(cells: _Cells, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
-    image = np.full((cells.row.max() + 1, cells.column.max() + 1), empty)
-    image[cells.row, cells.column] = values
-    return image
-
-
-def _pixel_noise(cells: _Cells) -> float:
-    """Standard deviation of a pixel: about its cell's median, and of that median."""
-    within = median_of(cells.noise[np.isfinite(cells.noise)])
-    return float(np.hypot(within, cells.level_noise))
-
-
 def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
-    """(tiles,) median size of the errors in each tile of cells, predicted from the tiles of the other folds."""
+    """Return the median size (tiles,) of the errors in each tile of cells, predicted from the tiles of other folds."""
     across = cells.column // TILE_CELLS
     down = cells.row // TILE_CELLS
     fold = (across + 2 * down) % FOLDS
@@ -320,8 +376,8 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
 
 
 def _simplest(errors: Sequence[np.ndarray], worth: float) -> int:
-    """The first of shapes, simple ones first, whose mean error over tiles is above the least by no more than ``worth``
-    or a standard error of the difference. ``errors``: (tiles,) of each shape."""
+    """Return the first of shapes, simple ones first, whose mean error over tiles is above the least by no more than
+    ``worth`` or a standard error of the difference. ``errors``: (tiles,) of each shape."""
     means = [each.mean() for each in errors]
     best = int(np.argmin(means))
     for i in range(best):
@@ -334,86 +390,31 @@ def _simplest(errors: Sequence[np.ndarray], worth: float) -> int:
 # ---------------------------------------------------------------- goodness of fit
 
 
-FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
-"""Share of the target with structure beyond the noise: from the first on a free form is tried, from the second on the
-surface is said not to fit."""
-STRUCTURE_CELLS = 5
-"""Side of what is averaged to see structure larger than damage."""
-STRUCTURE_SIGMAS = 4.0
-SEEN = 0.5
-"""Of the noise of a pixel: structure below it changes no finding."""
-
-
-def _structure(cells: _Cells, fit: Fit) -> tuple[float, float, np.ndarray]:
-    """Share of the cells that take part in structure, its rms in metres, and the smoothed misfit of each cell."""
+def _structure(cells: _Cells, fit: Fit) -> tuple[float, float]:
+    """Return the share of the cells that take part in structure, and its rms in metres."""
     error = cells.points[:, 2] - fit(cells.points)
     known = np.isfinite(error) & (cells.weights > 0)
-    image = _image(cells, np.where(known, error, np.nan))
+    image = cells.image(np.where(known, error, np.nan))
     noise, shared = _cell_noise(image)
-    pixel = _pixel_noise(cells)
     # compact findings stand out of their neighbourhood's median; structure makes the neighbourhood
     size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
     valid = np.isfinite(image)
-    limit = np.nanmedian(np.abs(image)) / 0.6745 * TUNING
-    used = valid & (np.abs(np.nan_to_num(image)) < max(limit, TUNING * noise))
+    limit = np.nanmedian(np.abs(image)) / 0.6745 * BISQUARE_TUNING
+    used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
     count = cv2.boxFilter(used.astype(float), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     total = cv2.boxFilter(np.where(used, image, 0.0), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     smooth = total / np.maximum(count, 1)
     enough = valid & (count >= 9)
-    beyond = enough & (
-        np.abs(smooth)
-        > np.maximum(STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1)), SEEN * pixel)
-    )
-    share = float(beyond.sum() / max(enough.sum(), 1))
+    chance = STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1))
+    beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * cells.pixel_noise))
     rms = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
-    return share, rms, smooth[cells.row, cells.column]
-
-
-def _cell_noise(image: np.ndarray) -> tuple[float, float]:
-    """Standard deviation of cells' medians, from second differences over every other cell along rows and columns, which
-    are blind to slopes; and the correlation of neighbours, from those over neighbours."""
-    near, far = _bend(image, 1), _bend(image, 2)
-    # of cells with variance s^2 and correlation r with their neighbours only: (6 - 8 r) s^2 and 6 s^2
-    deviation = max(near, far) / np.sqrt(6.0)
-    return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
-
-
-def _bend(image: np.ndarray, step: int) -> float:
-    """Robust standard deviation of second differences."""
-    twice = 2 * step
-    down = image[twice:] - 2 * image[step:-step] + image[:-twice]
-    across = image[:, twice:] - 2 * image[:, step:-step] + image[:, :-twice]
-    bends = np.concatenate([down.ravel(), across.ravel()])
-    bends = bends[np.isfinite(bends)]
-    return median_size_of(bends) / 0.6745 if len(bends) else 0.0
-
-
-def _judged(
-    points: np.ndarray, mask: np.ndarray, cells: _Cells, name: str, fit: Fit, wavelength: float | None
-) -> Background:
-    fitted = fit(points)
-    unseen = ~(np.isfinite(fitted) & ~_too_steep(cells, points, fit))
-    fitted[unseen] = np.nan
-    cells = _refreshed(cells, points, fit)
-    warning, notes = _misfit(cells, fit, name)
-    scale_m = None if wavelength is None else 0.5 * wavelength * cells.side_m / cells.side
-    text = name
-    if scale_m is not None:
-        text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
-    if unseen.mean() > 0.001:
-        text += (
-            f"; {100 * unseen.mean():.1f} % of the target, seen at more than {STEEPEST_DEG:g} degrees, is not judged"
-        )
-    noise = np.where(cells.of >= 0, _noise_map(cells)[cells.of], _pixel_noise(cells))
-    images = [_on(mask, each) for each in (fitted, points[:, 2] - fitted, noise)]
-    notes.update(shape=name, steep_share=float(unseen.mean()))
-    return Background(images[0], images[1], images[2], text, scale_m, not warning, warning, notes)
+    return float(beyond.sum() / max(enough.sum(), 1)), rms
 
 
 def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
-    """A warning where structure is left that would pass for damage; and what was measured."""
-    share, rms_m, _ = _structure(cells, fit)
-    notes: dict[str, Any] = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": _pixel_noise(cells)}
+    """Return a warning where structure is left that would pass for damage; and what was measured."""
+    share, rms_m = _structure(cells, fit)
+    notes: dict[str, Any] = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": cells.pixel_noise}
     if share < MISFIT_FROM:
         return "", notes
     text = (
@@ -424,21 +425,9 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     return text, notes
 
 
-def _too_steep(cells: _Cells, points: np.ndarray, fit: Fit) -> np.ndarray:
-    """(n,) bool: the surface turns away from the ray by more than `STEEPEST_DEG`; few pixels are near enough to that
-    to be looked at each."""
-    steep = np.zeros(len(points), dtype=bool)
-    if not cells.central:
-        return steep
-    near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
-    looked = np.flatnonzero((cells.of < 0) | near[cells.of])
-    # a ray that misses the surface beside the pixel gives NaN: not below the limit either
-    steep[looked] = ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
-    return steep
-
-
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
-    """(n,) angle between the ray and the surface's normal, from the surface a ``step`` in x/z and in y/z beside it."""
+    """Return the angle (n,) between the ray and the surface's normal, from the surface a ``step`` in x/z and in y/z
+    beside it."""
 
     def on_surface(dx: float, dy: float) -> np.ndarray:
         rays = points / points[:, 2:] + [dx, dy, 0.0]
@@ -451,56 +440,3 @@ def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
     normal = np.cross(on_surface(step, 0.0) - here, on_surface(0.0, step) - here)
     along = np.abs((normal * here).sum(axis=1))
     return np.asarray(np.degrees(np.arccos(along / (np.linalg.norm(normal, axis=1) * np.linalg.norm(here, axis=1)))))
-
-
-def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """A sentence where a surface that was stated, not chosen, leaves structure that would pass for damage; else "".
-
-    ``residual_m`` (h, w): of the cloud to the surface, NaN where nothing was judged; ``surface``: its name.
-    """
-    mask = np.isfinite(residual_m)
-    points = cloud.points_m[mask]
-    cells = _cells(points, cloud.projection == "central" and len(points) > 0 and float(points[:, 2].min()) > 0)
-    if cells is None:
-        return ""
-    medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
-    level_noise = _cell_noise(_image(cells, medians))[0]
-    level = replace(
-        cells,
-        points=np.column_stack([cells.points[:, :2], medians]),
-        noise=deviations,
-        level_noise=level_noise,
-    )
-    return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
-
-
-def _noise_map(cells: _Cells) -> np.ndarray:
-    """(c,) a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is more
-    than `NOISIER` times as much."""
-    image = _image(cells, cells.noise)
-    rows, columns = image.shape
-    padded = np.pad(image, 3, constant_values=np.nan)
-    around = np.stack([padded[i : i + rows, j : j + columns] for i in range(7) for j in range(7)])
-    with np.errstate(all="ignore"):
-        local = np.nanmedian(around[:, cells.row, cells.column], axis=0)
-    local = np.hypot(local, cells.level_noise)
-    pixel = _pixel_noise(cells)
-    return np.where(local > NOISIER * pixel, local, pixel)
-
-
-def _on(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    image = np.full(mask.shape, np.nan)
-    image[mask] = values
-    return image
-
-
-def _unjudged(points: np.ndarray, mask: np.ndarray, config: SurfaceConfig) -> Background:
-    """Of too few points: a plane, or the stated polynomial, and a warning that nobody can tell whether it fits."""
-    name, fit = _stated(points, config if config.shape == "polynomial" else SurfaceConfig(degree=1))
-    fitted = fit(points)
-    residual = points[:, 2] - fitted
-    noise_m = median_size_of(residual) / 0.6745
-    warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
-    images = [_on(mask, each) for each in (fitted, residual, np.full(len(points), noise_m))]
-    notes = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
-    return Background(images[0], images[1], images[2], name, None, False, warning, notes)

@@ -1,4 +1,4 @@
-"""Which pixels belong to the target: a box, a polygon in the image, or the nearest large smooth surface."""
+"""The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.smooth_surfaces import inset
+from detectors.masks import inset
 from detectors.target import Choice, propose
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
@@ -85,12 +85,13 @@ class AutoCrop(_Crop):
     target: int | None = Field(default=None, ge=1, le=99)
 
 
-CropConfig = Annotated[NoCrop | BoxCrop | PolygonCrop | AutoCrop, Field(discriminator="kind")]
+AnyCrop = NoCrop | BoxCrop | PolygonCrop | AutoCrop
+CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
 """A crop as the user writes it: ``kind: none | box | polygon | auto`` and that kind's fields."""
 
 
-def crop(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> np.ndarray:
-    """(h, w) bool: the valid pixels that belong to the target.
+def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
+    """Return (h, w) bool: the valid pixels that belong to the target.
 
     Raises UserError where nothing is left, with the cloud's actual extent, and for a polygon on a cloud without a grid.
     """
@@ -106,13 +107,32 @@ def crop(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> np.
         mask = cloud.valid
     if cloud.organised and not isinstance(config, AutoCrop):
         mask = inset(mask, config.inset_px)
-    if not mask.any():
-        raise _empty(cloud, config)
-    return mask
+    if mask.any():
+        return mask
+    points = cloud.points_m[cloud.valid]
+    (x0, y0, z0), (x1, y1, z1) = points.min(axis=0) / MM, points.max(axis=0) / MM
+    extent = f"x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f}, z {z0:.0f} to {z1:.0f} mm"
+    if isinstance(config, BoxCrop):
+        limits = zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
+        asked = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in limits)
+        asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+        unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
+        raise UserError(
+            f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}",
+            legal=f"limits that meet the cloud: {extent}",
+            fix="change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto",
+        )
+    seen = cloud.region
+    where = f"columns {seen.col0} to {seen.col1 - 1}, rows {seen.row0} to {seen.row1 - 1}"
+    raise UserError(
+        f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points",
+        legal=f"a crop that meets the cloud: {where}; {extent}",
+        fix="change the crop or lower crop.inset_px",
+    )
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """The automatic crop with all that it chose from. Raises UserError where there is no candidate ``target``."""
+    """Return the automatic crop and all that it chose from. Raises UserError where there is no candidate ``target``."""
     return propose(cloud, config.crease_deg, config.smooth_px, config.inset_px, config.target)
 
 
@@ -146,28 +166,3 @@ def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
         crossing = u0 + (v - v0) / (v1 - v0) * (u1 - u0)
         inside ^= ((v0 <= v) != (v1 <= v)) & (u < crossing)
     return inside & cloud.valid
-
-
-def _empty(cloud: Cloud, config: NoCrop | BoxCrop | PolygonCrop | AutoCrop) -> UserError:
-    points = cloud.points_m[cloud.valid]
-    (x0, y0, z0), (x1, y1, z1) = points.min(axis=0) / MM, points.max(axis=0) / MM
-    extent = f"x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f}, z {z0:.0f} to {z1:.0f} mm"
-    if isinstance(config, BoxCrop):
-        asked = ", ".join(
-            f"{n} {r[0]:g} to {r[1]:g}" for n, r in zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
-        )
-        asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
-        unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
-        return UserError(
-            f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}",
-            legal=f"limits that meet the cloud: {extent}",
-            fix="change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto",
-        )
-    where = (
-        f"columns {cloud.region.col0} to {cloud.region.col1 - 1}, rows {cloud.region.row0} to {cloud.region.row1 - 1}"
-    )
-    return UserError(
-        f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points",
-        legal=f"a crop that meets the cloud: {where}; {extent}",
-        fix="change the crop or lower crop.inset_px",
-    )

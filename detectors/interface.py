@@ -1,4 +1,4 @@
-"""What every detector is: a cloud goes in, scored evidence comes out; the threshold belongs to the caller."""
+"""The interface of a detector: a cloud goes in, scored evidence comes out; the threshold belongs to the caller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from harness.vocabulary.capture import Cloud
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a detector knows about each pixel of a cloud before any threshold is applied.
+    """A detector's knowledge about each pixel of a cloud before any threshold is applied.
 
     ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion
     (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
@@ -50,7 +50,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class MissingReturns:
-    """What a cloud lacks inside the target's outline.
+    """Pixels without a return inside the target's outline.
 
     ``outline`` (h, w) bool. ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing.
     ``blind``: share of the outline's pixels that returned nothing in any frame. ``dropouts``: rate of scattered missing
@@ -69,7 +69,7 @@ class MissingReturns:
 
     @property
     def blind_text(self) -> str:
-        """How much of the target is blind, and what chance has to do with it."""
+        """Sentence on how much of the target is blind, and how much of that chance explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
         return (
             f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places} of {self.least_points}"
@@ -79,7 +79,7 @@ class MissingReturns:
 
     @property
     def facts(self) -> dict[str, float]:
-        """The same as plain data."""
+        """Figures as plain data."""
         return {
             "blind_share": self.blind,
             "scattered_dropouts": self.dropouts,
@@ -102,20 +102,20 @@ class Measurement:
     score: float
     extent_diameter_m: float
     extent_centre_m: np.ndarray
-    model_diameter_m: float
-    model_diameter_se_m: float
-    model_depth_m: float
-    model_depth_se_m: float
-    model_centre_m: np.ndarray
-    model_centre_se_m: float
-    volume_m3: float
+    model_diameter_m: float = np.nan
+    model_diameter_se_m: float = np.nan
+    model_depth_m: float = np.nan
+    model_depth_se_m: float = np.nan
+    model_centre_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    model_centre_se_m: float = np.nan
+    volume_m3: float = np.nan
     model_note: str = ""
 
 
 @dataclass(frozen=True)
 class TrueDamage:
-    """One damage as a detector is told of it that tests the harness: centre (3,) on the face in the cloud's frame,
-    diameter, and the flat indices of the pixels that see into it."""
+    """One true damage, as a detector that tests the harness is told of it: centre (3,) on the face in the cloud's
+    frame, diameter, and the flat indices of the pixels that see into it."""
 
     centre_m: np.ndarray
     diameter_m: float
@@ -124,19 +124,19 @@ class TrueDamage:
 
 @runtime_checkable
 class ToldTheTruth(Protocol):
-    """A detector that is handed the truth, and by it tests the harness: no detector of damage is one."""
+    """A detector that is handed the truth, and by it tests the harness; no detector of damage implements this."""
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
-        """The detector for one cloud with this truth; empty on a hole-free board."""
+        """Return the detector for one cloud with this truth; empty on a hole-free board."""
         ...
 
 
 @runtime_checkable
 class FindsAtOnce(Protocol):
-    """A detector that tells the findings of many thresholds in one pass: no detector need be one."""
+    """A detector that returns the findings of many thresholds in one pass; no detector need implement this."""
 
     def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
-        """For each threshold the centres (m, 3) of what `Detector.find` finds at it, strongest first."""
+        """Return for each threshold the centres (m, 3) of what `Detector.find` finds at it, strongest first."""
         ...
 
 
@@ -147,7 +147,7 @@ class Detector(Protocol):
     def name(self) -> str: ...
     @property
     def version(self) -> int:
-        """Raised by every change that can change a number."""
+        """Number that every change raises that can change a result."""
         ...
 
     def analyse(self, cloud: Cloud) -> Evidence:
@@ -155,13 +155,13 @@ class Detector(Protocol):
         ...
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        """Clusters at a threshold, strongest first."""
+        """Return the findings at a threshold, strongest first."""
         ...
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """The lowest threshold at which `find` returns nothing."""
+        """Return the lowest threshold at which `find` returns nothing."""
         ...
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-        """Size and place of one detection."""
+        """Measure size and place of one detection."""
         ...

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.hole_image import Patch, Sight, blurred_disc, crossed
-from detectors.hole_kernels import plane_sums
-from detectors.hole_model import HoleFit, fit_hole
+from detectors.hole import HoleFit, Patch, Sight, blurred_disc, crossed, fit_hole
 from detectors.interface import Detection, Evidence, Measurement
-from detectors.median import median_of, median_size_of, quantile_of
+from detectors.masks import grown, parts_with
+from detectors.noise import median_of, quantile_of, sigma_of
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import Region, rotate_vectors
 from harness.vocabulary.units import MM
 
-NOWHERE = np.full(3, np.nan)
 OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
 CONTOUR_ZOOM = 4
@@ -31,7 +30,7 @@ CONTOUR_ZOOM = 4
 
 
 class HoleModelConfig(Config):
-    """What the model of a blurred hole takes for granted.
+    """Assumptions of the model of a blurred hole.
 
     ``blur_px``: side of the square over which the camera averages: 5 for the Azure Kinect's depth engine (5x5
     bilateral on phasors, OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: where the light
@@ -57,11 +56,12 @@ class HoleModelConfig(Config):
 
 
 def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
-    """Sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or cells.
+    """Return the sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or
+    cells.
 
-    What the noise of a recording shares counts before ``config.blur_px``: depth that was upsampled or aligned to a
-    finer camera is blurred over more pixels than the camera's filter has, and that of a camera without a filter over
-    its own pixel only, where a model of 5 pixels would make every hole narrower and several times deeper.
+    The noise that a recording shares counts before ``config.blur_px``: depth that was upsampled or aligned to a finer
+    camera is blurred over more pixels than the camera's filter has, and that of a camera without a filter over its own
+    pixel only, where a model of 5 pixels would make every hole narrower and several times deeper.
     A map adds the linear interpolation of its views' pixels, whose variance is a sixth of a pixel squared, to the
     square's twelfth: as a square of side sqrt(blur^2 + 2) pixels. Cells of more than a pixel take a mean of their own.
     """
@@ -78,7 +78,7 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
 
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
-    """The thesis' size and centre of a cluster (n, 3): (diameter, centre (3,)), metres.
+    """Return the thesis' size and centre of a cluster (n, 3): (diameter, centre (3,)), metres.
 
     Size: mean of the distances in space between the extreme points in x and between those in y; centre: mean of these
     four points. Of equal extremes the first counts, as in MATLAB.
@@ -90,48 +90,45 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
-    """The thesis' extents alone; ``note`` says why there is no more."""
+    """Measure the thesis' extents, and the mean of the detection's pixels as its place on the sensor where there is a
+    pixel grid; ``note`` says why there is no more."""
     points = cloud.points_m.reshape(-1, 3)[detection.pixels]
     diameter, centre = extents(points)
-    return Measurement(
-        u_px=np.nan,
-        v_px=np.nan,
-        points=len(points),
-        score=detection.score,
-        extent_diameter_m=diameter,
-        extent_centre_m=centre,
-        model_diameter_m=np.nan,
-        model_diameter_se_m=np.nan,
-        model_depth_m=np.nan,
-        model_depth_se_m=np.nan,
-        model_centre_m=NOWHERE,
-        model_centre_se_m=np.nan,
-        volume_m3=np.nan,
-        model_note=note,
-    )
+    u = v = np.nan
+    if cloud.organised:
+        rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
+        u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
+    return Measurement(u, v, len(points), detection.score, diameter, centre, model_note=note)
 
 
 def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig) -> Measurement:
-    """Both measures of one detection; NaN and a note where one cannot be made."""
-    blank = measure_extents(cloud, detection, "no pixel grid: extents only")
+    """Measure one detection both ways; NaN and a note where a measure cannot be made."""
     if not cloud.organised:
-        return blank
+        return measure_extents(cloud, detection, "no pixel grid: extents only")
+    placed = measure_extents(cloud, detection, "too few valid pixels around for a model")
     rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
-    placed = on_pixels(cloud, detection, blank)
     around = _Surroundings.of(cloud, evidence, rows, columns, config)
     if around is None:
-        return replace(placed, model_note="too few valid pixels around for a model")
+        return placed
+    near = grown(around.own, around.reach_px + 1) & around.patch.used
+    volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * around.facing_area_m2
+    measured = replace(placed, volume_m3=volume)
     fit, doubt = _modelled(around, config)
     if fit is None or doubt:
-        return _by_contour(placed, around, doubt)
-    return _by_model(placed, around, fit)
-
-
-def on_pixels(cloud: Cloud, detection: Detection, measured: Measurement) -> Measurement:
-    """A measurement with the mean of the detection's pixels as its place on the sensor."""
-    rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
-    u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
-    return replace(measured, u_px=u, v_px=v)
+        return _by_contour(measured, around, doubt)
+    errors = np.sqrt(np.diag(fit.covariance))
+    spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
+    return replace(
+        measured,
+        **around.placed(placed, fit.u_px, fit.v_px),
+        model_diameter_m=2.0 * fit.radius_m,
+        model_diameter_se_m=2.0 * float(errors[2]),
+        model_depth_m=fit.depth_m,
+        model_depth_se_m=float(errors[3]),
+        # per axis: the two axes on the surface share the trace
+        model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
+        model_note="",
+    )
 
 
 # ---------------------------------------------------------------- the neighbourhood
@@ -159,7 +156,8 @@ class _Surroundings:
     def of(
         cls, cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
     ) -> _Surroundings | None:
-        """Twice the blur of margin on each side; None where the surface around cannot be placed."""
+        """Cut out the detection with twice the blur of margin on each side; None where the surface around cannot be
+        placed."""
         h, w = cloud.points_m.shape[:2]
         sides = blur_in_cells(cloud, config)
         blur = max(sides)
@@ -170,14 +168,18 @@ class _Surroundings:
         own = np.zeros(residual.shape, dtype=bool)
         own[rows - corner.row0, columns - corner.col0] = True
         finite = np.isfinite(residual)
-        ring = finite & ~_grown(own, int(blur / 2) + 1)
-        if ring.sum() < 12:
+        ring = residual[finite & ~grown(own, int(blur / 2) + 1)]
+        if len(ring) < 12:
             return None
-        offset, noise = _level(residual[ring])
+        offset = median_of(ring)
+        noise = sigma_of(ring - offset)
         plane = local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], finite, own, cloud.projection)
         if plane is None:
             return None
-        used = finite & ~_other_damage(residual - offset, own, noise, blur)
+        # what stands out without touching the detection is other damage, with the blur around it
+        stands_out = (np.abs(np.nan_to_num(residual - offset)) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
+        others = stands_out & ~parts_with(stands_out, own)
+        used = finite & (own | ~grown(others, int(blur / 2)))
         deviations = residual[own] - offset
         sign = 1.0 if deviations.sum() >= 0 else -1.0
         peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
@@ -188,45 +190,45 @@ class _Surroundings:
         return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])
 
     @property
+    def reach_px(self) -> int:
+        """Half of the blur."""
+        return int(max(self.patch.blur_px) / 2)
+
+    @property
     def surface_area_m2(self) -> float:
-        """Of one pixel, on the surface."""
+        """Area of one pixel on the surface."""
         return float(np.linalg.norm(crossed(self.per_px_m[0], self.per_px_m[1])))
 
     @property
     def facing_area_m2(self) -> float:
-        """Of one pixel, across the optical axis."""
+        """Area of one pixel across the optical axis."""
         (ax, ay, _), (bx, by, _) = self.per_px_m
         return float(abs(ax * by - ay * bx))
 
-    def place_m(self, u: float, v: float) -> np.ndarray:
-        """The surface's point (3,) at a patch position, camera frame."""
-        place: np.ndarray = self.origin_m + (u - self.u0) * self.per_px_m[0] + (v - self.v0) * self.per_px_m[1]
-        return place
-
-
-def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    side = 2 * pixels + 1
-    grown: np.ndarray = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-    return grown
-
-
-def _level(values: np.ndarray) -> tuple[float, float]:
-    """Median and robust standard deviation."""
-    middle = median_of(values)
-    return middle, median_size_of(values - middle) / 0.6745
+    def placed(self, at_detection: Measurement, u: float, v: float) -> dict[str, Any]:
+        """Return the fields that place a measurement at a patch position."""
+        return {
+            "u_px": u - self.u0 + at_detection.u_px,
+            "v_px": v - self.v0 + at_detection.v_px,
+            "model_centre_m": self.origin_m + (u - self.u0) * self.per_px_m[0] + (v - self.v0) * self.per_px_m[1],
+        }
 
 
 def local_plane(
     points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression.
+    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression.
 
     Directions x/z and y/z and the surface's z are each linear in the pixel over a patch; then the product rule. In a
     parallel projection x and y themselves are.
     """
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
+    v, u = np.nonzero(finite)
+    design = np.column_stack([np.ones(len(u)), u - u0, v - v0])
+    seen = points[finite]
+    across = seen[:, :2] if projection == "parallel" else seen[:, :2] / seen[:, 2:]
     try:
-        beta = np.linalg.solve(*plane_sums(points, surface_z, finite, u0, v0, projection == "parallel"))
+        beta = np.linalg.solve(design.T @ design, design.T @ np.column_stack([across, surface_z[finite]]))
     except np.linalg.LinAlgError:
         return None
     if projection == "parallel":
@@ -241,7 +243,7 @@ def local_plane(
 
 
 def _sight(cloud: Cloud, centre: np.ndarray, per_px: np.ndarray, emitter_camera_m: np.ndarray) -> Sight:
-    """From where the surface's point (3,) is seen: the camera, or all those that a map was made from."""
+    """Return the sight of the surface's point (3,) from the camera, or from all those that a map was made from."""
     if cloud.projection == "central":
         return Sight.of(centre, per_px, emitter_camera_m)
     if cloud.map_views is None:
@@ -254,37 +256,35 @@ def _sight(cloud: Cloud, centre: np.ndarray, per_px: np.ndarray, emitter_camera_
     return replace(places[0], others=tuple(places[1:]))
 
 
-def _other_damage(deviation: np.ndarray, own: np.ndarray, noise: float, blur_px: float) -> np.ndarray:
-    """Pixels that stand out without touching the detection, with the blur around them."""
-    stands_out = (np.abs(np.nan_to_num(deviation)) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
-    count, labels = cv2.connectedComponents(stands_out.astype(np.uint8), connectivity=8)
-    touching = np.zeros(count, dtype=bool)
-    touching[labels[own]] = True
-    others = stands_out & ~touching[labels]
-    return _grown(others, int(blur_px / 2)) & ~own if others.any() else others
-
-
 # ---------------------------------------------------------------- the model, and what to do without it
 
 
 def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit | None, str]:
-    """The fitted hole, and the reason to doubt it ('' for none)."""
-    inside = around.own | (around.invalid & _grown(around.own, 1))
-    if float((around.invalid & inside).sum()) > config.largest_invalid * float(inside.sum()):
+    """Return the fitted hole, and the reason to doubt it ('' for none)."""
+    own, invalid, patch = around.own, around.invalid, around.patch
+    inside = own | (invalid & grown(own, 1))
+    if float((invalid & inside).sum()) > config.largest_invalid * float(inside.sum()):
         return None, "part of the hole has no range"
     too_deep = f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
     if around.peak_m > config.linear_depth_mm * MM:
         return None, too_deep
-    fit = fit_hole(around.patch, *_start(around))
-    h, w = around.own.shape
-    reach = np.pad(_grown(around.own, int(max(around.patch.blur_px) / 2) + 1), 1)
+    # the start: centroid of the deviation, peak depth, and the radius that gives the volume
+    near = grown(own, around.reach_px) & patch.used
+    weight = np.maximum(around.sign * (patch.residual_m[near] - around.offset_m), 0.0)
+    v, u = np.nonzero(near)
+    total = max(float(weight.sum()), 1e-12)
+    radius = float(np.sqrt(total * around.surface_area_m2 / (np.pi * around.peak_m)))
+    u0, v0 = float(weight @ u) / total, float(weight @ v) / total
+    fit = fit_hole(patch, u0, v0, radius, around.sign * around.peak_m, around.offset_m)
+    h, w = own.shape
+    reach = np.pad(grown(own, around.reach_px + 1), 1)
     at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
     if not (fit.converged and reach[at[0], at[1]]):
         return None, "the model of a blurred hole does not fit"
     if abs(fit.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
-    disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, around.patch.metric_m2, 1)
-    if float(disc[around.invalid].sum()) > config.largest_invalid * float(disc.sum()):
+    disc = blurred_disc((h, w), fit.u_px, fit.v_px, fit.radius_m, patch.metric_m2, 1)
+    if float(disc[invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, "part of the hole has no range"
     variance = float(fit.covariance[2, 2])
     # a singular fit can leave a negative variance by rounding
@@ -294,77 +294,24 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     return fit, ""
 
 
-def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
-    """(u, v, radius, depth, offset): centroid of the deviation, peak depth, and the radius that gives the volume."""
-    near = _grown(around.own, int(max(around.patch.blur_px) / 2)) & around.patch.used
-    deviation = np.where(near, around.sign * (around.patch.residual_m - around.offset_m), 0.0)
-    weights = np.maximum(deviation, 0.0)
-    v, u = np.nonzero(near)
-    weight = weights[near]
-    total = max(float(weight.sum()), 1e-12)
-    radius = np.sqrt(total * around.surface_area_m2 / (np.pi * around.peak_m))
-    u0, v0 = float(weight @ u) / total, float(weight @ v) / total
-    return u0, v0, float(radius), around.sign * around.peak_m, around.offset_m
-
-
-def _by_model(blank: Measurement, around: _Surroundings, fit: HoleFit) -> Measurement:
-    errors = np.sqrt(np.diag(fit.covariance))
-    spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
-    return replace(
-        blank,
-        u_px=fit.u_px - around.u0 + blank.u_px,
-        v_px=fit.v_px - around.v0 + blank.v_px,
-        model_diameter_m=2.0 * fit.radius_m,
-        model_diameter_se_m=2.0 * float(errors[2]),
-        model_depth_m=fit.depth_m,
-        model_depth_se_m=float(errors[3]),
-        model_centre_m=around.place_m(fit.u_px, fit.v_px),
-        # per axis: the two axes on the surface share the trace
-        model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
-        volume_m3=_volume(around),
-        model_note="",
-    )
-
-
-def _by_contour(blank: Measurement, around: _Surroundings, doubt: str) -> Measurement:
-    """The contour at half of the depth; pixels without a range that touch the detection count as inside."""
+def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Measurement:
+    """Measure the contour at half of the depth; pixels without a range that touch the detection count as inside."""
     residual = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
-    hollow = around.invalid & _reached(around.own | around.invalid, around.own)
+    hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     residual[hollow] = around.peak_m
     residual[~around.patch.used & ~hollow] = 0.0
-    fine = cv2.resize(residual, None, fx=CONTOUR_ZOOM, fy=CONTOUR_ZOOM, interpolation=cv2.INTER_LINEAR)
-    seeds = cv2.resize(
-        around.own.astype(np.uint8), None, fx=CONTOUR_ZOOM, fy=CONTOUR_ZOOM, interpolation=cv2.INTER_NEAREST
-    )
-    inside = _reached(fine > 0.5 * around.peak_m, seeds > 0)
-    volume = _volume(around)
+    size = tuple(CONTOUR_ZOOM * side for side in residual.shape[::-1])
+    fine = cv2.resize(residual, size, interpolation=cv2.INTER_LINEAR)
+    seeds = cv2.resize(around.own.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    inside = parts_with(fine > 0.5 * around.peak_m, seeds > 0)
     if not inside.any():
-        return replace(blank, volume_m3=volume, model_note=doubt + "; no half-depth contour")
-    v, u = ((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5 for axis in np.nonzero(inside))
+        return replace(measured, model_note=doubt + "; no half-depth contour")
+    v, u = (float((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5) for axis in np.nonzero(inside))
     area = inside.sum() / CONTOUR_ZOOM**2 * around.surface_area_m2
     return replace(
-        blank,
-        u_px=float(u) - around.u0 + blank.u_px,
-        v_px=float(v) - around.v0 + blank.v_px,
+        measured,
+        **around.placed(measured, u, v),
         model_diameter_m=2.0 * float(np.sqrt(area / np.pi)),
         model_depth_m=np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m,
-        model_centre_m=around.place_m(float(u), float(v)),
-        volume_m3=volume,
         model_note=doubt + "; from the contour at half depth, without standard errors",
     )
-
-
-def _reached(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The connected parts of the mask that hold a seed."""
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    wanted = np.zeros(count, dtype=bool)
-    wanted[labels[seeds & mask]] = True
-    wanted[0] = False
-    reached: np.ndarray = wanted[labels]
-    return reached
-
-
-def _volume(around: _Surroundings) -> float:
-    """Sum of the deviation times the pixel's area across the axis, over the detection and the blur around it."""
-    near = _grown(around.own, int(max(around.patch.blur_px) / 2) + 1) & around.patch.used
-    return float((around.patch.residual_m[near] - around.offset_m).sum()) * around.facing_area_m2

@@ -18,13 +18,16 @@ pixels, which nothing in a single frame tells from small holes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from scipy.special import ndtri, ndtri_exp, owens_t
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
+from detectors.masks import grown, holes_filled
 from detectors.measure import local_plane
 from harness.vocabulary.capture import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
@@ -47,8 +50,8 @@ FEWEST_FIELDS, MOST_FIELDS = 10, 100
 TAIL_CLUSTERS = 60
 """Largest simulated clusters from which the fall of their number with size is taken."""
 SLOWEST_FALL = 0.5
-"""Without simulated clusters to tell, each further pixel multiplies a cluster's chance by this: in fields averaged over
-5 x 5 pixels at a rate of 1e-4, 0.3 % of the clusters have 9 pixels and more."""
+"""Fall without simulated clusters to tell each further pixel multiplies a cluster's chance by this: in fields averaged
+over 5 x 5 pixels at a rate of 1e-4, 0.3 % of the clusters have 9 pixels and more."""
 REACH_PX = 2
 """A depth finding so near to pixels without return belongs to the same damage: half of a 5 x 5 window."""
 RING_PX = 4
@@ -59,71 +62,71 @@ HIGHEST_SCORE = 37.0
 
 def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
     """Look for missing returns inside the outline of what was judged; None for a cloud without a pixel grid, which does
-    not tell what it lacks. Deterministic."""
+    not tell what it lacks. Deterministic.
+
+    The outline (h, w) bool: judged pixels, gaps narrower than 3 pixels between them, and all that these enclose. Beyond
+    the image's edge there is no target.
+    """
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
-    outline = outline_of(judged)
+    closed = cv2.morphologyEx(np.pad(judged.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    outline = holes_filled(closed > 0)[2:-2, 2:-2]
     is_map = cloud.projection == "parallel"
     frames = max(cloud.n_frames, 1)
     unseen = (~cloud.valid).astype(float) if is_map else 1.0 - np.clip(cloud.count / frames, 0.0, 1.0)
     missing = (~cloud.valid | (unseen >= 1.0 - SELDOM)) & outline
     blind = float((~cloud.valid)[outline].mean())
     labels, sizes = _clusters(missing)
-    free = ~_touching(labels, len(sizes), outline)
+    inner = cv2.erode(outline.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), borderValue=0)
+    free = np.ones(len(sizes), dtype=bool)
+    free[labels[outline & (inner == 0)]] = False
     if sizes[free].max(initial=0) < LEAST_POINTS:
         small = float(missing.sum() / outline.sum())
         return MissingReturns(outline, unseen, blind, small, LEAST_POINTS, 0.0, ())
     chance = _settled(labels, sizes, outline)
-    named = np.flatnonzero(free & (sizes >= chance.least_points))
-    placed = (_detection(cloud, evidence, np.flatnonzero(labels.ravel() == n), chance) for n in named)
-    found = sorted((one for one in placed if one), key=lambda one: (-len(one.pixels), int(one.pixels[0])))
+    found = []
+    for number in np.flatnonzero(free & (sizes >= chance.least_points)):
+        pixels = np.flatnonzero(labels.ravel() == number)
+        placed = _surface_at(cloud, evidence, _filled(cloud.valid.shape, pixels))
+        if placed is not None:
+            improbable = -ndtri_exp(min(chance.log_expected(len(pixels)), np.log(0.5)))
+            found.append(Detection(min(float(improbable), HIGHEST_SCORE), pixels, placed[0], "no return"))
+    found.sort(key=lambda each: (-len(each.pixels), int(each.pixels[0])))
     expected = float(np.exp(chance.log_expected(chance.least_points)))
     return MissingReturns(outline, unseen, blind, chance.rate, chance.least_points, expected, tuple(found))
-
-
-def outline_of(judged: np.ndarray) -> np.ndarray:
-    """The target's filled outline (h, w) bool: judged pixels, gaps narrower than 3 pixels between them, and all that
-    these enclose. Beyond the image's edge there is no target."""
-    padded = np.pad(judged.astype(np.uint8), 2)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    _, labels = cv2.connectedComponents(1 - closed, connectivity=4)
-    filled: np.ndarray = (labels != labels[0, 0])[2:-2, 2:-2]
-    return filled
 
 
 def one_damage_once(
     shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
-    """Findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest first;
-    where two of them touch (`REACH_PX`) they are the same damage, and the larger of them stands for it.
+    """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest
+    first; where two of them touch (`REACH_PX`) they are the same damage, and the larger of them stands for it.
 
     A hole's floor with a few pixels lost at its wall stays a depth finding, which has a depth and whose size takes in
     pixels without a range that touch it; a hole that returns nothing but along its rim becomes a missing return.
     """
     kept = list(missing)
     depth = list(found)
-    for one in missing:
-        area = _filled(shape, one.pixels)
-        kernel = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
-        near = cv2.dilate(area.astype(np.uint8), kernel).ravel() > 0
+    for hole in missing:
+        area = _filled(shape, hole.pixels)
+        near = grown(area, REACH_PX).ravel()
         touching = [other for other in depth if near[other.pixels].any()]
         if any(len(other.pixels) >= area.sum() for other in touching):
-            kept.remove(one)
+            kept.remove(hole)
         else:
             depth = [other for other in depth if not any(other is gone for gone in touching)]
-    return tuple(sorted((*depth, *kept), key=lambda one: -one.score))
+    return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
 
 
 def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-    """Place and size of pixels without return, on the surface: the diameter of a circle of the same area, what they
-    enclose included, and the centre of their pixels. No depth, no volume; no allowance for the camera's blur.
+    """Measure place and size of pixels without return, on the surface: the diameter of a circle of the same area, what
+    they enclose included, and the centre of their pixels. No depth, no volume; no allowance for the camera's blur.
 
     The surface at the hole is a plane through the fitted surface around it: on a face of radius r the centre of a hole
     of diameter d is d^2 / 8r off.
     """
-    shape = cloud.valid.shape
-    area = _filled(shape, detection.pixels)
+    area = _filled(cloud.valid.shape, detection.pixels)
     rows, columns = np.nonzero(area)
     placed = _surface_at(cloud, evidence, area)
     if placed is None:
@@ -137,13 +140,6 @@ def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> M
         score=detection.score,
         extent_diameter_m=2.0 * float(np.sqrt(len(rows) * pixel_m2 / np.pi)),
         extent_centre_m=centre,
-        model_diameter_m=np.nan,
-        model_diameter_se_m=np.nan,
-        model_depth_m=np.nan,
-        model_depth_se_m=np.nan,
-        model_centre_m=np.full(3, np.nan),
-        model_centre_se_m=np.nan,
-        volume_m3=np.nan,
         model_note=f"no return: {_REASONS.get(int(reasons.argmax()), 'no light came back')}",
     )
 
@@ -163,49 +159,30 @@ _REASONS: dict[int, str] = {
 
 
 def _clusters(missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels (h, w) of clusters joined along rows and columns, and their sizes by label; 0 is no cluster."""
+    """Return labels (h, w) of clusters joined along rows and columns, and their sizes by label; 0 is no cluster."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8), connectivity=4)
     sizes = stats[:count, cv2.CC_STAT_AREA].astype(np.int64)
     sizes[0] = 0
     return labels, sizes
 
 
-def _touching(labels: np.ndarray, count: int, outline: np.ndarray) -> np.ndarray:
-    """(count,) bool by label: clusters that touch the outline's edge."""
-    inner = cv2.erode(outline.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), borderValue=0)
-    touching = np.zeros(count, dtype=bool)
-    touching[labels[outline & (inner == 0)]] = True
-    return touching
-
-
-def _detection(cloud: Cloud, evidence: Evidence, pixels: np.ndarray, chance: _Chance) -> Detection | None:
-    placed = _surface_at(cloud, evidence, _filled(cloud.valid.shape, pixels))
-    if placed is None:
-        return None
-    score = min(float(-ndtri_exp(min(chance.log_expected(len(pixels)), np.log(0.5)))), HIGHEST_SCORE)
-    return Detection(score, pixels, placed[0], "no return")
-
-
 def _filled(shape: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
-    """(h, w) bool: the pixels and what they enclose."""
+    """Return (h, w) bool: the pixels and what they enclose."""
     mask = np.zeros(shape, dtype=bool)
     mask.reshape(-1)[pixels] = True
-    _, labels = cv2.connectedComponents(np.pad(~mask, 1, constant_values=True).astype(np.uint8), connectivity=4)
-    filled: np.ndarray = (labels != labels[0, 0])[1:-1, 1:-1]
-    return filled
+    return holes_filled(mask)
 
 
 def _surface_at(cloud: Cloud, evidence: Evidence, area: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """The surface's point (3,) at an area's centroid and the surface that one pixel covers there, m2; None where too
-    little was judged around it. Directions come from the judged pixels' own points, so that no lens is needed."""
+    """Return the surface's point (3,) at an area's centroid and the surface that one pixel covers there, m2; None where
+    too little was judged around it. Directions come from the judged pixels' own points, so that no lens is needed."""
     rows, columns = np.nonzero(area)
     h, w = area.shape
     cut = np.s_[
         max(rows.min() - RING_PX, 0) : min(rows.max() + RING_PX + 1, h),
         max(columns.min() - RING_PX, 0) : min(columns.max() + RING_PX + 1, w),
     ]
-    ring = cv2.dilate(area[cut].astype(np.uint8), np.ones((2 * RING_PX + 1,) * 2, np.uint8)) > 0
-    ring &= ~area[cut] & np.isfinite(evidence.score[cut]) & cloud.valid[cut]
+    ring = grown(area[cut], RING_PX) & ~area[cut] & np.isfinite(evidence.score[cut]) & cloud.valid[cut]
     if ring.sum() < LEAST_POINTS:
         return None
     plane = local_plane(cloud.points_m[cut], evidence.surface_z_m[cut], ring, area[cut], cloud.projection)
@@ -225,78 +202,65 @@ class _Chance:
     of the expected number of clusters of a size and more."""
 
     rate: float
-    at: int
-    log_at: float
-    fall: float
+    at: int = 1
+    log_at: float = 0.0
+    fall: float = -math.log(SLOWEST_FALL)
 
     def log_expected(self, points: int) -> float:
-        """Of clusters of so many pixels and more on the whole target."""
+        """Return the logarithm of the expected number of clusters of so many pixels and more on the whole target."""
         return self.log_at - self.fall * (points - self.at)
 
     @property
     def least_points(self) -> int:
-        """At least `LEAST_POINTS`."""
+        """Least size of a finding, `LEAST_POINTS` or more."""
         needed = self.at + (self.log_at - np.log(ALPHA)) / self.fall
         return max(LEAST_POINTS, int(np.ceil(needed)))
 
 
 def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Chance:
-    """Chance by the clusters that are no findings, the least size of findings being raised until it stays."""
+    """Return chance by the clusters that are no findings, the least size of findings being raised until it stays."""
     rows, columns = np.nonzero(outline)
     cut = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels, outline = labels[cut], outline[cut]
-    fields = _Fields(outline)
+    (h, w), count = outline.shape, int(np.clip(SIMULATED_PX / outline.size, FEWEST_FIELDS, MOST_FIELDS))
+
+    @cache
+    def fields(side: int) -> list[np.ndarray]:
+        """Draw fields of unit variance averaged over a square of this side."""
+        beyond = side - 1
+        random = random_stream(0, "missing returns", h, w, side)
+        noise = (random.standard_normal((h + beyond, w + beyond), dtype=np.float32) for _ in range(count))
+        blurred = (cv2.blur(z, (side, side)) * side if beyond else z for z in noise)
+        first = beyond // 2
+        return [z[first : first + h, first : first + w].copy() for z in blurred]
+
+    def chance_of(scattered: np.ndarray, known: np.ndarray) -> _Chance:
+        """Return chance by scattered dropouts (h, w) among known pixels (h, w), findings left out."""
+        rate = float(scattered.sum() / max(known.sum(), 1))
+        if not scattered.any():
+            return _Chance(0.0)
+        window = (RATE_WINDOW_PX, RATE_WINDOW_PX)
+        near, of = (
+            cv2.boxFilter(part.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+            for part in (scattered, known)
+        )
+        local = (near + RATE_PRIOR_PX * rate) / (of + RATE_PRIOR_PX)
+        level = ndtri(np.clip(local, 1e-7, 0.999)).astype(np.float32)
+        sizes = [_clusters((z < level) & outline)[1][1:] for z in fields(_square(scattered, known, rate))]
+        return _tail(rate, np.sort(np.concatenate(sizes)), count)
+
     least = LEAST_POINTS
     while True:
         scattered = (sizes < least)[labels] & (labels > 0)
-        chance = fields.chance(scattered, outline & (scattered | (labels == 0)))
+        chance = chance_of(scattered, outline & (scattered | (labels == 0)))
         if not ((sizes >= least) & (sizes < chance.least_points)).any():
             return chance
         least = chance.least_points
 
 
-class _Fields:
-    """Simulated fields for one outline (h, w); those of a square are drawn once."""
-
-    def __init__(self, outline: np.ndarray) -> None:
-        self._outline = outline
-        self._count = int(np.clip(SIMULATED_PX / outline.size, FEWEST_FIELDS, MOST_FIELDS))
-        self._drawn: dict[int, list[np.ndarray]] = {}
-
-    def chance(self, scattered: np.ndarray, known: np.ndarray) -> _Chance:
-        """By scattered dropouts (h, w) among known pixels (h, w), findings left out."""
-        rate = float(scattered.sum() / max(known.sum(), 1))
-        if not scattered.any():
-            return _Chance(0.0, 1, 0.0, -np.log(SLOWEST_FALL))
-        level = ndtri(np.clip(_local_rate(scattered, known, rate), 1e-7, 0.999)).astype(np.float32)
-        sizes = [_clusters((z < level) & self._outline)[1][1:] for z in self._of(_square(scattered, known, rate))]
-        return _tail(rate, np.sort(np.concatenate(sizes)), self._count)
-
-    def _of(self, side: int) -> list[np.ndarray]:
-        """Fields of unit variance averaged over a square of this side."""
-        if side not in self._drawn:
-            (h, w), grown = self._outline.shape, side - 1
-            random = random_stream(0, "missing returns", h, w, side)
-            noise = (random.standard_normal((h + grown, w + grown), dtype=np.float32) for _ in range(self._count))
-            blurred = (cv2.blur(z, (side, side)) * side if grown else z for z in noise)
-            first = grown // 2
-            self._drawn[side] = [z[first : first + h, first : first + w].copy() for z in blurred]
-        return self._drawn[side]
-
-
-def _local_rate(scattered: np.ndarray, known: np.ndarray, rate: float) -> np.ndarray:
-    size = (RATE_WINDOW_PX, RATE_WINDOW_PX)
-    sums = [
-        cv2.boxFilter(part.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for part in (scattered, known)
-    ]
-    local: np.ndarray = (sums[0] + RATE_PRIOR_PX * rate) / (sums[1] + RATE_PRIOR_PX)
-    return local
-
-
 def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
-    """The side of the least square whose fields have as many missing neighbours of missing pixels as these dropouts, to
-    within two standard errors; 5 where none has."""
+    """Return the side of the least square whose fields have as many missing neighbours of missing pixels as these
+    dropouts, to within two standard errors; 5 where none has."""
     pairs = both = 0
     for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         pairs += int((scattered[a] & known[b]).sum())
@@ -314,10 +278,10 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
 
 
 def _tail(rate: float, sizes: np.ndarray, fields: int) -> _Chance:
-    """The fall of the number of clusters with size, from the largest of simulated ``sizes``, ascending; its mean excess
-    is taken two standard errors high, as the fall slows down a little with size."""
+    """Return the fall of the number of clusters with size, from the largest of simulated ``sizes``, ascending; its mean
+    excess is taken two standard errors high, as the fall slows down a little with size."""
     if len(sizes) < 2:
-        return _Chance(rate, 1, np.log(max(len(sizes), 1) / fields), -np.log(SLOWEST_FALL))
+        return _Chance(rate, log_at=float(np.log(max(len(sizes), 1) / fields)))
     largest = sizes[-min(TAIL_CLUSTERS, len(sizes)) :]
     at = int(largest[0])
     of_size = int((sizes >= at).sum())

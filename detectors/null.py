@@ -20,7 +20,6 @@ neither proud of it nor seen in a picture raise the threshold.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,6 +27,7 @@ import numpy as np
 from scipy import ndimage, optimize, stats
 
 from detectors.interface import Detection, Detector, Evidence, FindsAtOnce
+from detectors.masks import grown, holes_filled, parts_with
 from detectors.measure import extents
 from harness.vocabulary.capture import Cloud
 
@@ -39,8 +39,8 @@ spite of it."""
 WANTED_PEAKS = 60
 """Peaks above the floor: their mean excess is then known to 13 %, and the floor is as high as it can be."""
 FEWEST_PEAKS = 8
-"""Below, the tail is anybody's guess: the mean excess is known to 35 %, and the threshold is twice as far away as the
-floor."""
+"""Least number that tells a tail: the mean excess is known to 35 %, and the threshold is twice as far away as
+the floor."""
 CROWDED = 0.6
 """Share of the most findings that any threshold gives: with more, neighbouring peaks have merged."""
 LADDER = 1.06
@@ -49,8 +49,8 @@ LEAST = 3.0
 """Units of score below which no threshold goes, whatever is expected there: errors that are bounded, as those of
 rounded numbers without noise, end so near that a tail extrapolated from one side says nothing of the other."""
 OBJECT_MARGIN_PX = 6
-"""Around an object: its edge is mixed over 3 pixels, and its shadow lies beside it. Smoothed depth reaches further, by
-half of the square that it was smoothed over."""
+"""Margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it. Smoothed depth reaches
+further, by half of the square that it was smoothed over."""
 PATCH_PX = 5
 """Side of the square that residual and picture are smoothed over before objects are looked for."""
 LEAST_OBJECT_PX = 100
@@ -69,9 +69,9 @@ a twentieth of it once in 800 captures."""
 CONTRADICTED = 0.1
 """Chance of so many peaks above the threshold at which a tail no longer holds."""
 MOST_SKEW = 0.15
-"""Of the quartiles' distances from the median, over their sum: 0.15 are 1.35 times as far to one side."""
+"""Difference of the quartiles' distances from the median, over their sum: 0.15 are 1.35 times as far to one side."""
 DRAWS = 4000
-"""Of rate and scale, for the interval."""
+"""Draws of rate and scale, for the interval."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,15 @@ class OwnThreshold:
 
 
 def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float) -> OwnThreshold:
-    """The threshold at which ``false_calls`` (above 0) are expected beside objects, by the capture's own peaks towards
-    the camera, or `LEAST`, with fewer expected. With too few of them, threshold, expected number and interval are NaN,
-    and ``doubts`` says so."""
-    judged = int(np.isfinite(evidence.score).sum())
-    floor, peaks, objects = _without_objects(detector, cloud, evidence)
+    """Find the threshold at which ``false_calls`` (above 0) are expected beside objects, by the capture's own peaks
+    towards the camera, or `LEAST`, with fewer expected. With too few of them, threshold, expected number and interval
+    are NaN, and ``doubts`` says so."""
+    known = np.isfinite(evidence.score)
+    covered = np.zeros(known.shape, bool)
+    if cloud.organised:
+        covered = grown(_proud(cloud, evidence) | _marked(cloud, evidence), _margin(cloud), cv2.MORPH_ELLIPSE)
+    floor, peaks = _peaks(detector, cloud, _only(evidence, ~behind(evidence)), covered)
+    objects = int(ndimage.label(covered)[1])
     doubts = []
     skew = skew_of(evidence)
     if abs(skew) > MOST_SKEW:
@@ -113,14 +117,23 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
             f" ({FEWEST_PEAKS} at least)"
         )
         unknown = (float("nan"),) * 4
-        return OwnThreshold(*unknown, len(peaks), floor, objects.count, 0, evidence, tuple(doubts))
-    tail = _tail_of(peaks, floor, false_calls / 2.0)
-    threshold = max(tail.threshold(false_calls / 2.0), LEAST)
-    rim = _mixed_rim(detector, cloud, evidence, threshold) if cloud.organised else np.zeros(evidence.score.shape, bool)
+        return OwnThreshold(*unknown, len(peaks), floor, objects, 0, evidence, tuple(doubts))
+    # all peaks, or the higher half, and again, while too many lie above the threshold: a few wide waves of a fixed
+    # pattern are then higher than the noise of many pixels, and one tail does not hold both
+    falling, number = np.sort(peaks)[::-1], false_calls / 2.0
+    while True:
+        tail, half = Tail.of(falling, floor), len(falling) // 2
+        seen = int((falling > tail.threshold(number)).sum())
+        if half < FEWEST_PEAKS or stats.poisson.sf(seen - 1, number) > CONTRADICTED:
+            break
+        falling, floor = falling[:half], float(falling[half])
+    threshold = max(tail.threshold(number), LEAST)
+    rim = _mixed_rim(detector, cloud, evidence, threshold) if cloud.organised else np.zeros(known.shape, bool)
     low, high = (2.0 * bound for bound in tail.interval(threshold))
-    if objects.pixels > MOST_MASKED * judged:
+    hidden = int((covered & known).sum())
+    if hidden > MOST_MASKED * known.sum():
         doubts.append(
-            f"{100 * objects.pixels / judged:.0f} % of what is judged lies under or beside objects before the surface,"
+            f"{100 * hidden / known.sum():.0f} % of what is judged lies under or beside objects before the surface,"
             " and the rest may not stand for the whole"
         )
     return OwnThreshold(
@@ -130,7 +143,7 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         high=high,
         peaks=tail.peaks,
         floor=tail.floor,
-        objects=objects.count,
+        objects=objects,
         rim_pixels=int(rim.sum()),
         evidence=_only(evidence, ~rim),
         doubts=tuple(doubts),
@@ -138,7 +151,7 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
 
 
 def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:
-    """The findings with each object that lies on the target as one of them, strongest first.
+    """Return the findings with each object that lies on the target as one of them, strongest first.
 
     The edges of an object shadow the surface beside it and disturb filters there: findings that reach its margin and
     are weaker than the object itself are its own. An object with a single finding keeps that finding as it is. Nothing
@@ -153,7 +166,7 @@ def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, .
     kept, margin = list(found), _margin(cloud)
     for number in range(1, count + 1):
         region = labels == number
-        near = _grown(region, margin).ravel()
+        near = grown(region, margin, cv2.MORPH_ELLIPSE).ravel()
         bumps = [each for each in kept if region.ravel()[each.pixels].any()]
         height = max((each.score for each in bumps), default=0.0)
         own = [each for each in kept if each.score <= height and near[each.pixels].any()]
@@ -166,12 +179,12 @@ def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, .
 
 
 def _margin(cloud: Cloud) -> int:
-    """Pixels around an object that it disturbs."""
+    """Return the number of pixels around an object that it disturbs."""
     return OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
 
 
 def behind(evidence: Evidence) -> np.ndarray:
-    """(h, w) bool: pixels whose score speaks for something behind the surface."""
+    """Return (h, w) bool: pixels whose score speaks for something behind the surface."""
     if evidence.behind is not None:
         return evidence.behind
     with np.errstate(invalid="ignore"):
@@ -179,7 +192,8 @@ def behind(evidence: Evidence) -> np.ndarray:
 
 
 def skew_of(evidence: Evidence) -> float:
-    """Bowley's skewness of the residual, -1 to 1: damage on less than a quarter of the target hardly moves it."""
+    """Return Bowley's skewness of the residual, -1 to 1: damage on less than a quarter of the target hardly moves
+    it."""
     known = evidence.residual_m[np.isfinite(evidence.residual_m)]
     low, middle, high = np.quantile(known, (0.25, 0.5, 0.75))
     return float((high + low - 2 * middle) / max(high - low, 1e-12))
@@ -200,7 +214,7 @@ class Tail:
 
     @classmethod
     def of(cls, peaks: np.ndarray, floor: float) -> Tail:
-        """From the scores (n,) of the peaks above a floor, which is above 0."""
+        """Weigh the exponents by the scores (n,) of the peaks above a floor, which is above 0."""
         ratios = np.maximum(np.asarray(peaks, float) / floor, 1.0 + 1e-9)
         sums = np.array([_excess(ratios, exponent).sum() for exponent in EXPONENTS])
         # the likelihood with the scale integrated out under its invariant prior
@@ -208,14 +222,18 @@ class Tail:
         weights = np.exp(logs - logs.max())
         return cls(floor, len(ratios), sums, weights / weights.sum())
 
-    def expected(self, threshold: float) -> float:
-        """Mean number of peaks above a threshold, over all rates and scales that the peaks allow."""
+    def _excesses(self, threshold: float) -> np.ndarray:
         ratio = np.array([threshold / self.floor])
-        excesses = np.array([float(_excess(ratio, exponent)[0]) for exponent in EXPONENTS])
+        return np.array([float(_excess(ratio, exponent)[0]) for exponent in EXPONENTS])
+
+    def expected(self, threshold: float) -> float:
+        """Return the mean number of peaks above a threshold, over all rates and scales that the peaks allow."""
+        excesses = self._excesses(threshold)
         return float((self.weights * self.peaks * (1.0 + excesses / self.sums) ** -self.peaks).sum())
 
     def threshold(self, number: float) -> float:
-        """Where this many peaks are expected; the floor where fewer are expected there already."""
+        """Return the threshold at which so many peaks are expected; the floor where fewer are expected there
+        already."""
         if number >= self.peaks:
             return self.floor
         high = 2.0
@@ -227,29 +245,14 @@ class Tail:
         return float(np.exp(log_ratio)) * self.floor
 
     def interval(self, threshold: float) -> tuple[float, float]:
-        """Central 95 % of the expected number of peaks above a threshold."""
+        """Return the central 95 % of the expected number of peaks above a threshold."""
         random = np.random.default_rng(20201102)
         chosen = random.choice(len(EXPONENTS), DRAWS, p=self.weights)
-        ratio = np.array([threshold / self.floor])
-        excesses = np.array([float(_excess(ratio, exponent)[0]) for exponent in EXPONENTS])
+        excesses = self._excesses(threshold)
         per_scale = random.gamma(self.peaks, 1.0, DRAWS) * excesses[chosen] / self.sums[chosen]
         drawn = random.gamma(self.peaks, 1.0, DRAWS) * np.exp(-per_scale)
         low, high = np.quantile(drawn, (0.025, 0.975))
         return float(low), float(high)
-
-
-def _tail_of(peaks: np.ndarray, floor: float, number: float) -> Tail:
-    """The tail of all peaks (n,), or of the higher half, and again, while too many lie above the threshold at which
-    ``number`` of them are expected: a few wide waves of a fixed pattern are then higher than the noise of many pixels,
-    and one tail does not hold both."""
-    falling = np.sort(peaks)[::-1]
-    while True:
-        tail = Tail.of(falling, floor)
-        seen = int((falling > tail.threshold(number)).sum())
-        half = len(falling) // 2
-        if half < FEWEST_PEAKS or stats.poisson.sf(seen - 1, number) > CONTRADICTED:
-            return tail
-        falling, floor = falling[:half], float(falling[half])
 
 
 def _excess(ratios: np.ndarray, exponent: float) -> np.ndarray:
@@ -259,25 +262,8 @@ def _excess(ratios: np.ndarray, exponent: float) -> np.ndarray:
 # ---- peaks and objects -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Objects:
-    count: int
-    pixels: int
-
-
-def _without_objects(detector: Detector, cloud: Cloud, judged: Evidence) -> tuple[float, np.ndarray, _Objects]:
-    """The floor, the scores of the peaks before the surface above it, and the objects that were set aside."""
-    before = _only(judged, ~behind(judged))
-    covered = np.zeros(judged.score.shape, bool)
-    if cloud.organised:
-        covered = _grown(_proud(cloud, judged) | _marked(cloud, judged), _margin(cloud))
-    floor, found = _peaks(detector, cloud, before, covered)
-    pixels = int((covered & np.isfinite(judged.score)).sum())
-    return floor, np.array([each.score for each in found]), _Objects(int(ndimage.label(covered)[1]), pixels)
-
-
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """(h, w) bool: connected regions that stand before the surface as a whole, wider than noise is."""
+    """Return (h, w) bool: connected regions that stand before the surface as a whole, wider than noise is."""
     known = np.isfinite(evidence.residual_m)
     weights = _boxed(known.astype(np.float64))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -285,17 +271,15 @@ def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
     smooth[~known | (weights < 0.5)] = np.nan
     if not np.isfinite(smooth).any():
         return np.zeros_like(known)
-    before = (np.nanmedian(smooth) - smooth) / max(
-        1.4826 * np.nanmedian(np.abs(smooth - np.nanmedian(smooth))), cloud.z_step_m / PATCH_PX, 1e-9
-    )
-    return _regions(before > PROUD_FOOT, before > PROUD)
+    before = np.nanmedian(smooth) - smooth
+    before /= max(1.4826 * np.nanmedian(np.abs(before)), cloud.z_step_m / PATCH_PX, 1e-9)
+    return parts_with(before > PROUD_FOOT, before > PROUD, least=LEAST_OBJECT_PX)
 
 
 def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """(h, w) bool: long steep edges of the colour picture or the amplitude: where the material changes, range that
-    depends on brightness steps too. The target's own outline is none."""
-    whole = np.pad(ndimage.binary_fill_holes(np.isfinite(evidence.score)), 1, mode="edge")
-    inside = ndimage.distance_transform_edt(whole)[1:-1, 1:-1] > 2 * PATCH_PX
+    """Return (h, w) bool: long steep edges of the colour picture or the amplitude: where the material changes, range
+    that depends on brightness steps too. The target's own outline is none."""
+    inside = _depth_px(holes_filled(np.isfinite(evidence.score))) > 2 * PATCH_PX
     edges = np.zeros(cloud.valid.shape, bool)
     channels = [] if cloud.rgb is None else list(np.moveaxis(np.asarray(cloud.rgb, np.float64), -1, 0))
     for channel in (*channels, *(() if cloud.amplitude is None else (cloud.amplitude,))):
@@ -305,73 +289,58 @@ def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
         smooth = _boxed(_boxed(np.where(np.isfinite(channel), channel, np.median(channel[known]))))
         steep = np.hypot(*np.gradient(smooth))
         edges |= known & (steep > MARKED * max(float(np.median(steep[known])), 1e-9))
-    return _regions(edges, edges)
+    return parts_with(edges, edges, least=LEAST_OBJECT_PX)
 
 
 def _boxed(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.blur(image, (PATCH_PX, PATCH_PX), borderType=cv2.BORDER_REFLECT))
 
 
-def _regions(where: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Connected parts of ``where`` (h, w) bool with a seed in them and `LEAST_OBJECT_PX` pixels or more."""
-    labels, count = ndimage.label(where, np.ones((3, 3)))
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    chosen = (sizes >= LEAST_OBJECT_PX) & (np.bincount(labels[seeds], minlength=count + 1) > 0)
-    chosen[0] = False
-    return np.asarray(chosen[labels])
+def _depth_px(whole: np.ndarray) -> np.ndarray:
+    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge is no rim."""
+    return np.asarray(ndimage.distance_transform_edt(np.pad(whole, 1, mode="edge"))[1:-1, 1:-1])
 
 
-def _peaks(
-    detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarray
-) -> tuple[float, tuple[Detection, ...]]:
-    """A floor with about `WANTED_PEAKS` findings above it, and they; a higher one where they would merge. What reaches
-    into the ``covered`` (h, w) bool is left out: it may be the flank of a peak there."""
+def _peaks(detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return a floor with about `WANTED_PEAKS` findings above it, and their scores; a higher floor where they would
+    merge. What reaches into the ``covered`` (h, w) bool is left out: it may be the flank of a peak there."""
     evidence = _only(before, ~covered)
     known = evidence.score[np.isfinite(evidence.score)]
     if not (len(known) and known.max() > 0):
-        return 1.0, ()
+        return 1.0, np.zeros(0)
     least = max(float(np.median(known)), 1e-3 * float(known.max()))
     thresholds = least * LADDER ** np.arange(np.log(known.max() / least) / np.log(LADDER) + 1)
-    counts = _counts(detector, cloud, evidence, thresholds.tolist())
+    if isinstance(detector, FindsAtOnce):
+        found = detector.centres_at(cloud, evidence, thresholds.tolist())
+        counts = np.array([len(centres) for centres in found])
+    else:
+        counts = np.array([len(detector.find(cloud, evidence, threshold)) for threshold in thresholds.tolist()])
     crowd = int(counts.argmax())
     free = [n for n in range(crowd, len(counts)) if counts[n] <= CROWDED * counts[crowd]]
     enough = [n for n in free if counts[n] >= WANTED_PEAKS]
     floor = float(thresholds[enough[-1] if enough else free[0] if free else crowd])
     hidden = covered.reshape(-1)
-    return floor, tuple(each for each in detector.find(cloud, before, floor) if not hidden[each.pixels].any())
-
-
-def _counts(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> np.ndarray:
-    """Numbers of findings at each threshold."""
-    if isinstance(detector, FindsAtOnce):
-        return np.array([len(centres) for centres in detector.centres_at(cloud, evidence, thresholds)])
-    return np.array([len(detector.find(cloud, evidence, threshold)) for threshold in thresholds])
+    peaks = [each.score for each in detector.find(cloud, before, floor) if not hidden[each.pixels].any()]
+    return floor, np.array(peaks)
 
 
 # ---- the rim ---------------------------------------------------------------------------------------------------------
 
 
 def _mixed_rim(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> np.ndarray:
-    """(h, w) bool: a band along the target's outline as deep as the calls behind the surface that touch it reach, where
-    there are more of these than chance gives: pixels that mix in what lies behind the target."""
-    none = np.zeros(evidence.score.shape, bool)
+    """Return (h, w) bool: a band along the target's outline as deep as the calls behind the surface that touch it
+    reach, where there are more of these than chance gives: pixels that mix in what lies behind the target."""
     known = np.isfinite(evidence.score)
-    whole = ndimage.binary_fill_holes(known)
-    # the image's own edge is no rim
-    depth = ndimage.distance_transform_edt(np.pad(whole, 1, mode="edge"))[1:-1, 1:-1].reshape(-1)
+    whole = holes_filled(known)
+    depth = _depth_px(whole).reshape(-1)
     calls = detector.find(cloud, _only(evidence, behind(evidence)), threshold)
     along = [call for call in calls if depth[call.pixels].min() <= 1.5 and depth[call.pixels].max() <= RIM_PX]
     if len(along) < RIM_CALLS or (~whole).sum() == 0:
-        return none
+        return np.zeros(known.shape, bool)
     reach = max(float(depth[call.pixels].max()) for call in along)
-    return np.asarray((depth.reshape(none.shape) <= reach) & known)
+    return np.asarray((depth.reshape(known.shape) <= reach) & known)
 
 
 def _only(evidence: Evidence, where: np.ndarray) -> Evidence:
-    """The evidence with an opinion only ``where`` (h, w)."""
+    """Return the evidence with an opinion only ``where`` (h, w)."""
     return replace(evidence, score=np.where(where, evidence.score, np.nan))
-
-
-def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)

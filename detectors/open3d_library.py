@@ -9,7 +9,7 @@ from typing import Any
 from harness.vocabulary.errors import UserError
 
 DEBIAN_PACKAGES = {"libGL": "libgl1", "libgomp": "libgomp1", "libX11": "libx11-6", "libudev": "libudev1"}
-"""Where Debian keeps the system libraries that Open3D's wheel expects."""
+"""Debian's packages of the system libraries that Open3D's wheel expects."""
 
 
 class MissingLibrary(UserError):
@@ -17,7 +17,8 @@ class MissingLibrary(UserError):
 
 
 def load_open3d() -> Any:
-    """The module open3d. Raises MissingLibrary that names the Debian package where a system library is missing."""
+    """Return the module open3d. Raises MissingLibrary that names the Debian package where a system library is
+    missing."""
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -34,7 +35,7 @@ def load_open3d() -> Any:
 
 @contextmanager
 def open3d_on_one_thread() -> Iterator[Any]:
-    """The module open3d, silent and on one OpenMP thread within the block: sums in one order, hence the same bits
+    """Give the module open3d, silent and on one OpenMP thread within the block: sums in one order, hence the same bits
     whatever the number of cores. Raises MissingLibrary where it cannot start.
 
     On pictures of a target's size a second thread gains nothing, and loses tenfold where cores are shared.

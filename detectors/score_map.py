@@ -1,25 +1,27 @@
-"""The easy way to a detector: say how every pixel scores, and clusters, quiet threshold and sizes follow."""
+"""The easy way to a detector: score every pixel, and clusters, quiet threshold and sizes follow."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 from pydantic import Field
 
+from detectors.clusters import cluster_centres, euclidean_clusters
 from detectors.interface import Detection, Evidence, Measurement
+from detectors.masks import on_grid as on_grid
 from detectors.measure import HoleModelConfig, extents, measure_detection
-from detectors.segment import cluster_centres, euclidean_clusters
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.units import MM
 
 
 class ScoreMapConfig(Config):
-    """What turns a score map into findings. Pixels above the threshold that a chain of steps no longer than
+    """Settings that turn a score map into findings. Pixels above the threshold that a chain of steps no longer than
     ``cluster_distance_mm`` joins are one finding; those with fewer than ``min_points`` are none."""
 
     min_points: int = Field(default=1, ge=1)
@@ -47,7 +49,7 @@ class ScoreMapDetector(ABC, Generic[S]):
         """Score every pixel. Raises UserError where the cloud cannot be judged (empty crop, too few points)."""
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        """Clusters of pixels whose score is above the threshold, strongest first."""
+        """Return clusters of pixels whose score is above the threshold, strongest first."""
         pixels = above(evidence, threshold)
         labels = self._clusters(cloud, pixels)
         by_label = np.argsort(labels, kind="stable")
@@ -57,25 +59,26 @@ class ScoreMapDetector(ABC, Generic[S]):
         return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
 
     def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
-        """Where the findings at each of the thresholds lie, (m, 3): in one pass, unless a subclass finds its own way.
+        """Return the centres (m, 3) of the findings at each of the thresholds: in one pass, unless a subclass finds its
+        own way.
 
         Implements `detectors.interface.FindsAtOnce`. Of findings with equal strength the order may not be `find`'s.
         """
         own = type(self)
         if (own.find, own._detection, own._clusters) != _FINDING:
-            found = (self.find(cloud, evidence, float(threshold)) for threshold in thresholds)
-            return tuple(np.array([one.centre_m for one in each]).reshape(-1, 3) for each in found)
+            at_each = (self.find(cloud, evidence, float(threshold)) for threshold in thresholds)
+            return tuple(np.array([found.centre_m for found in each]).reshape(-1, 3) for each in at_each)
         distance_m, min_points = self.settings.cluster_distance_mm * MM, self.settings.min_points
         points, scores = cloud.points_m.reshape(-1, 3), evidence.score.reshape(-1)
         pixels = above(evidence, min(thresholds, default=np.inf))
         return cluster_centres(points[pixels], scores[pixels], np.asarray(thresholds, float), distance_m, min_points)
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """The lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
+        """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
         return self._strength(cloud, evidence, above(evidence, 0.0))
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-        """The thesis' extents, and the model of a blurred hole."""
+        """Measure the thesis' extents, and the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
 
     def _detection(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> Detection:
@@ -87,50 +90,36 @@ class ScoreMapDetector(ABC, Generic[S]):
         return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
 
     def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
-        """The lowest threshold at which no cluster of ``min_points`` is left among these pixels.
+        """Return the lowest threshold at which no cluster of ``min_points`` is left among these pixels.
 
         Raising the threshold only takes points away and only splits clusters, so the answer is the score of the point,
         in falling order, that completes the first cluster: found by doubling and bisection.
         """
-        if len(pixels) < self.settings.min_points:
+        least = self.settings.min_points
+        if len(pixels) < least:
             return 0.0
         scores = evidence.score.reshape(-1)[pixels]
-        if self.settings.min_points == 1:
+        if least == 1:
             return float(scores.max())
         falling = np.argsort(-scores, kind="stable")
 
         def completes(count: int) -> bool:
             return bool((self._clusters(cloud, pixels[falling[:count]]) >= 0).any())
 
-        count = _first_true(completes, self.settings.min_points, len(pixels))
-        return 0.0 if count is None else float(scores[falling[count - 1]])
+        low = high = least
+        while not completes(high):
+            if high == len(pixels):
+                return 0.0
+            low, high = high + 1, min(2 * high, len(pixels))
+        count = bisect_left(range(high), True, lo=low, key=completes)
+        return float(scores[falling[count - 1]])
 
 
 _FINDING = (ScoreMapDetector.find, ScoreMapDetector._detection, ScoreMapDetector._clusters)
-"""What `ScoreMapDetector.centres_at` does in one pass."""
+"""Methods that `ScoreMapDetector.centres_at` stands for in one pass."""
 
 
 def above(evidence: Evidence, threshold: float) -> np.ndarray:
-    """Flat indices, ascending, of the pixels whose score exceeds the threshold."""
+    """Return the flat indices, ascending, of the pixels whose score exceeds the threshold."""
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(evidence.score.reshape(-1) > threshold)
-
-
-def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(h, w) image with the values (n,) where the mask (h, w) is true, in its order, and NaN elsewhere."""
-    image = np.full(mask.shape, np.nan)
-    image[mask] = values
-    return image
-
-
-def _first_true(test: Callable[[int], bool], low: int, high: int) -> int | None:
-    """The least n in low..high at which a test that never turns false again is true; None if it never is."""
-    trial = low
-    while not test(trial):
-        if trial == high:
-            return None
-        low, trial = trial + 1, min(2 * trial, high)
-    while low < trial:
-        middle = (low + trial) // 2
-        low, trial = (low, middle) if test(middle) else (middle + 1, trial)
-    return trial

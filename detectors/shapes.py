@@ -14,29 +14,30 @@ from functools import lru_cache
 
 import numba
 import numpy as np
+from scipy import sparse
 from scipy.linalg import eigh, solveh_banded
 
 from detectors import surface_kernels as kernels
+from detectors.surface import Scaling
 
 Fit = Callable[[np.ndarray], np.ndarray]
 """Measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
 RIDGE = 1e-9
-"""Of the largest diagonal element: keeps normal equations regular where the points do not determine a coefficient."""
+"""Share of the largest diagonal element that is added to each: keeps normal equations regular where the points do not
+determine a coefficient."""
 KNOTS_PER_WAVELENGTH = 4.0
 """Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the penalty in charge."""
 MOST_KNOTS = 64
-"""Along one side: a limit to time and memory; the free form is then smoother than asked for."""
+"""Most knots along one side: a limit to time and memory; the free form is then smoother than asked for."""
 
 
 def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
-    """Weighted least squares in Chebyshev products of total degree ``degree``; regular for any points."""
+    """Fit Chebyshev products of total degree ``degree`` by weighted least squares; regular for any points."""
     powers = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)], dtype=np.int64)
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    middle, half, level = (low + high) / 2, np.maximum((high - low) / 2, 1e-9), float(points[:, 2].mean())
+    scaling, level = Scaling.of(points[:, 0], points[:, 1]), float(points[:, 2].mean())
 
     def scaled(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        u, v = ((p[:, :2] - middle) / half).T
-        return np.ascontiguousarray(u), np.ascontiguousarray(v)
+        return scaling(p[:, 0], p[:, 1])
 
     basis = kernels.chebyshev_basis(*scaled(points), powers)
     gram, right = kernels.weighted_gram(basis, np.ascontiguousarray(points[:, 2] - level), weights)
@@ -50,18 +51,30 @@ def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
 
 
 def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
-    """The quadric with the least weighted squares of distances along the rays, to first order: Taubin's algebraic fit
-    (1991) along the rays, then Gauss-Newton steps. None where the points lie on no single sheet of it.
+    """Fit the quadric with the least weighted squares of distances along the rays, to first order: Taubin's algebraic
+    fit (1991) along the rays, then Gauss-Newton steps. None where the points lie on no single sheet of it.
 
     ``central``: rays leave the origin; else they are parallel to z.
     """
     middle = np.average(points, axis=0, weights=weights)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
-    p = (points - middle) / size
+    scaled = (points - middle) / size
     along = (points / points[:, 2:] if central else np.broadcast_to([0.0, 0.0, 1.0], points.shape)) / size
-    terms = _quadric_terms(p)
-    slopes = _quadric_slopes(p, along)
-    c = _taubin(terms, slopes, weights)
+    x, y, z = scaled.T
+    terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, np.ones_like(x)], axis=1)
+    (dx, dy, dz), zero = along.T, np.zeros_like(x)
+    products = [2 * x * dx, 2 * y * dy, 2 * z * dz, x * dy + y * dx, x * dz + z * dx, y * dz + z * dy]
+    slopes = np.stack([*products, dx + zero, dy + zero, dz + zero, zero], axis=1)
+
+    # Taubin's fit: the least sum of F^2 for a given sum of (dF/dray)^2
+    means = np.average(terms[:, :9], axis=0, weights=weights)
+    centred = terms[:, :9] - means
+    squares = centred.T @ (weights[:, None] * centred)
+    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
+    sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
+    algebraic = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
+    c = np.append(algebraic, -means @ algebraic)
+    c /= np.linalg.norm(c)
     for _ in range(4):
         steep = slopes @ c
         sheet = np.sign(np.average(np.sign(steep), weights=weights)) or 1.0
@@ -86,33 +99,8 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
     return z_at
 
 
-def _quadric_terms(p: np.ndarray) -> np.ndarray:
-    x, y, z = p.T
-    return np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, np.ones_like(x)], axis=1)
-
-
-def _quadric_slopes(p: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Derivative of each term along the directions ``d`` (n, 3)."""
-    (x, y, z), (a, b, c) = p.T, d.T
-    zero = np.zeros_like(x)
-    products = [2 * x * a, 2 * y * b, 2 * z * c, x * b + y * a, x * c + z * a, y * c + z * b]
-    return np.stack([*products, a + zero, b + zero, c + zero, zero], axis=1)
-
-
-def _taubin(terms: np.ndarray, slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(10,) the least sum of F^2 for a given sum of (dF/dray)^2."""
-    means = np.average(terms[:, :9], axis=0, weights=weights)
-    centred = terms[:, :9] - means
-    squares = centred.T @ (weights[:, None] * centred)
-    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
-    sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
-    c = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
-    full = np.append(c, -means @ c)
-    return np.asarray(full / np.linalg.norm(full))
-
-
 def _crossing(c: np.ndarray, start: np.ndarray, ray: np.ndarray, sheet: float) -> np.ndarray:
-    """t at which start + t ray meets the quadric where F grows along the ray with the sign ``sheet``; NaN if never."""
+    """Return t at which start + t ray meets the quadric where F grows along the ray with the sign ``sheet``, or NaN."""
     matrix = np.array([[c[0], c[3] / 2, c[4] / 2], [c[3] / 2, c[1], c[5] / 2], [c[4] / 2, c[5] / 2, c[2]]])
     linear = c[6:9]
     a = np.einsum("ni,ij,nj->n", ray, matrix, ray)
@@ -128,7 +116,7 @@ def _crossing(c: np.ndarray, start: np.ndarray, ray: np.ndarray, sheet: float) -
 
 
 def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: float, cell: float, central: bool) -> Fit:
-    """A base shape plus a smooth correction of z: tensor-product cubic B-splines in the picture's plane with a penalty
+    """Fit a base shape plus a smooth correction of z: tensor-product cubic B-splines in the picture's plane, penalised
     on third derivatives (Eilers and Marx 1996, in two dimensions).
 
     ``wavelength``: waves of this length pass by half, shorter ones less (as its sixth power); in units of x/z (central)
@@ -154,7 +142,7 @@ def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: fl
 
 
 def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
-    """(n, 2) x/z and y/z, or x and y where rays are parallel."""
+    """Return (n, 2) x/z and y/z, or x and y where rays are parallel."""
     return points[:, :2] / points[:, 2:] if central else points[:, :2]
 
 
@@ -175,7 +163,7 @@ def _splines(x: float, count: int, values: np.ndarray) -> int:
 def _spline_gram(
     places: np.ndarray, z: np.ndarray, weights: np.ndarray, low: np.ndarray, spacing: float, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Upper bands (3 counts[1] + 4, counts[0] counts[1]), as LAPACK wants them, of B' W B; and B' W z."""
+    """Return the upper bands (3 counts[1] + 4, counts[0] counts[1]), as LAPACK wants them, of B' W B; and B' W z."""
     size, width = counts[0] * counts[1], 3 * counts[1] + 3
     banded, right = np.zeros((width + 1, size)), np.zeros(size)
     x, y, value, number = np.empty(4), np.empty(4), np.empty(16), np.empty(16, np.int64)
@@ -200,7 +188,7 @@ def _spline_gram(
 def _spline_sum(
     places: np.ndarray, coefficients: np.ndarray, low: np.ndarray, spacing: float, counts: np.ndarray
 ) -> np.ndarray:
-    """(n,) the splines' sum; beyond their edge the value at the edge."""
+    """Return the splines' sum (n,); beyond their edge the value at the edge."""
     total = np.zeros(len(places))
     x, y = np.empty(4), np.empty(4)
     for n in range(len(places)):
@@ -214,31 +202,18 @@ def _spline_sum(
 
 @lru_cache(maxsize=32)
 def _penalty(rows: int, columns: int, width: int) -> np.ndarray:
-    """Upper bands of the sum of squared third differences of (rows, columns) coefficients, mixed ones three times."""
-    steps = (rows, columns)
+    """Return the upper bands of the sum of squared third differences of (rows, columns) coefficients, mixed ones three
+    times."""
+
+    def squared(count: int, order: int) -> np.ndarray:
+        differences = np.diff(np.eye(count), order, axis=0)
+        return np.asarray(differences.T @ differences)
+
+    penalty = sum(
+        factor * sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr")
+        for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
+    )
+    upper = sparse.coo_array(sparse.triu(penalty))
     banded = np.zeros((width + 1, rows * columns))
-    products = [[_squared_differences(count, order) for order in range(4)] for count in steps]
-    for order, factor in enumerate((1.0, 3.0, 3.0, 1.0)):
-        down, across = products[0][order], products[1][3 - order]
-        for i in range(4):
-            for j in range(-3, 4):
-                if i * columns + j < 0:
-                    continue
-                entries = factor * np.outer(_diagonal(down, i), _diagonal(across, j))
-                offset = i * columns + j
-                banded[width - offset, offset:] += entries.ravel()[: rows * columns - offset]
+    banded[width + upper.row - upper.col, upper.col] = upper.data
     return banded
-
-
-def _squared_differences(count: int, order: int) -> np.ndarray:
-    differences = np.diff(np.eye(count), order, axis=0)
-    return np.asarray(differences.T @ differences)
-
-
-def _diagonal(matrix: np.ndarray, offset: int) -> np.ndarray:
-    """(n,) the elements (k, k + offset), 0 where there is none."""
-    padded = np.zeros(len(matrix))
-    elements = np.diagonal(matrix, offset)
-    start = max(0, -offset)
-    padded[start : start + len(elements)] = elements
-    return padded

@@ -9,15 +9,13 @@ robust fit by about a third of a sigma.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from detectors import surface_kernels as kernels
-from detectors.lar_kernels import lar_stage, lower_factor
-from detectors.triangular import solved
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 
@@ -32,7 +30,7 @@ With 35 % damage a start of 10 points is clean with probability 0.65^10 = 1.3 %,
 LTS_COVERAGE = 0.55
 """Fraction of points that the fit must explain: up to 45 % damage is survived."""
 SEED = 20201102
-"""Of the elemental starts: fixed, so that the same cloud gives the same surface."""
+"""Seed of the elemental starts: fixed, so that the same cloud gives the same surface."""
 LAR_SAMPLE, LAR_THINNING = 2048, 12
 """Points below which LAR starts from least squares, and the thinning that gives the start above it."""
 BISQUARE_CONVERGED = 1e-2
@@ -61,24 +59,41 @@ class SurfaceConfig(Config):
 
 
 @dataclass(frozen=True)
+class Scaling:
+    """Map of x and y, each between its extremes, to [-1, 1]."""
+
+    x_middle_m: float
+    x_half_m: float
+    y_middle_m: float
+    y_half_m: float
+
+    @classmethod
+    def of(cls, x_m: np.ndarray, y_m: np.ndarray) -> Scaling:
+        """Return the map for places of which no two need differ."""
+        (x0, x1), (y0, y1) = (x_m.min(), x_m.max()), (y_m.min(), y_m.max())
+        return cls((x0 + x1) / 2, max((x1 - x0) / 2, TINY_M), (y0 + y1) / 2, max((y1 - y0) / 2, TINY_M))
+
+    def __call__(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return scaled x and y."""
+        return (x_m - self.x_middle_m) / self.x_half_m, (y_m - self.y_middle_m) / self.y_half_m
+
+
+@dataclass(frozen=True)
 class Surface:
     """A fitted surface. ``powers`` (p, 2) Chebyshev orders in scaled x and y, ``coefficients`` (p,) metres."""
 
     coefficients: np.ndarray
     powers: np.ndarray
-    x_middle_m: float
-    x_half_m: float
-    y_middle_m: float
-    y_half_m: float
+    scaling: Scaling
     method: str
     iterations: int
     converged: bool
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """z in metres at x, y of any equal shape; NaN where they are NaN. Extrapolates as polynomials do: badly."""
+        """Return z in metres at x, y of one shape; NaN where they are NaN. Extrapolates as polynomials do: badly."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
-        u, v = _scaled(x.ravel(), y.ravel(), self)
+        u, v = self.scaling(x.ravel(), y.ravel())
         return kernels.chebyshev_sum(u, v, self.powers, self.coefficients).reshape(x.shape)
 
 
@@ -91,56 +106,41 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
 
     Raises UserError where there are fewer points than coefficients, or where all points lie on a line.
     """
-    powers = _powers(config)
-    _check_points(len(z_m), len(powers), config)
-    x, y, z = (np.ascontiguousarray(a, dtype=np.float64) for a in (x_m, y_m, z_m))
-    blank = _blank_surface(x, y, powers, config)
-    basis = kernels.chebyshev_basis(*_scaled(x, y, blank), powers)
-    middle = float(np.median(z[:: max(1, len(z) // SAMPLE_POINTS)]))
-    problem = _Problem.of(basis, z - middle, config)
-    solve = {"least_squares": _least_squares, "lar": _lar, "bisquare": _bisquare, "lts": _lts_bisquare}[config.method]
-    solution = solve(problem)
-    coefficients = solution.coefficients.copy()
-    coefficients[0] += middle
-    return replace(
-        blank,
-        coefficients=coefficients,
-        iterations=solution.iterations,
-        converged=solution.converged,
-        note=solution.note,
-    )
-
-
-def _powers(config: SurfaceConfig) -> np.ndarray:
-    """(p, 2) orders (i, j) with i + j <= degree; only those with i = 0 or j = 0 where cross terms are dropped.
-
-    The separable polynomials f(x) + g(y) stay separable under scaling of each axis, so dropping the terms here and in
-    metres is the same.
-    """
+    # separable polynomials f(x) + g(y) stay separable under scaling of each axis: dropping cross terms here and in
+    # metres is the same
     top = range(config.degree + 1)
     pairs = [(i, j) for i in top for j in top if i + j <= config.degree and not (config.drop_cross_terms and i and j)]
-    return np.array(sorted(pairs, key=lambda p: (p[0] + p[1], -p[0])), dtype=np.int64)
-
-
-def _check_points(points: int, terms: int, config: SurfaceConfig) -> None:
-    if points < terms:
+    powers = np.array(sorted(pairs, key=lambda p: (p[0] + p[1], -p[0])), dtype=np.int64)
+    if len(z_m) < len(powers):
         raise UserError(
-            f"{points} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}",
-            legal=f"at least {terms} points, and many more to be useful",
+            f"{len(z_m)} valid points cannot determine the {len(powers)} coefficients of a surface of degree"
+            f" {config.degree}",
+            legal=f"at least {len(powers)} points, and many more to be useful",
             fix="widen the crop, lower surface.degree, or check the capture",
         )
-
-
-def _blank_surface(x: np.ndarray, y: np.ndarray, powers: np.ndarray, config: SurfaceConfig) -> Surface:
-    (x0, x1), (y0, y1) = (x.min(), x.max()), (y.min(), y.max())
-    halves = (max((x1 - x0) / 2, TINY_M), max((y1 - y0) / 2, TINY_M))
-    return Surface(
-        np.zeros(len(powers)), powers, (x0 + x1) / 2, halves[0], (y0 + y1) / 2, halves[1], config.method, 0, False, ""
-    )
-
-
-def _scaled(x: np.ndarray, y: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    return (x - surface.x_middle_m) / surface.x_half_m, (y - surface.y_middle_m) / surface.y_half_m
+    x, y, z = (np.ascontiguousarray(a, dtype=np.float64) for a in (x_m, y_m, z_m))
+    scaling = Scaling.of(x, y)
+    basis = kernels.chebyshev_basis(*scaling(x, y), powers)
+    middle = float(np.median(z[:: max(1, len(z) // SAMPLE_POINTS)]))
+    problem = _Problem.of(basis, z - middle)
+    if problem is None:
+        raise UserError(
+            f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
+            fix="widen the crop, or lower surface.degree",
+        )
+    if config.method == "lar":
+        solution = _lar(problem)
+    elif config.method == "bisquare":
+        solution = _bisquare(problem, None, "bisquare from a least-squares start")
+    elif config.method == "lts":
+        start = _lts_start(problem.sample(LTS_SAMPLE) or problem)
+        solution = _bisquare(problem, start, "bisquare from a FAST-LTS start")
+    else:
+        solution = _Solution(problem.least_squares, 1, True, "least squares")
+    coefficients = solution.coefficients.copy()
+    coefficients[0] += middle
+    method, iterations, converged = config.method, solution.iterations, solution.converged
+    return Surface(coefficients, powers, scaling, method, iterations, converged, solution.note)
 
 
 @dataclass(frozen=True)
@@ -153,54 +153,44 @@ class _Solution:
 
 @dataclass(frozen=True)
 class _Problem:
-    """``basis`` (p, n), ``z`` (n,), the plain Gram matrix and its Cholesky factor."""
+    """``basis`` (p, n), ``z`` (n,), the Cholesky factor of the plain Gram matrix, the least-squares solution (p,)."""
 
     basis: np.ndarray
     z: np.ndarray
-    gram: np.ndarray
-    right: np.ndarray
     factor: np.ndarray
+    least_squares: np.ndarray
 
     @classmethod
-    def of(cls, basis: np.ndarray, z: np.ndarray, config: SurfaceConfig) -> _Problem:
-        gram, right = kernels.weighted_gram(basis, z, np.ones(len(z)))
-        factor = _cholesky(gram)
-        if factor is None:
-            raise UserError(
-                f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
-                fix="widen the crop, or lower surface.degree",
-            )
-        return cls(basis, z, gram, right, factor)
+    def of(cls, basis: np.ndarray, z: np.ndarray) -> _Problem | None:
+        """None where the points do not determine the coefficients to working precision."""
+        found = _weighted(basis, z, np.ones(len(z)))
+        return None if found is None else cls(basis, z, *found)
 
     def sample(self, points: int) -> _Problem | None:
-        """The same problem on about ``points`` of its points; None where it has few or the sample is degenerate."""
+        """Return the problem on about ``points`` of its points; None where it has few or the sample is degenerate."""
         stride = len(self.z) // points
         if stride < 2:
             return None
-        basis, z = np.ascontiguousarray(self.basis[:, ::stride]), np.ascontiguousarray(self.z[::stride])
-        gram, right = kernels.weighted_gram(basis, z, np.ones(len(z)))
-        factor = _cholesky(gram)
-        return None if factor is None else _Problem(basis, z, gram, right, factor)
+        return _Problem.of(np.ascontiguousarray(self.basis[:, ::stride]), np.ascontiguousarray(self.z[::stride]))
 
     def residuals(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return z less the surface (n,)."""
         return kernels.residuals(self.basis, self.z, coefficients)
 
 
-def _cholesky(gram: np.ndarray) -> np.ndarray | None:
-    """Lower factor, None where the matrix is singular to working precision."""
-    factor, regular = lower_factor(gram)
-    return factor if regular else None
-
-
-def _least_squares(problem: _Problem) -> _Solution:
-    return _Solution(solved(problem.factor, problem.right), 1, True, "least squares")
+def _weighted(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the Cholesky factor of the weighted Gram matrix and the weighted solution (p,); None where singular."""
+    gram, right = kernels.weighted_gram(basis, z, weights)
+    factor, regular = kernels.lower_factor(gram)
+    return (factor, kernels.solved(factor, right)) if regular else None
 
 
 # ---------------------------------------------------------------- least absolute residuals
 
 
 def _lar(problem: _Problem) -> _Solution:
-    """The L1 solution by smoothing (Madsen and Nielsen 1993): Huber's function with a knee that shrinks, by Newton.
+    """Find the L1 solution by smoothing (Madsen and Nielsen 1993): Huber's function with a knee that shrinks, by
+    Newton.
 
     The sub-gradient of the smoothed optimum is feasible for the dual linear program, so the gap to the least possible
     sum of |r| is known, not guessed. Most points keep the sign of their residual: they enter as one constant vector,
@@ -209,19 +199,18 @@ def _lar(problem: _Problem) -> _Solution:
     """
     terms, n = problem.basis.shape
     sample = problem.sample(max(LAR_SAMPLE, n // LAR_THINNING))
-    if sample is None:
-        c = _least_squares(problem).coefficients
-        margin = np.inf
-    else:
-        c = _lar(sample).coefficients
+    c, margin, knees = problem.least_squares, np.inf, np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])
+    if sample is not None:
+        c, knees = _lar(sample).coefficients, knees[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(terms / len(sample.z))
     r = problem.residuals(c)
-    scale = max(_median_size(r), TINY_M)
+    scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
     iterations, gap = 0, np.inf
-    for knee in scale * np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])[0 if sample is None else 2 :]:
+    for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
-        c, r, spent = lar_stage(problem.basis, problem.z, c, r, max(margin * scale, 10.0 * knee), knee, enough)
+        reach = max(margin * scale, 10.0 * knee)
+        c, r, spent = kernels.lar_stage(problem.basis, problem.z, c, r, reach, knee, enough)
         iterations += spent
         margin = min(margin, 5.0 * knee / scale)
         _, lost, _ = kernels.huber_state(r, knee)
@@ -232,78 +221,64 @@ def _lar(problem: _Problem) -> _Solution:
     return _Solution(c, iterations, gap <= GAP_CONVERGED, note)
 
 
-def _median_size(r: np.ndarray) -> float:
-    return float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)])))
-
-
 # ---------------------------------------------------------------- bisquare
 
 
-def _bisquare(problem: _Problem) -> _Solution:
-    return _bisquare_from(problem, None, "bisquare from a least-squares start")
-
-
-def _bisquare_from(problem: _Problem, start: np.ndarray | None, note: str) -> _Solution:
-    """Iteratively reweighted least squares with MATLAB's robustfit semantics, on a sample first, then on all points."""
+def _bisquare(problem: _Problem, start: np.ndarray | None, note: str) -> _Solution:
+    """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points; from the
+    least-squares solution where no ``start`` is given."""
     sample = problem.sample(SAMPLE_POINTS)
-    if start is None:
-        start = _least_squares(problem if sample is None else sample).coefficients
-    coarse = 0
-    if sample is not None:
-        inner = _reweighted(sample, start, 50, note)
-        start, coarse = inner.coefficients, inner.iterations
-    full = _reweighted(problem, start, 50 if sample is None else 8, note)
-    return _Solution(full.coefficients, coarse + full.iterations, full.converged, note)
+    if sample is None:
+        return _reweighted(problem, problem.least_squares if start is None else start, 50, note)
+    inner = _reweighted(sample, sample.least_squares if start is None else start, 50, note)
+    full = _reweighted(problem, inner.coefficients, 8, note)
+    return _Solution(full.coefficients, inner.iterations + full.iterations, full.converged, note)
 
 
 def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> _Solution:
     inverse = np.linalg.inv(problem.factor)
     leverage = np.minimum(kernels.leverages(problem.basis, inverse), 0.9999)
     adjust = 1.0 / np.sqrt(1.0 - leverage)
-    c = start
+    c, terms = start, len(start)
     for step in range(1, steps + 1):
         adjusted = problem.residuals(c) * adjust
-        scale = _mad_scale(adjusted, len(c))
-        weights = kernels.bisquare_weights(adjusted, BISQUARE_TUNING * scale)
-        gram, right = kernels.weighted_gram(problem.basis, problem.z, weights)
-        factor = _cholesky(gram)
-        if factor is None:
+        # MATLAB's robust sigma: median of |r| without as many of the smallest as there are terms, over 0.6745
+        sizes = np.abs(adjusted)
+        place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
+        scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
+        found = _weighted(problem.basis, problem.z, kernels.bisquare_weights(adjusted, BISQUARE_TUNING * scale))
+        if found is None:
             return _Solution(c, step, False, note + "; stopped: too few points kept weight")
-        new = solved(factor, right)
+        factor, new = found
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
-        if moved < BISQUARE_CONVERGED * np.sqrt(len(c)):
+        if moved < BISQUARE_CONVERGED * np.sqrt(terms):
             return _Solution(c, step, True, note)
     return _Solution(c, steps, False, note)
-
-
-def _mad_scale(r: np.ndarray, terms: int) -> float:
-    """MATLAB's robust sigma: median of |r| without the ``terms`` smallest, over 0.6745."""
-    sizes = np.abs(r)
-    position = terms - 1 + (len(sizes) - terms + 1) // 2
-    return max(
-        float(np.partition(sizes, min(position, len(sizes) - 1))[min(position, len(sizes) - 1)]) / 0.6745, TINY_M
-    )
 
 
 # ---------------------------------------------------------------- least trimmed squares
 
 
-def _lts_bisquare(problem: _Problem) -> _Solution:
-    """Bisquare from a FAST-LTS start (Rousseeuw and Van Driessen 2006)."""
-    start = _lts_start(problem.sample(LTS_SAMPLE) or problem)
-    return _bisquare_from(problem, start, "bisquare from a FAST-LTS start")
-
-
 def _lts_start(problem: _Problem) -> np.ndarray:
+    """Return FAST-LTS's coefficients (p,) (Rousseeuw and Van Driessen 2006): concentration steps from elemental starts
+    on few points, the best of them carried on to all."""
     random = np.random.default_rng(SEED)
     terms, n = problem.basis.shape
     small = problem.sample(LTS_SMALL) or problem
-    picks = np.argsort(random.random((LTS_STARTS, len(small.z))), axis=1)[:, :terms]
-    solutions, sums = kernels.lts_starts(small.basis, small.z, picks, _kept(len(small.z), terms), 2)
-    best = np.argsort(sums, kind="stable")[:LTS_KEPT]
-    finalists = [_concentrate(problem, solutions[i], _kept(n, terms)) for i in best]
+    points = len(small.z)
+    picks = np.argsort(random.random((LTS_STARTS, points)), axis=1)[:, :terms]
+    kept, ridge = _kept(points, terms), 1e-12 * np.eye(terms)
+    c = np.linalg.solve(small.basis.T[picks] + ridge, small.z[picks][..., None])[..., 0]
+    for _ in range(2):
+        squares = (small.z - c @ small.basis) ** 2
+        chosen = squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept]
+        weighted = chosen[:, None, :] * small.basis
+        gram, right = weighted @ small.basis.T + points * ridge, weighted @ small.z
+        c = np.linalg.solve(gram, right[..., None])[..., 0]
+    sums = np.partition((small.z - c @ small.basis) ** 2, kept - 1, axis=1)[:, :kept].sum(axis=1)
+    finalists = [_concentrate(problem, c[i], _kept(n, terms)) for i in np.argsort(sums, kind="stable")[:LTS_KEPT]]
     return min(finalists, key=lambda finalist: finalist[1])[0]
 
 
@@ -312,19 +287,17 @@ def _kept(points: int, terms: int) -> int:
 
 
 def _concentrate(problem: _Problem, c: np.ndarray, kept: int) -> tuple[np.ndarray, float]:
-    """Concentration steps until the sum of the ``kept`` smallest squares stays: (coefficients, sum)."""
+    """Take concentration steps until the sum of the ``kept`` smallest squares stays: (coefficients, sum)."""
     best = np.inf
     for _ in range(30):
         squares = problem.residuals(c) ** 2
-        limit = np.partition(squares, kept - 1)[kept - 1]
-        chosen = squares <= limit
+        chosen = squares <= np.partition(squares, kept - 1)[kept - 1]
         total = float(squares[chosen].sum())
         if total >= best * (1.0 - 1e-9):
             break
         best = total
-        gram, right = kernels.weighted_gram(problem.basis, problem.z, chosen.astype(np.float64))
-        factor = _cholesky(gram)
-        if factor is None:
+        found = _weighted(problem.basis, problem.z, chosen.astype(np.float64))
+        if found is None:
             break
-        c = solved(factor, right)
+        c = found[1]
     return c, best

@@ -1,4 +1,6 @@
-"""Compiled inner loops of the surface fit: basis functions, weighted Gram matrices, weights.
+"""Compiled inner loops of the surface fit: basis functions, weighted Gram matrices, weights, and the descent of the
+least-absolute-residuals fit: Huber's function at one knee, by Newton's method (`detectors.surface` says why that ends
+at the L1 solution).
 
 Blocked over points so that a block of all basis functions stays in the first-level cache; one core.
 """
@@ -12,25 +14,14 @@ import numpy as np
 
 BLOCK = 256
 FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
-
-
-@numba.njit(cache=True, nogil=True)
-def columns_at(points: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and z, each (n,), of points (h, w, 3) where the mask (h, w) is true, in its order."""
-    n = mask.sum()
-    x, y, z = np.empty(n), np.empty(n), np.empty(n)
-    i = 0
-    for r in range(mask.shape[0]):
-        for c in range(mask.shape[1]):
-            if mask[r, c]:
-                x[i], y[i], z[i] = points[r, c, 0], points[r, c, 1], points[r, c, 2]
-                i += 1
-    return x, y, z
+PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
+LAR_STEPS = 60
+HALVINGS = 12
 
 
 @numba.njit(**FAST)
 def chebyshev_basis(u: np.ndarray, v: np.ndarray, powers: np.ndarray) -> np.ndarray:
-    """(p, n) products T_a(u) T_b(v) of Chebyshev polynomials for each row (a, b) of ``powers`` (p, 2)."""
+    """Return the products (p, n) T_a(u) T_b(v) of Chebyshev polynomials for each row (a, b) of ``powers`` (p, 2)."""
     terms, n = len(powers), len(u)
     top = powers.max() + 1
     basis = np.empty((terms, n))
@@ -59,7 +50,7 @@ def chebyshev_basis(u: np.ndarray, v: np.ndarray, powers: np.ndarray) -> np.ndar
 
 @numba.njit(**FAST)
 def chebyshev_sum(u: np.ndarray, v: np.ndarray, powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """(n,) coefficients times `chebyshev_basis`, without storing the basis."""
+    """Return the coefficients times `chebyshev_basis`, (n,), without storing the basis."""
     n = len(u)
     values = np.empty(n)
     for start in range(0, n, BLOCK):
@@ -75,7 +66,7 @@ def chebyshev_sum(u: np.ndarray, v: np.ndarray, powers: np.ndarray, coefficients
 
 @numba.njit(**FAST)
 def weighted_gram(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(B W B', B W z) of a basis (p, n), values (n,) and weights (n,)."""
+    """Return (B W B', B W z) of a basis (p, n), values (n,) and weights (n,)."""
     terms, n = basis.shape
     gram = np.zeros((terms, terms))
     right = np.zeros(terms)
@@ -105,7 +96,7 @@ def weighted_gram(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tupl
 
 @numba.njit(**FAST)
 def residuals(basis: np.ndarray, z: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """(n,) z less the surface."""
+    """Return z less the surface (n,)."""
     terms, n = basis.shape
     r = np.empty(n)
     for start in range(0, n, BLOCK):
@@ -122,7 +113,7 @@ def residuals(basis: np.ndarray, z: np.ndarray, coefficients: np.ndarray) -> np.
 
 @numba.njit(**FAST)
 def leverages(basis: np.ndarray, inverse_factor: np.ndarray) -> np.ndarray:
-    """(n,) diagonal of the hat matrix, b' (B B')^-1 b, from L^-1 of B B' = L L'."""
+    """Return the diagonal (n,) of the hat matrix, b' (B B')^-1 b, from L^-1 of B B' = L L'."""
     terms, n = basis.shape
     h = np.zeros(n)
     row = np.empty(BLOCK)
@@ -141,7 +132,7 @@ def leverages(basis: np.ndarray, inverse_factor: np.ndarray) -> np.ndarray:
 
 @numba.njit(**FAST)
 def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
-    """Tukey's weights (1 - (r / limit)^2)^2 inside the limit, 0 outside."""
+    """Return Tukey's weights (1 - (r / limit)^2)^2 inside the limit, 0 outside."""
     w = np.empty(len(r))
     for i in range(len(r)):
         u = r[i] / limit
@@ -152,7 +143,7 @@ def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
 
 @numba.njit(**FAST)
 def huber_state(r: np.ndarray, eps: float) -> tuple[float, float, int]:
-    """Smoothed L1 (Huber with knee eps), the duality gap of its sub-gradient, and the count inside the knee."""
+    """Return the smoothed L1 (Huber, knee eps), the duality gap of its sub-gradient, and the count inside the knee."""
     smooth = 0.0
     gap = 0.0
     inside = 0
@@ -170,7 +161,7 @@ def huber_state(r: np.ndarray, eps: float) -> tuple[float, float, int]:
 
 @numba.njit(**FAST)
 def signed_sum(basis: np.ndarray, r: np.ndarray, floor: float) -> np.ndarray:
-    """(p,) B s with s = sign(r) where |r| exceeds the floor and r / floor inside it."""
+    """Return B s (p,) with s = sign(r) where |r| exceeds the floor and r / floor inside it."""
     terms, n = basis.shape
     s = np.empty(BLOCK)
     total = np.zeros(terms)
@@ -189,7 +180,7 @@ def signed_sum(basis: np.ndarray, r: np.ndarray, floor: float) -> np.ndarray:
 
 @numba.njit(**FAST)
 def split(basis: np.ndarray, r: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points near the surface, |r| < margin, and the pull of the others.
+    """Split the points into those near the surface, |r| < margin, and the pull of the others.
 
     Returns the near points' indices (m,), their basis (p, m) and the sum of basis * sign(r) over the far points (p,).
     """
@@ -219,46 +210,116 @@ def split(basis: np.ndarray, r: np.ndarray, margin: float) -> tuple[np.ndarray, 
 
 @numba.njit(**FAST)
 def sides_changed(before: np.ndarray, after: np.ndarray, margin: float, knee: float) -> bool:
-    """Whether a point outside the margin before has crossed the surface, or come within the knee of it."""
+    """Return whether a point outside the margin before has crossed the surface, or come within the knee of it."""
     for i in range(len(before)):
         if abs(before[i]) >= margin and (before[i] * after[i] <= 0.0 or abs(after[i]) < knee):
             return True
     return False
 
 
-@numba.njit(cache=True, nogil=True)
-def lts_starts(
-    basis: np.ndarray, z: np.ndarray, picks: np.ndarray, kept: int, steps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Concentration steps from elemental starts: (s, p) coefficients and (s,) sums of the ``kept`` smallest squares.
+@numba.njit(**PLAIN)
+def lower_factor(gram: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return Cholesky's factor (p, p) of a symmetric matrix, and whether it is regular to working precision."""
+    n = len(gram)
+    factor = np.zeros((n, n))
+    least, most = np.inf, 0.0
+    for a in range(n):
+        for b in range(a + 1):
+            total = gram[a, b]
+            for k in range(b):
+                total -= factor[a, k] * factor[b, k]
+            if b < a:
+                factor[a, b] = total / factor[b, b]
+            elif total > 0.0:
+                factor[a, a] = np.sqrt(total)
+                least, most = min(least, factor[a, a]), max(most, factor[a, a])
+            else:
+                return factor, False
+    return factor, least > 1e-7 * most
 
-    ``picks`` (s, p) are the points of each start. A start whose points are degenerate gets an infinite sum.
+
+@numba.njit(**PLAIN)
+def solved(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return x (p,) of L L' x = right; ``factor`` (p, p) is the lower triangle L. A library's call takes longer than a
+    system of ten unknowns."""
+    x = right.copy()
+    for a in range(len(x)):
+        for k in range(a):
+            x[a] -= factor[a, k] * x[k]
+        x[a] /= factor[a, a]
+    for a in range(len(x) - 1, -1, -1):
+        for k in range(a + 1, len(x)):
+            x[a] -= factor[k, a] * x[k]
+        x[a] /= factor[a, a]
+    return x
+
+
+@numba.njit(**PLAIN)
+def _smoothed_descent(
+    basis: np.ndarray, z: np.ndarray, fixed_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
+) -> tuple[np.ndarray, int]:
+    """Minimise sum huber(r, knee) - c' fixed_pull: Newton, or where it fails a majorising step, which always descends:
+    (c, steps).
+
+    ``basis`` (p, n), ``z`` (n,), ``fixed_pull``, ``start`` (p,). Stops where a step promises or brings less than
+    ``enough``.
     """
-    starts, terms = picks.shape
-    solutions = np.zeros((starts, terms))
-    sums = np.full(starts, np.inf)
-    n = len(z)
-    for s in range(starts):
-        square = np.empty((terms, terms))
-        right = np.empty(terms)
-        for a in range(terms):
-            for b in range(terms):
-                square[a, b] = basis[b, picks[s, a]]
-            right[a] = z[picks[s, a]]
-        for a in range(terms):
-            square[a, a] += 1e-12
-        c = np.linalg.solve(square, right)
-        for _ in range(steps):
-            squares = residuals(basis, z, c) ** 2
-            limit = np.partition(squares, kept - 1)[kept - 1]
-            weights = np.empty(n)
-            for i in range(n):
-                weights[i] = 1.0 if squares[i] <= limit else 0.0
-            gram, moments = weighted_gram(basis, z, weights)
-            for a in range(terms):
-                gram[a, a] += 1e-12 * n
-            c = np.linalg.solve(gram, moments)
-        squares = residuals(basis, z, c) ** 2
-        solutions[s] = c
-        sums[s] = np.partition(squares, kept - 1)[:kept].sum()
-    return solutions, sums
+    c = start
+    r = residuals(basis, z, c)
+    value = huber_state(r, knee)[0] - np.sum(c * fixed_pull)
+    weights = np.empty(len(r))
+    for steps in range(1, LAR_STEPS + 1):
+        pull = signed_sum(basis, r, knee) + fixed_pull
+        for i in range(len(r)):
+            weights[i] = 1.0 if abs(r[i]) <= knee else 0.0
+        factor, regular = lower_factor(weighted_gram(basis, r, weights)[0] / knee)
+        lower = False
+        for majorising in (False, True):
+            if not majorising and regular:
+                step = solved(factor, pull)
+                if np.sum(step * pull) < enough:
+                    return c, steps
+            elif majorising:
+                # reweighted least squares: each |r| beyond the knee under its tangent parabola
+                for i in range(len(r)):
+                    weights[i] = 1.0 / max(abs(r[i]), knee)
+                step = np.linalg.lstsq(weighted_gram(basis, r, weights)[0], pull, 1e-12)[0]
+            else:
+                continue
+            # the first of the full, half, quarter ... step that lowers the value
+            for halvings in range(HALVINGS):
+                trial = c + step * 0.5**halvings
+                r_trial = residuals(basis, z, trial)
+                new = huber_state(r_trial, knee)[0] - np.sum(trial * fixed_pull)
+                lower = new < value
+                if lower:
+                    break
+            if lower:
+                break
+        if not lower or value - new < enough:
+            return c, steps
+        c, r, value = trial, r_trial, new
+    return c, LAR_STEPS
+
+
+@numba.njit(**PLAIN)
+def lar_stage(
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    r_start: np.ndarray,
+    margin: float,
+    knee: float,
+    enough: float,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the optimum at one knee: (coefficients (p,), residuals (n,), steps). Only points within the margin of the
+    start are iterated, the others pull as they did; the margin widens until no far point changes sides."""
+    steps = 0
+    while True:
+        near, part, far_pull = split(basis, r_start, margin)
+        c, spent = _smoothed_descent(part, z[near], far_pull, start, knee, enough)
+        r = residuals(basis, z, c)
+        steps += spent
+        if not sides_changed(r_start, r, margin, knee):
+            return c, r, steps
+        margin *= 3.0

@@ -1,4 +1,4 @@
-"""Which of a view's smooth surfaces is the target: the nearest large one, and how sure that is.
+"""The choice of the target among a view's smooth surfaces: the nearest large one, and how sure that is.
 
 Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
 through its hole, or they only meet. Each comparison gives odds that the one and not the other is the target; the
@@ -14,16 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from detectors.smooth_surfaces import (
-    CONTACT_MM,
-    CONTACT_SIGMAS,
-    Surfaces,
-    holes_filled,
-    inset,
-    nearest_pixel,
-    raster,
-    smooth_surfaces,
-)
+from detectors.masks import grown, holes_filled, inset, nearest_pixel
+from detectors.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import MM
@@ -31,7 +23,8 @@ from harness.vocabulary.units import MM
 DOUBTFUL_BELOW = 0.8
 """Probability of a comparison below which the choice is called doubtful."""
 CENTRE_SPREAD = 0.25
-"""Of the picture's width and height: standard deviation of the weight that pixels have. People aim at the target."""
+"""Standard deviation of the weight that pixels have, as a share of the picture's width and height. People aim at the
+target."""
 LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
 """Weight in the view at which a thing is as likely the target as the surface that it lies on, or stands far before."""
 OBSTACLE_AREA = 0.2
@@ -90,18 +83,10 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """Probability that a surface and not another is the target, and the reason for a doubt."""
-
-    probability: float
-    reason: str
-
-
-@dataclass(frozen=True)
 class Border:
-    """Where one surface borders on another. ``part``: of its outline. ``ahead``, ``back``: the parts of this border at
-    which the other lies behind, and before it, by more than `CONTACT_MM` and noise. ``behind_m``: how far behind, the
-    median of the former."""
+    """A surface's border on another. ``part``: of its outline. ``ahead``, ``back``: the parts of this border at which
+    the other lies behind, and before it, by more than `Surfaces.contact_m`. ``behind_m``: how far behind, the median of
+    the former."""
 
     part: float
     ahead: float
@@ -110,7 +95,7 @@ class Border:
 
     @property
     def stands_before(self) -> bool:
-        """Whether the border is a step behind which the other lies."""
+        """True where the border is a step behind which the other lies."""
         return bool(self.ahead >= STEP_PART and self.ahead > 2.0 * self.back)
 
 
@@ -118,64 +103,35 @@ class Border:
 
 
 def propose(cloud: Cloud, crease_deg: float, smooth_px: int, inset_px: int, wanted: int | None) -> Choice:
-    """The target of a cloud with a valid point: the proposal, or candidate number ``wanted``.
+    """Choose the target of a cloud with a valid point: the proposal, or candidate number ``wanted``.
 
     Raises UserError, with the candidates, where there is none of that number.
     """
-    if cloud.organised:
-        surfaces = smooth_surfaces(cloud, crease_deg, smooth_px)
-        candidates, warnings = choose(surfaces, cloud, wanted)
-        taken = _taken(candidates, wanted)
-        mask = candidates[taken - 1].outline & cloud.valid if candidates else np.zeros(cloud.valid.shape, bool)
-        return Choice(candidates, taken, inset(mask, inset_px), cloud, warnings)
-    grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
-    surfaces = smooth_surfaces(grid, crease_deg, max(3, 2 * round(smooth_px / spacings / 2) - 1))
-    candidates, warnings = choose(surfaces, grid, wanted)
-    taken = _taken(candidates, wanted)
-    kept = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
-    if inset_px:
+    grid, spacings = cloud, 1.0
+    if not cloud.organised:
+        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
+        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
         # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
-        kept = inset(kept, math.ceil((inset_px - 1) / spacings) + 1)
-    mask = cloud.valid.copy()
-    mask[mask] = kept[rows, columns]
+        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
+    candidates, warnings = _candidates(smooth_surfaces(grid, crease_deg, smooth_px), grid, wanted)
+    taken = wanted or 1
+    if wanted is not None and wanted > len(candidates):
+        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+        raise UserError(
+            f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
+            legal=f"1 to {len(candidates)}:{known}" if candidates else "none",
+            fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
+        )
+    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    mask = inset(mask, inset_px)
+    if not cloud.organised:
+        kept, mask = mask, cloud.valid.copy()
+        mask[mask] = kept[rows, columns]
     return Choice(candidates, taken, mask, grid, warnings)
 
 
-def _taken(candidates: tuple[Candidate, ...], wanted: int | None) -> int:
-    if wanted is None or wanted <= len(candidates):
-        return wanted or 1
-    known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
-    raise UserError(
-        f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
-        legal=f"1 to {len(candidates)}:{known}" if candidates else "none",
-        fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
-    )
-
-
-def choose(surfaces: Surfaces, grid: Cloud, wanted: int | None) -> tuple[tuple[Candidate, ...], tuple[str, ...]]:
-    """The candidates, best odds first, and what makes the first doubtful (nothing where the user chose)."""
-    count = len(surfaces.own)
-    described = [_described(surfaces, grid, number) for number in range(count)]
-    borders = [_borders(surfaces, grid, number) for number in range(count)]
-    judged = [
-        [_judged(described, borders, surfaces, i, j) if i != j else Judgement(1.0, "") for j in range(count)]
-        for i in range(count)
-    ]
-    odds = [sum(math.log(each.probability) for each in row) for row in judged]
-    order = sorted(range(count), key=lambda number: (-odds[number], number))
-    candidates = tuple(_without_others(described, judged, borders, surfaces, number) for number in order)
-    if wanted is not None or not order:
-        return candidates, ()
-    against = {place: judged[order[0]][other] for place, other in enumerate(order[1:], start=2)}
-    doubts = {place: each.reason for place, each in against.items() if each.probability < DOUBTFUL_BELOW}
-    if not doubts:
-        return candidates, ()
-    reasons = "; ".join(f"{reason} (--target {place} takes the other)" for place, reason in doubts.items())
-    return candidates, (f"it is doubtful which surface is the target: {reasons}",)
-
-
 def described_text(candidate: Candidate) -> str:
-    """Distance, extent, share of the view and tilt in words."""
+    """Return distance, extent, share of the view and tilt in words."""
     long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
     depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f} m"
     share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
@@ -185,51 +141,74 @@ def described_text(candidate: Candidate) -> str:
     )
 
 
-# ---------------------------------------------------------------- two surfaces
+def _candidates(surfaces: Surfaces, grid: Cloud, wanted: int | None) -> tuple[tuple[Candidate, ...], tuple[str, ...]]:
+    """Return the candidates, best odds first, and what makes the first doubtful (nothing where the user chose)."""
+    numbers = range(len(surfaces.own))
+    described = [_described(surfaces, grid, number) for number in numbers]
+    borders = [_borders(surfaces, grid, number) for number in numbers]
 
+    def before(front: int, back: int) -> tuple[float, str] | None:
+        """Return the probability that ``front`` is the target, and the reason for a doubt; None where it does not stand
+        before ``back``."""
+        ours = borders[front].get(back)
+        if ours is None or not ours.stands_before:
+            return None
+        it, other = described[front], described[back]
+        seen = f"covers {100 * it.share:.2g} % of the view"
+        if encloses(front, back):
+            opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
+            return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
+        if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
+            why = f"a thing that {seen} lies on a larger surface, or is fixed before it"
+            return _probability(it.weight / LYING_WEIGHT), why
+        if other.cut_off < CUT_OFF:
+            ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            why = f"a thing that {seen} stands before a surface that is seen whole"
+            return _probability(ratio / OBSTACLE_AREA), why
+        why = f"the nearer surface covers only {100 * it.share:.2g} % of the view"
+        return _probability(it.weight / STANDING_WEIGHT), why
 
-def _judged(
-    described: list[Candidate], borders: list[dict[int, Border]], surfaces: Surfaces, i: int, j: int
-) -> Judgement:
-    """Whether surface i and not j is the target."""
-    ahead = _front_judgement(described, borders, surfaces, i, j)
-    if ahead is not None:
-        return ahead
-    behind = _front_judgement(described, borders, surfaces, j, i)
-    if behind is not None:
-        return Judgement(1.0 - behind.probability, behind.reason)
-    return _side_by_side(described[i], described[j])
+    def encloses(outer: int, inner: int) -> bool:
+        own = surfaces.own[inner]
+        return bool(np.count_nonzero(own & surfaces.filled[outer]) >= ENCLOSED * np.count_nonzero(own))
 
+    def judged(i: int, j: int) -> tuple[float, str]:
+        """Return the probability that surface i and not j is the target, and the reason for a doubt."""
+        if i == j:
+            return 1.0, ""
+        ahead, behind = before(i, j), before(j, i)
+        if ahead is not None:
+            return ahead
+        if behind is not None:
+            return 1.0 - behind[0], behind[1]
+        # of two that meet, or have nothing to do with one another, weight, a frontal view and nearness count
+        it, other = described[i], described[j]
+        ratio = it.weight / max(other.weight, 1e-9)
+        facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+        near = other.distance_m / max(it.distance_m, 1e-6)
+        return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
-def _front_judgement(
-    described: list[Candidate], borders: list[dict[int, Border]], surfaces: Surfaces, front: int, back: int
-) -> Judgement | None:
-    """Whether ``front`` is the target, where it stands before ``back``; None where it does not."""
-    ours = borders[front].get(back)
-    if ours is None or not ours.stands_before:
-        return None
-    it, other = described[front], described[back]
-    if _encloses(surfaces, front, back):
-        seen = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
-        probability = _probability(0.5 / max(seen, 1e-6))
-        return Judgement(probability, "a surface is seen through a large opening of another")
-    if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
-        why = f"a thing that covers {100 * it.share:.2g} % of the view lies on a larger surface, or is fixed before it"
-        return Judgement(_probability(it.weight / LYING_WEIGHT), why)
-    if other.cut_off < CUT_OFF:
-        ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
-        why = f"a thing that covers {100 * it.share:.2g} % of the view stands before a surface that is seen whole"
-        return Judgement(_probability(ratio / OBSTACLE_AREA), why)
-    why = f"the nearer surface covers only {100 * it.share:.2g} % of the view"
-    return Judgement(_probability(it.weight / STANDING_WEIGHT), why)
+    def outline(number: int) -> np.ndarray:
+        """Return the outline without what it encloses and what stands before it as a target of its own; a thing that
+        lies on it stays."""
+        found = described[number].outline
+        for other in numbers:
+            border = borders[other].get(number)
+            own_target = border is not None and border.stands_before and table[other][number][0] >= 0.5
+            if own_target and encloses(number, other):
+                found = found & ~grown(surfaces.filled[other], surfaces.reach_px)
+        return found
 
-
-def _side_by_side(it: Candidate, other: Candidate) -> Judgement:
-    """Of two that meet, or have nothing to do with one another: weight, a frontal view and nearness count."""
-    ratio = it.weight / max(other.weight, 1e-9)
-    facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
-    near = other.distance_m / max(it.distance_m, 1e-6)
-    return Judgement(_probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near")
+    table = [[judged(i, j) for j in numbers] for i in numbers]
+    odds = [sum(math.log(probability) for probability, _ in row) for row in table]
+    order = sorted(numbers, key=lambda number: (-odds[number], number))
+    candidates = tuple(replace(described[number], outline=outline(number)) for number in order)
+    against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
+    doubtful = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]
+    doubts = [f"{why} (--target {place} takes the other)" for place, why in doubtful]
+    if wanted is not None or not doubts:
+        return candidates, ()
+    return candidates, (f"it is doubtful which surface is the target: {'; '.join(doubts)}",)
 
 
 def _probability(odds_base: float) -> float:
@@ -237,101 +216,62 @@ def _probability(odds_base: float) -> float:
     return min(max(odds / (1.0 + odds), 1e-4), 1.0 - 1e-4)
 
 
-def _encloses(surfaces: Surfaces, outer: int, inner: int) -> bool:
-    own = surfaces.own[inner]
-    inside, whole = int(np.count_nonzero(own & surfaces.filled[outer])), int(np.count_nonzero(own))
-    return inside >= ENCLOSED * whole
-
-
 # ---------------------------------------------------------------- one surface
 
 
 def _described(surfaces: Surfaces, grid: Cloud, number: int) -> Candidate:
-    own = surfaces.own[number]
+    own, filled = surfaces.own[number], surfaces.filled[number]
     places = np.flatnonzero(own)
     some = grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
     near, median, far = np.quantile(some[:, 2], (0.01, 0.5, 0.99)).tolist()
     centred = some - some.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     facing = min(abs(float(axes[2, 0])), 1.0)
-    return Candidate(
-        outline=surfaces.filled[number],
-        pixels=len(places),
-        distance_m=median,
-        nearest_m=near,
-        farthest_m=far,
-        extent_m=_extent_m(centred @ axes[:, 1:]),
-        share=len(places) / own.size,
-        weight=_centre_weight(own) * min(1.0, (facing / GRAZING) ** 2),
-        tilt_deg=math.degrees(math.acos(facing)),
-        cut_off=_cut_off(surfaces.filled[number], grid),
-    )
-
-
-def _extent_m(plan_m: np.ndarray) -> tuple[float, float]:
-    """(longer, shorter) side of the smallest rectangle around places (n, 2), without the outermost hundredth."""
-    turn = math.radians(float(cv2.minAreaRect(plan_m.astype(np.float32))[2]))
-    along = plan_m @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    # the smallest rectangle around it in its own plane, without the outermost hundredth
+    plan = centred @ axes[:, 1:]
+    turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
+    along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     low, high = np.quantile(along, (0.005, 0.995), axis=0)
     short, long = sorted(((high - low) / 0.99).tolist())
-    return long, short
-
-
-def _centre_weight(mask: np.ndarray) -> float:
-    """Part of the picture that the mask (h, w) holds, its pixels weighted by a Gaussian about the centre."""
-    row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in mask.shape)
-    return float(row @ mask @ column / (row.sum() * column.sum()))
-
-
-def _cut_off(filled: np.ndarray, grid: Cloud) -> float:
-    """Part of the outline that lies on the picture's edge; without a pixel grid, beyond which no point lies."""
-    inner = cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    outline = filled & ~inner
+    # pixels weighted by a Gaussian about the picture's centre
+    row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in own.shape)
+    weight = float(row @ own @ column / (row.sum() * column.sum()))
+    # the picture's edge; without a pixel grid, what no point lies beyond
+    outline = filled & ~(cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
     if grid.organised:
         edge = np.ones(filled.shape, dtype=bool)
         edge[1:-1, 1:-1] = False
     else:
-        seen = cv2.dilate(grid.valid.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        edge = cv2.dilate((~holes_filled(seen)).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
+        edge = grown(~holes_filled(grown(grid.valid, 2)), 3)
+    return Candidate(
+        outline=filled,
+        pixels=len(places),
+        distance_m=median,
+        nearest_m=near,
+        farthest_m=far,
+        extent_m=(long, short),
+        share=len(places) / own.size,
+        weight=weight * min(1.0, (facing / GRAZING) ** 2),
+        tilt_deg=math.degrees(math.acos(facing)),
+        cut_off=int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1),
+    )
 
 
 def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, Border]:
-    """The surfaces beyond this one's outline, by number."""
+    """Return the surfaces beyond this one's outline, by number."""
     filled, own = surfaces.filled[number], surfaces.own[number]
     apart, nearest = nearest_pixel(own)
     ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~filled)
     z, seeds = grid.points_m[..., 2].reshape(-1), nearest.reshape(-1)
     outline = len(np.unique(seeds[ring]))
-    limit = max(CONTACT_MM * MM, CONTACT_SIGMAS * surfaces.noise_m)
     found = {}
     for other in range(len(surfaces.own)):
         there = ring[surfaces.own[other].reshape(-1)[ring]]
         part = len(np.unique(seeds[there])) / max(outline, 1)
         if other != number and part >= BORDERING:
             steps = z[there] - z[seeds[there]]
-            behind = steps[steps > limit]
+            behind = steps[steps > surfaces.contact_m]
             away = float(np.median(behind)) if len(behind) else 0.0
-            found[other] = Border(part, len(behind) / len(steps), float((steps < -limit).mean()), away)
+            back = float((steps < -surfaces.contact_m).mean())
+            found[other] = Border(part, len(behind) / len(steps), back, away)
     return found
-
-
-def _without_others(
-    described: list[Candidate],
-    judged: list[list[Judgement]],
-    borders: list[dict[int, Border]],
-    surfaces: Surfaces,
-    number: int,
-) -> Candidate:
-    """The candidate without what it encloses and what stands before it as a target of its own; a thing that lies on it
-    stays."""
-    outline = described[number].outline
-    kernel = np.ones((3, 3), np.uint8)
-    for other in range(len(described)):
-        border = borders[other].get(number)
-        if border is None or not border.stands_before or judged[other][number].probability < 0.5:
-            continue
-        if _encloses(surfaces, number, other):
-            grown = cv2.dilate(surfaces.filled[other].astype(np.uint8), kernel, iterations=surfaces.reach_px) > 0
-            outline = outline & ~grown
-    return replace(described[number], outline=outline)

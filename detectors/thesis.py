@@ -15,11 +15,9 @@ from pydantic import Field, model_validator
 from detectors.background import background
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
-from detectors.median import median_of, median_size_of
-from detectors.rounding import rounding_variances
+from detectors.noise import median_of, rounding_floor, sigma_of
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surface import SurfaceConfig, fit_surface
-from detectors.surface_kernels import columns_at
 from harness.vocabulary.capture import Cloud
 
 SCRIPT_VARIANT: dict[str, Any] = {
@@ -66,7 +64,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     @property
     def default_threshold(self) -> float | None:
-        """The k that the thesis states: 1.2 for the script; None for the text, whose k is set by hand or calibrated."""
+        """Threshold k that the thesis states: 1.2 for the script; None for the text, whose k is set by hand or
+        calibrated."""
         return SCRIPT_THRESHOLD if self.settings.variant == "script" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
@@ -77,7 +76,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         mask = crop(cloud, self.settings.crop)
         if self.settings.surface.shape != "polynomial":
             return self._before_background(cloud, mask)
-        x, y, z = columns_at(cloud.points_m, mask)
+        x, y, z = np.ascontiguousarray(cloud.points_m[mask].T)
         surface = fit_surface(x, y, z, self.settings.surface)
         fitted = surface.evaluate(x, y)
         residual = z - fitted
@@ -103,7 +102,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         )
 
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
-        """As `analyse`, with a surface whose shape is chosen: one unit of score is the noise round about each pixel, so
+        """Analyse with a surface whose shape is chosen: one unit of score is the noise round about each pixel, so
         that neither the surface's misfit nor a noisy part of the target sets the scale of all of it."""
         behind = background(cloud, mask, self.settings.surface)
         unit = np.maximum(behind.noise_m, rounding_floor(cloud, mask))
@@ -111,7 +110,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         if stated is not None:
             deviation = on_grid(stated, mask)
             known = np.isfinite(behind.residual_m)
-            spread = median_size_of(behind.residual_m[known] / deviation[known]) / 0.6745
+            spread = sigma_of(behind.residual_m[known] / deviation[known])
             unit = np.maximum(unit, spread * deviation)
         return Evidence(
             score=np.abs(behind.residual_m) / unit,
@@ -123,8 +122,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         )
 
     def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:
-        """(n,) standard deviation that the cloud states of each point, metres; None where it states none or none is
-        wanted."""
+        """Return the standard deviation (n,) that the cloud states of each point, metres; None where it states none or
+        none is wanted."""
         wanted = self.settings.use_variance and self.settings.scale != "raw_z_std"
         if cloud.mean_variance_m2 is None or not wanted:
             return None
@@ -132,15 +131,9 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         return deviation
 
 
-def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
-    """The standard deviation that the rounding of z leaves in the average, metres (`rounding_variances`): the least
-    credible scale."""
-    return float(np.sqrt(sum(rounding_variances(cloud, mask))))
-
-
 def _spread(residual: np.ndarray, z: np.ndarray, scale: str) -> float:
     if scale == "mad":
-        return median_size_of(residual) / 0.6745
+        return sigma_of(residual)
     values = z if scale == "raw_z_std" else residual
     # MATLAB's std divides by n - 1
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0

@@ -10,7 +10,7 @@ from target_scenes import SCENES, Scene
 
 from detectors import load_detector
 from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, choice_of, crop
-from detectors.smooth_surfaces import holes_filled
+from detectors.masks import holes_filled
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region

@@ -1,4 +1,4 @@
-"""The compiled fit of the hole model against MINPACK, and its covariance against a plain one."""
+"""The fit of the hole model against a plainly written one, and its covariance against a plain one."""
 
 from __future__ import annotations
 
@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from detectors.hole_image import Patch, Sight, blurred_hole, crossed, derivatives
-from detectors.hole_kernels import correlated_products, plane_sums
-from detectors.hole_model import IMAGES, TOLERANCE, WALL_PRIOR, fit_hole
+from detectors.hole import (
+    IMAGES,
+    TOLERANCE,
+    WALL_PRIOR,
+    Patch,
+    Sight,
+    blurred_hole,
+    correlated_products,
+    crossed,
+    derivatives,
+    fit_hole,
+)
+from detectors.measure import local_plane
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
@@ -32,7 +42,7 @@ def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> Patch:
 def by_minpack(patch: Patch, start: tuple[float, float, float, float, float]) -> tuple[np.ndarray, float, bool]:
     """(hole, offset, converged) by the same least squares, written plainly, with scipy's MINPACK."""
     u, v, radius_m, depth_m, offset_m = start
-    weight = patch.noise_m * math.sqrt(patch.blur_area_px) / WALL_PRIOR[1]
+    weight = patch.noise_m * math.sqrt(patch.blur_px[0] * patch.blur_px[1]) / WALL_PRIOR[1]
     data = patch.residual_m[patch.used]
 
     def hole_of(q: np.ndarray) -> np.ndarray:
@@ -63,7 +73,7 @@ def by_minpack(patch: Patch, start: tuple[float, float, float, float, float]) ->
 @pytest.mark.parametrize(
     ("radius_mm", "depth_mm"), [(2.1, 12.7), (3.2, 6.0), (4.8, 33.0), (6.4, 3.0), (12.7, 12.7), (4.0, -5.0)]
 )
-def test_the_descent_ends_where_minpack_does(radius_mm: float, depth_mm: float, seed: int) -> None:
+def test_the_fit_is_that_of_the_plainly_written_least_squares(radius_mm: float, depth_mm: float, seed: int) -> None:
     hole = np.array([18.3, 16.4, radius_mm * 1e-3, depth_mm * 1e-3, 0.6])
     patch = patch_of(hole, 1.5e-4, seed)
     start = (17.6, 16.9, 1.2e-3 * radius_mm, 0.7e-3 * depth_mm, 0.0)
@@ -95,19 +105,28 @@ def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
     np.testing.assert_allclose(correlated_products(columns, across, down), summed @ summed.T, rtol=1e-10, atol=1e-9)
 
 
-@pytest.mark.parametrize("parallel", [False, True])
-def test_plane_sums_equal_a_design_matrix(parallel: bool) -> None:
+@pytest.mark.parametrize("projection", ["central", "parallel"])
+def test_a_local_plane_is_that_of_exact_points(projection: str) -> None:
+    """A point and derivatives of a plane that is known everywhere, from some of its pixels with other depths."""
     random = np.random.default_rng(2)
-    points, surface = random.uniform(0.5, 1.0, (9, 11, 3)), random.uniform(0.5, 1.0, (9, 11))
-    finite = random.random((9, 11)) > 0.3
-    v, u = np.nonzero(finite)
-    design = np.column_stack([np.ones(len(u)), u - 4.2, v - 3.1])
-    p = points[finite]
-    across = p[:, :2] if parallel else p[:, :2] / p[:, 2:]
-    targets = np.column_stack([across, surface[finite]])
-    square, right = plane_sums(points, surface, finite, 4.2, 3.1, parallel)
-    np.testing.assert_allclose(square, design.T @ design, rtol=1e-12)
-    np.testing.assert_allclose(right, design.T @ targets, rtol=1e-12, atol=1e-12)
+    v, u = np.mgrid[:9, :11].astype(float)
+    if projection == "parallel":
+        surface = np.stack([1e-3 * u, 1.1e-3 * v, 0.7 + 2e-4 * u - 1e-4 * v], axis=-1)
+        points = surface + np.multiply.outer(random.uniform(-0.01, 0.01, u.shape), [0.0, 0.0, 1.0])
+        expected = np.array([[1e-3, 0.0, 2e-4], [0.0, 1.1e-3, -1e-4]])
+    else:
+        rays = np.stack([2e-3 * (u - 40), 2e-3 * (v + 30), np.ones(u.shape)], axis=-1)
+        z = 0.7 + 2e-4 * u - 1e-4 * v
+        surface = rays * z[..., None]
+        points = rays * random.uniform(0.69, 0.71, u.shape)[..., None]
+    finite, own = random.random(u.shape) > 0.3, np.zeros(u.shape, dtype=bool)
+    own[3:6, 4:7] = True
+    found = local_plane(points, surface[..., 2], finite, own, projection)
+    assert found is not None
+    if projection == "central":
+        expected = np.stack([(surface[4, 6] - surface[4, 4]) / 2, (surface[5, 5] - surface[3, 5]) / 2])
+    np.testing.assert_allclose(found[0], surface[4, 5], rtol=1e-10)
+    np.testing.assert_allclose(found[1], expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:

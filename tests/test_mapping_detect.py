@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.hole_image import Sight
+from detectors.hole import Sight
 from detectors.interface import Detection
 from detectors.mapping.merge import merge
 from detectors.mapping.settings import FusedMerge, GridMerge

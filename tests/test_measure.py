@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from detectors.hole_image import Patch, Sight, blurred_disc, blurred_hole, derivatives
+from detectors.hole import Patch, Sight, blurred_disc, blurred_hole, derivatives
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, extents, measure_detection
 from harness.vocabulary.capture import Cloud

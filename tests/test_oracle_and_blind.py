@@ -9,9 +9,8 @@ import pytest
 from scipy import stats
 
 from detectors import load_detector
-from detectors.blind import BlindDetector, judged_area_m2
+from detectors.controls import BlindDetector, Oracle, OracleConfig, judged_area_m2
 from detectors.interface import ToldTheTruth, TrueDamage
-from detectors.oracle import Oracle, OracleConfig
 from harness.testing import CHECKS, checks, motion
 from harness.testing.clouds import DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
 from harness.vocabulary.capture import Cloud

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
+from detectors.clusters import cluster_centres, euclidean_clusters
 from detectors.measure import extents
-from detectors.segment import cluster_centres, euclidean_clusters
 from harness.vocabulary.errors import UserError
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from detectors import detector_names, detector_type, load_detector
 from detectors.interface import Detector, Evidence
-from detectors.thesis import ThesisConfig, ThesisDetector, rounding_floor
+from detectors.noise import rounding_floor
+from detectors.thesis import ThesisConfig, ThesisDetector
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region

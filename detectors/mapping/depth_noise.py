@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detectors.rounding import rounding_left_m2
+from detectors.noise import rounding_left_m2
 from harness.vocabulary.capture import Cloud
 
 BINS, PER_BIN = 16, 40

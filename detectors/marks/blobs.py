@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from detectors.clusters import euclidean_clusters
 from detectors.marks.pixelation import region_covariance_px2
-from detectors.segment import euclidean_clusters
 from harness.vocabulary.capture import Cloud
 
 LEAST_PIXELS = 9

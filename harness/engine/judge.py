@@ -11,7 +11,7 @@ import numpy as np
 
 from detectors import DETECTORS, load_detector
 from detectors.interface import Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
-from detectors.median import median_of, median_size_of
+from detectors.noise import median_of, median_size_of
 from harness.engine.sight import Sight
 from harness.evaluation.match import match
 from harness.vocabulary.units import MM

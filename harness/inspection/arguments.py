@@ -186,7 +186,8 @@ def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
     """Return the capture's average as --average says."""
     from itertools import islice
 
-    from detectors.average import REACH_FRAMES, AverageConfig, average, noise_reach_px
+    from detectors.average import AverageConfig, average
+    from detectors.noise import REACH_FRAMES, noise_reach_px
 
     cloud = average(recording, AverageConfig(method=arguments.average))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0

@@ -30,7 +30,7 @@ THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
-    from detectors.measure import measure_extents, on_pixels
+    from detectors.measure import measure_extents
     from detectors.missing import measure_missing, missing_returns, one_damage_once
     from detectors.null import each_object_once
     from harness.report.findings import Judged
@@ -42,8 +42,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
     def measure(each: Detection) -> Measurement:
         if each.kind == "object":
-            whole = measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
-            return on_pixels(cloud, each, whole)
+            return measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
         return (measure_missing if each.kind == "no return" else detector.measure)(cloud, evidence, each)
 
     measured = tuple(map(measure, found))

@@ -14,9 +14,9 @@ import pytest
 
 from detectors import load_detector
 from detectors.average import AverageConfig, RunningAverage
+from detectors.clusters import euclidean_clusters
 from detectors.crop import AutoCrop, crop
 from detectors.interface import FindsAtOnce
-from detectors.segment import euclidean_clusters
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.capture import Cloud, Frame
 from harness.vocabulary.geometry import Region

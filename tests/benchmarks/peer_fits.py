@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from detectors.segment import euclidean_clusters
+from detectors.clusters import euclidean_clusters
 from detectors.surface import SurfaceConfig, fit_surface
 
 HUBER = 1.345

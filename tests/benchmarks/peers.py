@@ -17,8 +17,8 @@ from peer_fits import CLUSTERS, FITS, Points, robust_sigma, same_partition
 
 from detectors import load_detector
 from detectors.average import AverageConfig, prefix_averages
+from detectors.clusters import euclidean_clusters
 from detectors.crop import crop
-from detectors.segment import euclidean_clusters
 from harness.engine.trial import TrialTask
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM

@@ -1,15 +1,17 @@
-"""The automatic crop's compiled passes against plain ones, and the medians that the detectors take."""
+"""Links, components, normals and turns of the automatic crop against plain ones; the detectors' medians."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from detectors.crop_kernels import components, links, turns, unit_normals
-from detectors.median import median_of, median_size_of, quantile_of
+from detectors.masks import components
+from detectors.noise import median_of, median_size_of, quantile_of
+from detectors.smooth_surfaces import links, turns, unit_normals
 
 
 def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
@@ -21,15 +23,15 @@ def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
     return np.stack([u * 1.4e-3 * z, v * 1.4e-3 * z, z], axis=-1)
 
 
-def by_picture(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The components' numbers by labelling a picture in which every link is a pixel of its own."""
-    h, w = nodes.shape
-    picture = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
-    picture[::2, ::2] = nodes
-    picture[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
-    picture[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
-    labels: np.ndarray = cv2.connectedComponents(picture, connectivity=4)[1][::2, ::2]
-    return np.where(nodes, labels, 0)
+def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Number the components by scipy's search of the graph whose edges are the links; -1 off the nodes."""
+    places = np.arange(nodes.size).reshape(nodes.shape)
+    across, below = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:], down[:-1] & nodes[:-1] & nodes[1:]
+    starts = np.concatenate([places[:, :-1][across], places[:-1][below]])
+    ends = np.concatenate([places[:, 1:][across], places[1:][below]])
+    graph = coo_array((np.ones(len(starts)), (starts, ends)), shape=(nodes.size, nodes.size))
+    labels = connected_components(graph, directed=False)[1].reshape(nodes.shape)
+    return np.where(nodes, labels, -1)
 
 
 @pytest.mark.parametrize("central", [False, True])
@@ -62,14 +64,18 @@ def test_a_step_far_off_the_axis_is_a_step() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), share=st.sampled_from([0.3, 0.6, 0.9]), least=st.sampled_from([1, 4]))
-def test_the_components_are_those_of_a_labelled_picture(seed: int, share: float, least: int) -> None:
+@given(seed=st.integers(0, 10_000), share=st.sampled_from([0.3, 0.6, 0.9]))
+def test_the_components_are_those_of_a_graph(seed: int, share: float) -> None:
     random = np.random.default_rng(seed)
     nodes, right, down = random.random((3, 9, 13)) < share
-    found, sizes = components(nodes, right, down, least)
-    expected = by_picture(nodes, right, down)
+    found, sizes = components(nodes, right, down)
+    expected = by_graph(nodes, right, down)
     counts = np.bincount(expected[nodes]) if nodes.any() else np.zeros(1, int)
-    assert sizes.tolist() == sorted((n for n in counts.tolist() if n >= least), reverse=True)
+    assert sizes.tolist() == sorted((n for n in counts.tolist() if n), reverse=True)
+    assert not found[~nodes].any()
+    firsts = [int(np.flatnonzero(found == number)[0]) for number in range(1, len(sizes) + 1)]
+    # of equal sizes the first in the order of the pixels is the first
+    assert sorted(zip((-sizes).tolist(), firsts, strict=True)) == list(zip((-sizes).tolist(), firsts, strict=True))
     for number, size in enumerate(sizes, start=1):
         assert (found == number).sum() == size
         assert len(set(expected[found == number].tolist())) == 1
@@ -77,7 +83,7 @@ def test_the_components_are_those_of_a_labelled_picture(seed: int, share: float,
 
 def test_no_node_has_no_component() -> None:
     nothing = np.zeros((4, 5), dtype=bool)
-    found, sizes = components(nothing, ~nothing, ~nothing, 1)
+    found, sizes = components(nothing, ~nothing, ~nothing)
     assert not found.any() and not len(sizes)
 
 

@@ -1,0 +1,83 @@
+"""Operations on masks (h, w) bool: what they enclose, their rims, connected parts and nearest pixels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+
+def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return an image (h, w) with the values (n,) where the mask is true, in its order, and NaN elsewhere."""
+    image = np.full(mask.shape, np.nan)
+    image[mask] = values
+    return image
+
+
+def holes_filled(mask: np.ndarray) -> np.ndarray:
+    """Return the mask with everything that it encloses."""
+    outside = np.pad(~mask, 1, constant_values=True).astype(np.uint8)
+    _, labels = cv2.connectedComponents(outside, connectivity=4)
+    filled: np.ndarray = (labels != labels[0, 0])[1:-1, 1:-1]
+    return filled
+
+
+def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
+    """Return the mask with all pixels so near to it: in a square, or in OpenCV's ``shape``."""
+    kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+
+
+def shrunk(mask: np.ndarray, side: int) -> np.ndarray:
+    """Return the pixels whose square of ``side`` pixels lies inside the mask; beyond the picture all is inside."""
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """Take so many pixels off the mask's outer rim. Holes inside do not grow; the picture's edge is no rim."""
+    if pixels == 0:
+        return mask
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    # OpenCV's default border never erodes
+    return mask & cv2.erode(holes_filled(mask).astype(np.uint8), kernel).astype(bool)
+
+
+def parts_with(mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least: int = 0) -> np.ndarray:
+    """Return the connected parts of the mask that hold a seed (h, w) and at least ``least`` pixels."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
+    wanted = np.zeros(count, dtype=bool)
+    wanted[labels[seeds & mask]] = True
+    if least:
+        wanted &= np.bincount(labels.ravel(), minlength=count) >= least
+    wanted[0] = False
+    return np.asarray(wanted[labels])
+
+
+def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance of each pixel (h, w) to the mask, in pixels, and the flat index of the mask's nearest one."""
+    apart, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    flat = np.zeros(labels.max() + 1, dtype=np.int64)
+    inside = np.flatnonzero(mask)
+    flat[labels.reshape(-1)[inside]] = inside
+    return apart, flat[labels]
+
+
+def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number the sets of nodes (h, w) that links to the right and downwards (both (h, w)) join.
+
+    Returns the number of each pixel's set (h, w), 0 for none, and the sizes of the sets, largest first, of equal ones
+    the first in the order of the pixels: set number i has the size ``sizes[i - 1]``.
+    """
+    h, w = nodes.shape
+    # links are pixels between the nodes of a picture twice as fine
+    fine = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
+    fine[::2, ::2] = nodes
+    fine[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
+    fine[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
+    labels = np.ascontiguousarray(cv2.connectedComponents(fine, connectivity=4)[1][::2, ::2])
+    sizes = np.bincount(labels.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable")
+    number = np.zeros(len(sizes) + 1, dtype=np.int32)
+    number[order + 1] = np.arange(1, len(sizes) + 1)
+    return number[labels], sizes[order]
