@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.tables.outputs import TARGETS
 from harness.vocabulary.units import MM
 
 if TYPE_CHECKING:
@@ -12,8 +13,6 @@ if TYPE_CHECKING:
 
     from detectors.target import Candidate, Choice
     from harness.vocabulary.capture import Cloud
-
-PICTURE = "targets.png"
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
@@ -61,7 +60,7 @@ def _facts(candidate: Candidate) -> dict[str, Any]:
     }
 
 
-def pictures(choice: Choice | None, name: str = PICTURE) -> dict[str, Callable[[Path], object]]:
+def pictures(choice: Choice | None, name: str = TARGETS.name) -> dict[str, Callable[[Path], object]]:
     """The numbered picture of the candidates, by its file's name, for `harness.report.findings.write_findings`."""
     from detectors.target import described_text
     from harness.report.targets_picture import save_targets
