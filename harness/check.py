@@ -27,11 +27,9 @@ from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
-    from harness.evaluation.study.verdict import Comparison
-    from harness.experiment.points import Experiment
 
 BASELINES = Path(__file__).resolve().parents[1] / "results" / "baselines"
-"""Where the repository keeps them, one ``<name of the experiment>.json`` each."""
+"""Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -68,45 +66,63 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.compare import FILES, print_comparison, write_comparison
     from harness.engine.study import run_study
+    from harness.evaluation.study.record import read_record, record_text
+    from harness.evaluation.study.verdict import ALPHA, compare_studies, fewest_boards
     from harness.experiment.load import load_experiment
+    from harness.vocabulary.files import write_text
 
     experiment = load_experiment(options.experiment, options.overrides)
-    if experiment.config.study is None:
-        raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
-    _refuse_too_few_boards(experiment)
-    asked = engine_options(options)
-    if not asked.shard.is_whole:
-        raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
-    path = options.baseline or BASELINES / f"{experiment.config.name}.json"
-    baseline = _baseline(path, update=options.update)
-    code = run_study(experiment, options.out, asked, command)
-    if code not in (0, 1):
-        return code
-    found = _found(experiment, options.out)
-    comparison = _compared(baseline, found, experiment.folder(options.out), command)
-    if options.update:
-        return _update(path, found, trials_failed=code == 1)
-    assert comparison is not None
-    return _gate(comparison, path)
-
-
-def _refuse_too_few_boards(experiment: Experiment) -> None:
-    """With these no loss could ever be told from chance, and the gate would pass everything."""
-    from harness.evaluation.study.verdict import ALPHA, fewest_boards
-
     study, set_ups = experiment.config.study, len(experiment.points)
+    if study is None:
+        raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
-    if study is not None and study.boards < needed:
+    if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
         raise UserError(
             f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail",
             legal=f"at least {needed} boards for {set_ups} set-up{'s' if set_ups > 1 else ''}",
             fix="raise study.boards: 40 are needed to see a90 grow by 15 %",
         )
+    asked = engine_options(options)
+    if not asked.shard.is_whole:
+        raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
+    path = options.baseline or BASELINES / f"{experiment.config.name}.json"
+    baseline = _baseline(path, update=options.update)  # before anything runs: a study takes minutes
+    code = run_study(experiment, options.out, asked, command)
+    if code not in (0, 1):
+        return code
+    folder = experiment.folder(options.out)
+    found, comparison = read_record(folder), None
+    if baseline is not None:
+        comparison = compare_studies(baseline, found)
+        print()
+        print_comparison(comparison)
+        write_comparison(comparison, folder, command)
+        print(f"comparison with the baseline: {folder / FILES[1]}")
+    if options.update:
+        if code == 1:
+            raise UserError(f"{path}: is left as it was, since trials failed", fix="mend what makes them fail first")
+        write_text(path, record_text(found))
+        print(f"wrote {path}")
+        return 0
+    assert comparison is not None
+    missing = [row.label for row in comparison.marked("only in first")]
+    if missing:
+        print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
+    if missing or any(row.is_worse for row in comparison.rows):
+        print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
+        return 1
+    if apart := comparison.marked("not comparable"):
+        raise UserError(
+            f"{path}: cannot be compared with: {'; '.join(f'{row.label}: {row.why}' for row in apart)}",
+            fix="run the check again with --update and commit the baseline",
+        )
+    return 0
 
 
 def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
-    """Read before anything runs: a study takes minutes. None where an ``update`` has none to compare with."""
+    """Read the baseline. Returns None where an ``update`` has none to compare with."""
     from harness.evaluation.study.record import read_record
 
     if path.is_dir():
@@ -122,53 +138,6 @@ def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
             raise UserError(mistake.message, legal=mistake.legal, fix="write it anew with --update") from mistake
         print(f"no comparison with the old baseline, which will be overwritten. {mistake.message}")
         return None
-
-
-def _found(experiment: Experiment, out: Path) -> StudyRecord:
-    from harness.evaluation.study.record import read_record
-
-    return read_record(experiment.folder(out))
-
-
-def _compared(baseline: StudyRecord | None, found: StudyRecord, folder: Path, command: str) -> Comparison | None:
-    """Printed, and written beside the study's own results."""
-    from harness.compare import FILES, print_comparison, write_comparison
-    from harness.evaluation.study.verdict import compare_studies
-
-    if baseline is None:
-        return None
-    comparison = compare_studies(baseline, found)
-    print()
-    print_comparison(comparison)
-    write_comparison(comparison, folder, command)
-    print(f"comparison with the baseline: {folder / FILES[1]}")
-    return comparison
-
-
-def _update(path: Path, found: StudyRecord, *, trials_failed: bool) -> int:
-    from harness.evaluation.study.record import record_text
-    from harness.vocabulary.files import write_text
-
-    if trials_failed:
-        raise UserError(f"{path}: is left as it was, since trials failed", fix="mend what makes them fail first")
-    write_text(path, record_text(found))
-    print(f"wrote {path}")
-    return 0
-
-
-def _gate(comparison: Comparison, path: Path) -> int:
-    missing = [row.label for row in comparison.marked("only in first")]
-    if missing:
-        print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
-    if missing or any(row.is_worse for row in comparison.rows):
-        print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
-        return 1
-    if apart := comparison.marked("not comparable"):
-        raise UserError(
-            f"{path}: cannot be compared with: {'; '.join(f'{row.label}: {row.why}' for row in apart)}",
-            fix="run the check again with --update and commit the baseline",
-        )
-    return 0
 
 
 if __name__ == "__main__":

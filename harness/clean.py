@@ -49,16 +49,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _clean_cache(options: argparse.Namespace) -> int:
     from harness.listing.removal import cache_removal, checked_inside
-    from harness.listing.renders import cache_folder
-    from harness.listing.text import bytes_of, seconds_of, size_text
+    from harness.listing.text import bytes_of, cache_folder, many, seconds_of, size_text
     from scenes.render.store import alone, removed
 
     limit = None if options.limit is None else bytes_of(options.limit)
     older_s = None if options.older_than is None else seconds_of(options.older_than)
     if limit is None and older_s is None and not options.damaged and not options.all:
-        raise UserError(
-            "nothing is said of which renders go", legal="--limit SIZE, --older-than AGE, --damaged, --all; or several"
-        )
+        raise UserError("no renders were chosen", legal="--limit SIZE, --older-than AGE, --damaged, --all; or several")
     folder = cache_folder(options.out)
     if not folder.is_dir():
         print(f"{folder}: there is no cache")
@@ -69,7 +66,7 @@ def _clean_cache(options: argparse.Namespace) -> int:
             pass
     wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
     size = sum(one.size_bytes for one in wanted)
-    if not _agreed(options, f"{_files(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
+    if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
     with alone(folder):  # not while the question waits for its answer: that would block every sweep
         gone = removed(wanted)
@@ -78,7 +75,7 @@ def _clean_cache(options: argparse.Namespace) -> int:
 
 def _clean_results(options: argparse.Namespace) -> int:
     from harness.listing.removal import chosen_results, removable, remove_files
-    from harness.listing.text import size_text
+    from harness.listing.text import many, size_text
 
     folders = chosen_results(options.out, options.name)
     if not options.dry_run:
@@ -90,7 +87,7 @@ def _clean_results(options: argparse.Namespace) -> int:
     for folder in folders:
         print(folder)
     what = "records of trials" if options.journal_only else "files"
-    if not _agreed(options, f"{len(files)} {what} in {_files(len(folders), 'folder')}, {size_text(size)}", len(files)):
+    if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size_text(size)}", len(files)):
         return 0 if options.dry_run or not files else 1
     with ExitStack() as held:
         for folder in folders:  # not while the question waits for its answer: that would block every sweep
@@ -116,7 +113,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
-    """Whether to go on. Raises UserError where nobody can be asked."""
+    """Ask whether to go on. Raises UserError where nobody can be asked."""
     if options.dry_run or not count:
         print(f"would remove {what}" if count else "nothing to remove")
         return False
@@ -131,16 +128,12 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
 
 
 def _concluded(gone: int, wanted: int, freed: int) -> int:
-    from harness.listing.text import size_text
+    from harness.listing.text import many, size_text
 
-    print(f"removed {_files(gone, 'file')}, {size_text(freed)}")
+    print(f"removed {many(gone, 'file')}, {size_text(freed)}")
     if gone < wanted:
-        print(f"{_files(wanted - gone, 'file')} could not be removed", file=sys.stderr)
+        print(f"{many(wanted - gone, 'file')} could not be removed", file=sys.stderr)
     return 0 if gone == wanted else 1
-
-
-def _files(count: int, what: str) -> str:
-    return f"{count} {what}" + ("" if count == 1 else "s")
 
 
 if __name__ == "__main__":

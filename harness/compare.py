@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from harness.tables.outputs import COMPARISON, COMPARISON_PAGE
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from harness.evaluation.study.record import StudyRecord
     from harness.evaluation.study.verdict import Comparison
 
-FILES = ("compare.json", "compare.html")
+FILES = (COMPARISON.name, COMPARISON_PAGE.name)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,11 +59,18 @@ def _level(text: str) -> float:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.evaluation.study.paired_set_ups import paired_set_ups
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies
 
     first, second = read_record(options.first), read_record(options.second)
-    _refuse_where_nothing_is_paired(first, second)
+    if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
+        both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
+        raise UserError(
+            f"nothing could be paired: no set-up of the two has the same name and frames: {both}",
+            legal="set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each",
+            fix="run both studies with the same `sweep`, or each with a single set-up",
+        )
     comparison = compare_studies(first, second, options.alpha)
     print_comparison(comparison, as_json=options.json)
     if options.out is not None:
@@ -73,39 +80,19 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _refuse_where_nothing_is_paired(first: StudyRecord, second: StudyRecord) -> None:
-    from harness.evaluation.study.paired_set_ups import paired_set_ups
-
-    if any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
-        return
-    both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
-    raise UserError(
-        f"nothing could be paired: no set-up of the two has the same name and frames: {both}",
-        legal="set-ups of the same name, or the same values on the axes, and the same frames; or one set-up in each",
-        fix="run both studies with the same `sweep`, or each with a single set-up",
-    )
-
-
 def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
-    """The table, in colour on a terminal; or JSON."""
-    from harness.report.compare_rows import compare_table, compare_text
+    """Print the table, in colour on a terminal; or JSON."""
+    from harness.report.compare_rows import comparison_parts
+    from harness.tables.grid import show
 
     if as_json:
         print(_json(comparison))
-        return
-    if sys.stdout.isatty():
-        from rich.console import Console
-
-        console, table = Console(), compare_table(comparison)
-        # On a narrow terminal rich would cut the numbers; wrapped lines can still be read.
-        if console.measure(table, options=console.options.update(max_width=1000)).maximum <= console.width:
-            console.print(table)
-            return
-    print(compare_text(comparison))
+    else:
+        show(comparison_parts(comparison))
 
 
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
-    """`FILES` in ``folder``."""
+    """Write `FILES` into ``folder``."""
     from harness.report.compare_page import compare_html
     from harness.vocabulary.files import write_text
 

@@ -1,4 +1,4 @@
-"""``python -m harness.ls``: what there is to choose from and what can be set of it; results and stored renders."""
+"""``python -m harness.ls``: list detectors and cameras with their settings, folders of results, and stored renders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
     from harness.listing.offers import Offers
-    from harness.listing.results import ResultFolder
 
 KINDS = ("detectors", "cameras")
 STORED = ("results", "cache")
@@ -71,7 +70,7 @@ def _list_offers(options: argparse.Namespace) -> int:
 
 
 def _show_whichever(options: argparse.Namespace) -> int:
-    """What is called so: a detector, a camera, or one of each. Raises UserError where it is neither."""
+    """Show a detector, a camera, or one of each, by name. Raises UserError where there is none."""
     from harness.listing.offers import OFFERS
     from harness.vocabulary.declaration.diagnose import nearest
 
@@ -94,7 +93,7 @@ def _show_whichever(options: argparse.Namespace) -> int:
 
 
 def _show(offers: Offers, name: str, *, as_json: bool) -> int:
-    """One of them with all that can be set of it. Raises UserError where it is unknown, taken twice or broken."""
+    """Show one of them with its settings. Raises UserError where it is unknown, taken twice or broken."""
     from harness.listing.text import table_lines
     from harness.vocabulary.seeds import canonical_json
 
@@ -111,8 +110,10 @@ def _show(offers: Offers, name: str, *, as_json: bool) -> int:
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """Every folder of results with its state. Raises UserError where an experiment was named that has none."""
+    """List every folder of results with its state, the limit that it found and what tells it from others. Raises
+    UserError where an experiment was named that has none."""
     from harness.listing.results import result_folders
+    from harness.listing.text import size_text, table_lines
 
     folders = list(result_folders(options.out, options.name))
     if options.name is not None and not folders:
@@ -124,42 +125,56 @@ def _list_results(options: argparse.Namespace) -> int:
     print(f"results in {options.out}" + ("" if folders else ": none"))
     for name in sorted({one.experiment for one in folders}):
         print(f"  {name}")
-        _print_folders([one for one in folders if one.experiment == name])
+        shown = [one for one in folders if one.experiment == name]
+        rows = [
+            (
+                one.digest,
+                (one.date or "")[:10],
+                (one.commit or "")[:7] + ("+" if one.dirty else ""),
+                size_text(one.size_bytes),
+                "report" if one.has_report else "no report",
+                one.note + (", latest" if one.is_latest else ""),
+            )
+            for one in shown
+        ]
+        for one, line in zip(shown, table_lines(rows, indent="    "), strict=True):
+            print(line)
+            for said in (one.limit_text, one.differs_text):
+                if said:
+                    print(f"      {said}")
     return 0
 
 
-def _print_folders(folders: list[ResultFolder]) -> None:
-    from harness.listing.text import size_text, table_lines
-
-    print(
-        "\n".join(
-            table_lines(
-                [
-                    (
-                        one.digest,
-                        (one.date or "")[:10],
-                        (one.commit or "")[:7] + ("+" if one.dirty else ""),
-                        size_text(one.size_bytes),
-                        "report" if one.has_report else "no report",
-                        one.note,
-                    )
-                    for one in folders
-                ],
-                indent="    ",
-            )
-        )
-    )
-
-
 def _list_cache(options: argparse.Namespace) -> int:
+    import time
+
+    from harness.listing.text import age_text, cache_folder, size_text
+    from scenes.render.store import damaged_renders, leftovers, stored_renders
+
     if options.name is not None:
         raise UserError(f"the cache has no part called {options.name!r}", fix="python -m harness.ls cache")
-    from harness.listing.renders import cache_facts, cache_lines
-
-    facts = cache_facts(options.out, check=not options.fast)
+    folder = cache_folder(options.out)
+    renders, left = stored_renders(folder), leftovers(folder)
+    ages_s = [max(time.time() - one.used_s, 0.0) for one in renders]
+    size_bytes, left_bytes = (sum(one.size_bytes for one in files) for files in (renders, left))
+    damaged = None if options.fast else [one.path.name for one in damaged_renders(renders)]  # 5 ms a render
     if options.json:
-        return _print_json(facts)
-    print("\n".join(cache_lines(facts)))
+        facts = {"folder": str(folder), "renders": len(renders), "size_bytes": size_bytes}
+        facts |= {"longest_unused_s": max(ages_s, default=None), "latest_use_s": min(ages_s, default=None)}
+        return _print_json(facts | {"damaged": damaged, "leftovers": len(left), "leftovers_bytes": left_bytes})
+    print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
+    if renders:
+        print(f"  used: latest {age_text(min(ages_s))}, oldest {age_text(max(ages_s))}")
+    if damaged is None:
+        print("  damaged: not looked for")
+    elif damaged:
+        named = ", ".join(damaged[:3]) + (", ..." if len(damaged) > 3 else "")
+        print(f"  damaged, or of another version: {len(damaged)} ({named})")
+        print("    rendered again when needed; python -m harness.clean cache --damaged removes them")
+    elif renders:
+        print("  damaged: none")
+    if left:
+        print(f"  left by processes that were killed: {len(left)}, {size_text(left_bytes)}")
     return 0
 
 

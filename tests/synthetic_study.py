@@ -193,7 +193,7 @@ def _calls(study: Study, one: SetUp, role: str) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Tables:
-    """Satisfies `harness.evaluation.study.tables.StudyTables`."""
+    """Has the tables of `harness.tables.trials.ResultTables` that a study is judged by."""
 
     holes: pd.DataFrame
     sites: pd.DataFrame

@@ -15,7 +15,7 @@ from harness.report.examples import ExampleCloud
 
 @dataclass(frozen=True)
 class Tables:
-    """Satisfies `harness.evaluation.summary.ResultTables`."""
+    """Has the tables of `harness.tables.trials.ResultTables`."""
 
     holes: pd.DataFrame
     runs: pd.DataFrame

@@ -21,7 +21,8 @@ from harness.evaluation.study.paired_set_ups import not_comparable, paired_set_u
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
 from harness.evaluation.study.verdict import ALPHA, Comparison, compare_studies, fewest_boards, holm
 from harness.report.compare_page import compare_html
-from harness.report.compare_rows import HEADS, cells, compare_table, compare_text
+from harness.report.compare_rows import HEADS, cells, comparison_grid, comparison_parts
+from harness.tables.grid import text_of
 from tests.synthetic_study import SetUp, Study, study_record
 
 FRAMES = count()
@@ -378,7 +379,7 @@ def comparison() -> Comparison:
 
 
 def test_every_row_is_said_in_text_and_on_the_page(comparison):
-    text, page = compare_text(comparison), compare_html(comparison, "python -m harness.compare a b")
+    text, page = text_of(comparison_parts(comparison)), compare_html(comparison, "python -m harness.compare a b")
     assert [row.mark for row in comparison.rows] == ["worse", "as good", "only in first", "only in second"]
     for row in comparison.rows:
         assert len(cells(row)) == len(HEADS)
@@ -386,7 +387,7 @@ def test_every_row_is_said_in_text_and_on_the_page(comparison):
     assert text.splitlines()[-1].startswith("1 of 4 set-ups is worse. 1 frame: a90 ")
     assert "what differs: other frames of the same boards (1 frame)" in text
     assert page.count("<tr") == 1 + 4 + 2 + 4 + 1 + 3 and 'class="no"' in page and "<svg" in page
-    assert compare_table(comparison).row_count == 4
+    assert comparison_grid(comparison).rich().row_count == 4
     assert compare_html(comparison, "x") == compare_html(comparison, "x")
 
 

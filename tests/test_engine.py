@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pandas as pd
 import pytest
+from declared_results import assert_declared
 from serial_run import records_of, run_serially
 
 from harness.engine import run
@@ -65,7 +66,7 @@ def sweep(folder: Path, *arguments: str, experiment: Path | None = None) -> subp
 
 
 def results(folder: Path) -> Path:
-    (found,) = (folder / "tiny").iterdir()
+    (found,) = (folder / "tiny").glob("[0-9a-f]*")
     return found
 
 
@@ -86,9 +87,15 @@ def test_a_sweep_leaves_all_its_files(finished):
     names = {path.name for path in results(finished).iterdir()}
     assert names == {
         ".lock",
+        "claims.csv",
         "experiment.yaml",
+        "false_calls.csv",
+        "false_calls.parquet",
         "journal",
+        "noise.csv",
         "noise.parquet",
+        "noise_by_frames.csv",
+        "noise_by_frames.parquet",
         "probes.parquet",
         "provenance.json",
         "report.html",
@@ -96,6 +103,9 @@ def test_a_sweep_leaves_all_its_files(finished):
         "summary.csv",
         "trials.parquet",
     }
+    assert_declared(results(finished))
+    latest = finished / "tiny" / "latest"
+    assert latest.is_symlink() and latest.resolve() == results(finished).resolve()
     table = trials(finished)
     assert len(table) == 2 * 2 * 11  # numbers of frames, repeats, holes
     assert table.groupby("hole")["true_diameter_mm"].nunique().eq(1).all()
@@ -161,7 +171,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
         command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     deadline = time.monotonic() + 120
-    while not list(cut.glob("tiny/*/journal/*/damaged-*.jsonl")):
+    while not list(cut.glob("tiny/[0-9a-f]*/journal/*/damaged-*.jsonl")):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -172,7 +182,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     assert process.returncode == 130, errors
     assert "interrupted; finished trials are kept" in errors
     assert "--set repeats=400" in errors
-    journal = Journal(next(cut.glob("tiny/*/journal")))
+    journal = Journal(next(cut.glob("tiny/[0-9a-f]*/journal")))
     kept = [key for key, _ in journal.entries()]
     assert kept
     assert all(journal.read(key) is not None for key in kept)
@@ -186,7 +196,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished):
     marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
     process = subprocess.Popen([*command, "--set", "repeats=400"], cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not list(cut.glob("tiny/*/journal/*/hole_free-*.jsonl")):
+    while not list(cut.glob("tiny/[0-9a-f]*/journal/*/hole_free-*.jsonl")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -304,9 +314,9 @@ def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "left out: " in done.stdout
     assert "00003.png" in done.stdout
-    table = pd.read_csv(next((tmp_path / "out").glob("capture/*/summary.csv")))
+    table = pd.read_csv(next((tmp_path / "out").glob("capture/[0-9a-f]*/summary.csv")))
     assert list(table.frames_used) == [1, 11] and list(table.results_version) == [RESULTS_VERSION] * 2
-    assert len(list((tmp_path / "out").glob("capture/*/point-*/findings.csv"))) == 2
+    assert len(list((tmp_path / "out").glob("capture/[0-9a-f]*/point-*/findings.csv"))) == 2
 
 
 def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
@@ -352,7 +362,7 @@ def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, ca
     assert told.count("Traceback (most recent call last)") == 1
     assert "ValueError: a bug of the detector" in told
     assert told.rstrip().endswith("no trial of tiny succeeded; 4 failed, the first as above (detector 'thesis')")
-    assert not list(out.glob("tiny/*/report.html"))
+    assert not list(out.glob("tiny/[0-9a-f]*/report.html"))
 
 
 def test_changed_code_is_not_served_old_trials(finished, monkeypatch):

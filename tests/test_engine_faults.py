@@ -112,7 +112,7 @@ def test_a_killed_driver_costs_what_was_under_way(home):
     command = sweep_command(home / "tiny.yaml", out, "--set", REPEATS)
     process = subprocess.Popen(command, cwd=ROOT, env=os.environ | environment(home), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not (kept := list(out.glob("tiny/*/journal/*/damaged-*.jsonl"))):
+    while not (kept := list(out.glob("tiny/[0-9a-f]*/journal/*/damaged-*.jsonl"))):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pandas as pd
 import pytest
+from declared_results import assert_declared
 from scipy.spatial.transform import Rotation
 
 from harness.engine.maps import registration_error_m
@@ -164,13 +165,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (home / "tiny.yaml").write_text(TINY)
     done = sweep(home / "out", "--jobs", "2")
     assert done.returncode == 0, done.stderr
-    (found,) = (home / "out" / "tiny").iterdir()
+    (found,) = (home / "out" / "tiny").glob("[0-9a-f]*")
     return found
 
 
 def test_a_sweep_over_views_leaves_its_tables_report_and_view_in_space(finished):
     names = {path.name for path in finished.iterdir()}
     assert {"registrations.parquet", "walls.parquet", "report.html"} <= names
+    assert {"registrations.csv", "registration_errors.csv", "set_ups.csv", "claims.csv"} <= names
+    assert_declared(finished)
     registrations = pd.read_parquet(finished / "registrations.parquet")
     main = registrations[registrations["method"] != "odometry"]
     # methods, roles, repeats, views but the first
@@ -200,7 +203,7 @@ def test_one_process_or_two_give_the_same_numbers(finished, tmp_path):
     shutil.copytree(finished.parents[1] / ".cache", tmp_path / "out" / ".cache")
     done = sweep(tmp_path / "out", "--jobs", "1")
     assert done.returncode == 0, done.stderr
-    (again,) = (tmp_path / "out" / "tiny").iterdir()
+    (again,) = (tmp_path / "out" / "tiny").glob("[0-9a-f]*")
     for name in ("trials", "registrations", "probes"):
         tables = [
             pd.read_parquet(folder / f"{name}.parquet").drop(columns="seconds", errors="ignore")

@@ -42,7 +42,7 @@ def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, capsys):
         done = sweep(home / "tiny.yaml", home / f"part{number}", "--shard", f"{number}/2")
         assert done.returncode == 0, done.stderr
         assert f"shard {number}/2: " in done.stdout
-        assert not list((home / f"part{number}").glob("tiny/*/report.html"))
+        assert not list((home / f"part{number}").glob("tiny/[0-9a-f]*/report.html"))
     parts = [str(home / f"part{number}" / "tiny" / name) for number in (1, 2)]
     into = home / "joined" / "tiny" / name
     assert merge.main([*parts, "--into", str(into)]) == 0

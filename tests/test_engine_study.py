@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import pytest
+from declared_results import assert_declared
 from scipy import stats
 from serial_run import records_of, run_serially
 
@@ -20,12 +21,13 @@ from harness.engine import run
 from harness.engine.calibration import threshold_of
 from harness.engine.plan import plan_of
 from harness.engine.study_record import record_of
-from harness.engine.tables import Tables, tables_of
+from harness.engine.tables import tables_of
 from harness.engine.trial import TrialTask, board_labels, run_trial
 from harness.evaluation.study.record import StudyRecord, read_record
 from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import load_experiment
 from harness.experiment.points import Point
+from harness.tables.trials import ResultTables
 from harness.vocabulary.declaration.problems import DeclarationError
 from harness.vocabulary.errors import UserError
 
@@ -178,7 +180,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def results(folder: Path) -> Path:
-    (found,) = (folder / "tiny").iterdir()
+    (found,) = (folder / "tiny").glob("[0-9a-f]*")
     return found
 
 
@@ -187,7 +189,11 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     names = {path.name for path in folder.iterdir()}
     tables = {f"{name}.parquet" for name in ("trials", "runs", "sites", "findings", "operating", "pixels")}
     assert names >= {"study.json", "report.html", "provenance.json", "experiment.yaml", *tables}
+    assert_declared(folder)
     record = read_record(folder)
+    limits = pd.read_csv(folder / "limits.csv")
+    assert limits["frames"].tolist() == [1, 2] and limits["inspections"].tolist() == [20, 20]
+    assert read_record(folder.parent / "latest").digest == record.digest
     assert [one.frames for one in record.set_ups] == [1, 2]
     for one in record.set_ups:
         assert sorted(set(one.inspected.board.tolist())) == [0, 1, 2, 3]
@@ -205,7 +211,9 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     assert runs[runs.role != "calibration"].groupby("frames").threshold.nunique().eq(1).all()
 
 
-def judged(home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str) -> tuple[StudyRecord, Tables]:
+def judged(
+    home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str
+) -> tuple[StudyRecord, ResultTables]:
     """A study run serially in this process, on the renders that are there, its journal in ``folder``."""
     experiment = load_experiment(home / "tiny.yaml", changes)
     plan = plan_of(experiment, home / "out" / ".cache" / "renders")

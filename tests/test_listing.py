@@ -14,6 +14,7 @@ import pytest
 from harness import clean, ls
 from harness.engine.journal import Entry, Journal
 from harness.engine.lock import locked
+from harness.listing.latest import latest_run, point_to
 from harness.listing.text import age_text, bytes_of, seconds_of, size_text
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
@@ -162,6 +163,98 @@ def test_the_cache_is_counted(cache, tmp_path, capsys):
     assert ls.main(["cache", "--out", str(tmp_path / "none")]) == 0
 
 
+def test_what_tells_runs_apart_and_the_limits_found_are_listed(tmp_path, capsys):
+    for digest, frames, size in (("0" * 16, 1, "5.314"), ("1" * 16, 50, "")):
+        folder = results(tmp_path, digest, trials={"done": 5})
+        settings = (
+            f"name: study\ncapture: {{frames: {frames}}}\nseed: 3\nsource: {{target: {{distance_m: 0.{frames}}}}}\n"
+        )
+        (folder / "experiment.yaml").write_text(f"# tofpod experiment 1\n{settings}")
+        rows = f'"far, {frames} frames",{size},{"demonstrated" if size else "not demonstrated"}\n'
+        rows += "near,3.2,demonstrated\n" if size else ""
+        (folder / "limits.csv").write_text(f"set_up,a90_95_mm,a90_95_verdict\n{rows}")
+    point_to(folder)
+    rows = listed(capsys, tmp_path)
+    assert rows["0" * 16]["differs"] == {"capture.frames": 1, "source.target.distance_m": 0.1}
+    assert rows["0" * 16]["limits"][0] == {"set_up": "far, 1 frames", "verdict": "demonstrated", "a90_95_mm": 5.314}
+    assert rows["1" * 16]["is_latest"] and not rows["0" * 16]["is_latest"]
+    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[3] == "      a90/95 3.20 mm (near) to 5.31 mm (far, 1 frames)"
+    assert lines[4] == "      frames=1, distance=0.1 m"
+    assert lines[5].endswith("complete: 5 trials, latest")
+    assert lines[6] == "      a90/95 not demonstrated"
+
+
+@pytest.mark.parametrize("content", [b"", b"a,b\n1,2\n", b"\xff", b"set_up,a90_95_mm,a90_95_verdict\nx,y,z\n"])
+def test_whatever_stands_in_settings_and_limits_the_list_goes_on(tmp_path, capsys, content):
+    results(tmp_path, "0" * 16, trials={"done": 5})
+    folder = results(tmp_path, "1" * 16, trials={"done": 5})
+    (folder / "limits.csv").write_bytes(content)
+    (folder / "experiment.yaml").write_bytes(b"# tofpod experiment 1\n[" + content)
+    rows = listed(capsys, tmp_path)
+    assert rows["1" * 16]["limits"] == [] and rows["1" * 16]["differs"] == {}
+
+
+# ---------------------------------------------------------------- the newest run
+
+
+def test_latest_is_a_relative_link_that_follows_the_newest_run(tmp_path):
+    first, second = (results(tmp_path, digit * 16, trials={"done": 1}, started=f"2026-11-2{digit}") for digit in "12")
+    link = first.parent / "latest"
+    for run in (first, second, first):
+        point_to(run)
+        assert os.readlink(link) == run.name
+        assert read_text(link / "report.html") == "<html>"
+    assert sorted(path.name for path in first.parent.iterdir()) == [first.name, second.name, "latest"]
+
+
+def read_text(path: Path) -> str:
+    return path.read_text()
+
+
+def test_latest_is_a_text_file_where_links_cannot_be_made(tmp_path, monkeypatch):
+    def refused(*_: object) -> None:
+        raise OSError("no links here")
+
+    monkeypatch.setattr("os.symlink", refused)
+    run = results(tmp_path, "0" * 16, trials={"done": 1})
+    point_to(run)
+    assert (run.parent / "latest").read_text() == f"{run.name}\n"
+    assert latest_run(run.parent) == run.name
+    point_to(results(tmp_path, "1" * 16, trials={"done": 1}))
+    assert latest_run(run.parent) == "1" * 16
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_a_latest_of_somebody_else_is_left_alone(tmp_path, capsys, kind):
+    run = results(tmp_path, "0" * 16, trials={"done": 1})
+    theirs = run.parent / "latest"
+    (tmp_path / "goal").mkdir()
+    {
+        "file": lambda: theirs.write_text("my notes"),
+        "folder": theirs.mkdir,
+        "link": lambda: theirs.symlink_to("../goal"),
+    }[kind]()
+    point_to(run)
+    assert "is not tofpod's" in capsys.readouterr().err
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert os.path.lexists(theirs) and not run.exists()
+
+
+def test_latest_neither_counts_twice_nor_outlives_its_run(tmp_path, capsys):
+    first, second = (results(tmp_path, digit * 16, trials={"done": 1}, started=f"2026-11-2{digit}") for digit in "12")
+    point_to(second)
+    left = first.parent / ".latest.0123abcd.part"
+    left.symlink_to(first.name)
+    assert set(listed(capsys, tmp_path)) == {first.name, second.name}
+    assert clean.main(["results", "study/latest", "--yes", "--out", str(tmp_path)]) == 2
+    assert clean.main(["results", f"study/{second.name}", "--yes", "--out", str(tmp_path)]) == 0
+    assert latest_run(first.parent) == first.name and not left.is_symlink()
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert not first.parent.exists()
+
+
 # ---------------------------------------------------------------- what is removed
 
 
@@ -229,7 +322,10 @@ def test_nothing_is_removed_unasked(cache, tmp_path, capsys, monkeypatch):
 def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
     first = results(tmp_path, "0" * 16, records=2, trials={"done": 2})
     (first / "point-000").mkdir()
-    (first / "point-000" / "cloud.ply").write_text("ply")
+    for name in ("cloud.ply", "targets.png", "findings.csv"):
+        (first / "point-000" / name).write_text("x")
+    for name in ("map-2-50.html", "limits.csv", "limits.parquet", "compare.json", "thresholds.csv", "claims.csv"):
+        (first / name).write_text("x")
     (first / "journal" / "00" / f".damaged-00007-{'7' * 16}.abcd1234.part.jsonl").write_text("half")
     second = results(tmp_path, "1" * 16, records=2, trials={"done": 2})
     (second / "notes.md").write_text("mine")

@@ -17,7 +17,7 @@ from detectors.missing import ALPHA, measure_missing, missing_returns, one_damag
 from harness.evaluation.study.limit import limit_of
 from harness.inspection.judging import judged as judged_cloud
 from harness.report.findings import write_findings
-from harness.report.study_rows import limit_rows
+from harness.tables.limits import LIMITS, notes_of
 from harness.testing.clouds import LENS, SHAPE, plane, without
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
@@ -205,9 +205,11 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
     unseen[lost] = True
     seen = replace(record.inspected, hit=by_depth | unseen, by_depth=by_depth, by_no_return=unseen)
 
-    both, alone = limit_rows([limit_of(replace(record, inspected=seen), draws=50), limit_of(record, draws=50)])
+    limits = [limit_of(replace(record, inspected=seen), draws=50), limit_of(record, draws=50)]
+    grid = LIMITS.grid(limits)
+    both, alone = (row[grid.heads.index("found")].text for row in grid.rows)
 
     n, hits = len(by_depth), int(by_depth.sum())
-    assert both.found == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
-    assert f"5 of {hits + 5} hits by missing returns alone" in both.why
-    assert alone.found == f"{hits} of {n}"
+    assert both == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
+    assert f"5 of {hits + 5} hits by missing returns alone" in "; ".join(notes_of(limits[0]))
+    assert alone == f"{hits} of {n}"

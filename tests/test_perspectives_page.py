@@ -16,7 +16,7 @@ from harness.evaluation.summary import summarise_holes
 from harness.report.page import write_report
 from harness.report.perspectives_page import map_files, perspectives_html
 from harness.report.perspectives_rows import Ways
-from harness.report.terminal import maps_table, maps_text
+from harness.report.terminal import maps_grid
 
 YAML = "name: perspectives # <few> & many\n"
 METHODS = ("icp", "cpd", "marks")
@@ -155,15 +155,15 @@ def test_the_terminal_shows_counts_of_both_numbers_of_frames(found):
     summary = summarise_holes(found.holes, list(found.axes["path"]))
     compared = compare_maps(found, summary)
     ways = Ways.of(found, compared)
-    lines = maps_text(compared, ways).splitlines()
+    lines = maps_grid(compared, ways).lines()
     assert len(lines) == 1 + 6
     assert re.match(r"registration, merge +1 view +2 views +9 views$", lines[0])
     assert re.match(r"marks, fusion +7 / 8 +7 / 8 +8 / 9$", lines[-1])
-    assert "of 11 with N=1 / N=50 frames a view" in str(maps_table(compared, ways).title)
+    assert "of 11 with N=1 / N=50 frames a view" in maps_grid(compared, ways).title
     half = found.holes["hole"].eq("4") & found.holes["repeat"].lt(6)
     unsure = replace(found, holes=found.holes.assign(detected=found.holes["detected"] & ~half))
     again = compare_maps(unsure, summarise_holes(unsure.holes, list(found.axes["path"])))
-    assert re.match(r"icp, grid +7 / 7\+1 +7 / 7\+1 +7 / 7\+1$", maps_text(again, ways).splitlines()[1])
+    assert re.match(r"icp, grid +7 / 7\+1 +7 / 7\+1 +7 / 7\+1$", maps_grid(again, ways).lines()[1])
 
 
 def test_a_guess_that_was_never_known_gives_no_picture_of_fiducials(small):

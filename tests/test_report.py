@@ -17,9 +17,9 @@ from synthetic_tables import Tables, World, example, joined, provenance, tables
 
 from harness.evaluation.summary import summarise_holes
 from harness.report.clouds import cloud_figure
-from harness.report.measures import inches
 from harness.report.page import answer_sentence, report_html, write_report
-from harness.report.terminal import terminal_table, terminal_text
+from harness.report.terminal import holes_grid
+from harness.tables.text import inches
 from harness.thesis.claims import score_claims
 from harness.vocabulary.errors import UserError
 
@@ -196,12 +196,12 @@ def test_terminal_table_and_its_plain_twin_say_the_same() -> None:
     from rich.console import Console
 
     summary = summarise_holes(tables().holes)
-    plain = terminal_text(summary).splitlines()
+    plain = holes_grid(summary).lines()
     assert plain[0].split()[:9] == ["hole", "drill", "mm", "N=1", "N=2", "N=5", "N=10", "N=20", "N=50"]
     assert plain[4].split()[:9] == ["4", '1/4"', "6.35", "0/50", "0/50", "0/50", "50/50", "50/50", "50/50"]
     assert len(plain) == 12
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(terminal_table(summary))
+    console.print(holes_grid(summary).rich())
     drawn = [line.split() for line in console.export_text().splitlines() if line.strip()]
     assert [line for line in drawn if line and line[0].isdecimal()] == [line.split() for line in plain[1:]]
 

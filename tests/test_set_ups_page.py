@@ -17,7 +17,7 @@ from harness.evaluation.summary import summarise_holes
 from harness.report.page import write_report
 from harness.report.set_ups_page import set_ups_html
 from harness.report.set_ups_rows import Layout, matrix_rows
-from harness.report.terminal import set_ups_text
+from harness.report.terminal import set_ups_grid
 
 AXES = ["source.camera.name", "source.target.distance_m"]
 SMALLEST = {"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)}
@@ -107,7 +107,7 @@ def test_matrix_has_the_counts_of_both_numbers_of_frames():
     ]
     assert rows[0]["cells"][0][1]["found"] == "3–11"
     assert rows[0]["cells"][0][1]["limit"] == "4.76 mm"
-    text = set_ups_text(compared, layout).splitlines()
+    text = set_ups_grid(compared, layout).lines()
     assert len(text) == 1 + 6
     assert re.match(r"kinect_v2 +1 m +6 of 11 6–11 +9.52 +7 of 11 5–11 +7.94$", text[4])
 

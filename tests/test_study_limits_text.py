@@ -16,21 +16,15 @@ from harness.evaluation.study.axes import FRAMES, axis_lines
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import SetUpResult, StudyResult
 from harness.report.examples import StudyExample
-from harness.report.study_axes_figure import axis_figure, axis_groups
-from harness.report.study_axes_rows import axis_heads, axis_rows
+from harness.report.study_axes_figure import axis_figure
 from harness.report.study_examples_figure import examples_figure, framed_pixels
-from harness.report.study_pod_figures import MOST_PANELS, curves_figure, with_room
-from harness.report.study_rows import (
-    interval_text,
-    limit_notes,
-    limit_rows,
-    limit_sentence,
-    study_answer,
-    unbroken,
-    unmeasured,
-    with_interval,
-)
-from harness.report.study_terminal import HEADS, study_table, study_text
+from harness.report.study_figures import MOST_PANELS, curves_figure, with_room
+from harness.report.study_page import study_parts
+from harness.tables.grid import Grid, text_of
+from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, notes_of, study_answer
+from harness.tables.schema import Estimate
+from harness.tables.study import axis_grid, axis_groups
+from harness.tables.text import interval, unbroken, unmeasured, with_interval
 
 
 def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
@@ -42,6 +36,16 @@ def result_of(limits: list[SetUpLimit]) -> StudyResult:
     """A result of limits alone."""
     set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", (), np.nan) for one in limits)
     return StudyResult(study_record(), set_ups, (), ())
+
+
+def row_of(limit: SetUpLimit) -> dict[str, str]:
+    """The limit's cells on the page by their heads."""
+    grid = LIMITS.grid([limit])
+    return dict(zip(grid.heads, (cell.text for cell in grid.rows[0]), strict=True))
+
+
+def study_text(limits: list[SetUpLimit]) -> str:
+    return text_of(study_parts(result_of(limits)))
 
 
 @pytest.fixture(scope="module")
@@ -80,10 +84,11 @@ def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit
 
 
 def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> None:
-    row = limit_rows([nothing_found])[0]
-    assert (row.a50, row.a90, row.a90_95, row.over_boards) == ("none", "none", "not demonstrated", "not demonstrated")
-    assert row.why.startswith("every target was missed")
-    assert not row.demonstrated
+    row = row_of(nothing_found)
+    assert [row[head] for head in ("a50 (mm)", "a90 (mm)")] == ["none", "none"]
+    assert [row[head] for head in ("a90/95 (mm)", "over boards (mm)")] == ["not demonstrated"] * 2
+    assert notes_of(nothing_found)[0].startswith("every target was missed")
+    assert not is_within_sizes(nothing_found)
     assert "a90/95 is not demonstrated: every target was missed" in limit_sentence(nothing_found)
 
 
@@ -93,7 +98,7 @@ def test_the_answer_is_without_statistics(two: list[SetUpLimit]) -> None:
     said = limit_sentence(limit)
     assert said.startswith("1 frame: a90/95 is not demonstrated: the hits do not grow clearly with diameter; ")
     assert "3.84" not in said
-    assert "(ratio 1.79 <= 3.84)" in limit_rows([limit])[0].why
+    assert "(ratio 1.79 <= 3.84)" in "; ".join(notes_of(limit))
 
 
 def test_sizes_beyond_those_inspected_are_no_numbers(two: list[SetUpLimit]) -> None:
@@ -105,28 +110,28 @@ def test_sizes_beyond_those_inspected_are_no_numbers(two: list[SetUpLimit]) -> N
         a90_mm=21.0,
         a90_interval_mm=Interval(15.0, np.inf),
     )
-    row = limit_rows([limit])[0]
-    assert (row.a90_95, row.over_boards, row.a90) == ((">\u00a014",) * 3)
-    assert row.a50 == f"{limit.a50_mm:.2f} (4.20 to >\u00a014)"
-    assert not row.demonstrated
-    assert not row.over_demonstrated
-    assert "lies beyond the largest size inspected, 14 mm" in row.why
+    row = row_of(limit)
+    assert (row["a90/95 (mm)"], row["over boards (mm)"], row["a90 (mm)"]) == ((">\u00a014",) * 3)
+    assert row["a50 (mm)"] == f"{limit.a50_mm:.2f} (4.20 to >\u00a014)"
+    assert not is_within_sizes(limit)
+    assert not is_within_sizes(limit, limit.over_boards)
+    assert "lies beyond the largest size inspected, 14 mm" in "; ".join(notes_of(limit))
     assert "no limit (a90/95) within the sizes inspected (1 to 14 mm); " in limit_sentence(limit)
-    wide = limit_rows([replace(limit, a90_interval_mm=Interval(12.0, np.inf))])[0].a90
+    wide = row_of(replace(limit, a90_interval_mm=Interval(12.0, np.inf)))["a90 (mm)"]
     assert wide == ">\u00a014 (12.00 to >\u00a014)"
-    terminal = study_text(result_of([limit]))
+    terminal = study_text([limit])
     assert "14 mm" in terminal
     assert "e+" not in terminal
-    assert "> 14  > 14" in re.sub(r"\s\s+", "  ", terminal.replace("\u00a0", " "))
+    assert "> 14  > 14  > 14" in re.sub(r"\s\s+", "  ", terminal.replace("\u00a0", " "))
 
 
 def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> None:
     failed = [replace(one, record=replace(one.record, failed=3)) for one in two]
     failed[1] = replace(failed[1], a90_95=replace(failed[1].a90_95, value=np.inf, why="not demonstrated: of a ceiling"))
-    notes = limit_notes(limit_rows(failed))
+    notes = limit_notes(failed)
     assert notes[0] == "every set-up: 3 trials failed and are missing"
     assert notes[1] == "50 frames: of a ceiling"
-    assert limit_notes(limit_rows(two[:1])) == []
+    assert limit_notes(two[:1]) == []
     assert limit_notes([]) == []
 
 
@@ -137,28 +142,44 @@ def test_notes_of_statements_lose_sizes_that_nobody_inspected() -> None:
 
 
 def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLimit) -> None:
-    row = limit_rows([everything_found])[0]
+    row = row_of(everything_found)
     # the smallest of 160 sizes from 1 to 14 mm: an upper limit of both estimates, and none of them has an interval
-    assert row.a50 == row.a90 == "≤\u00a01.00"
-    assert row.a90_95 == f"{everything_found.a90_95.value:.2f}"
-    assert row.why.startswith("all found: binomial")
-    assert row.found == "160 of 160"
+    assert row["a50 (mm)"] == row["a90 (mm)"] == "≤\u00a01.00"
+    assert row["a90/95 (mm)"] == f"{everything_found.a90_95.value:.2f}"
+    assert notes_of(everything_found)[0].startswith("all found: binomial")
+    assert row["found"] == "160 of 160"
 
 
 def test_the_terminals_table_and_its_plain_twin_say_the_same(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
     from rich.console import Console
 
     limits = [*two, nothing_found]
-    result = result_of(limits)
-    plain = study_text(result)
+    plain = study_text(limits)
     console = Console(width=110, force_terminal=False)
+    (grid,) = [part for part in study_parts(result_of(limits)) if isinstance(part, Grid)]
     with console.capture() as capture:
-        console.print(study_table(result))
+        console.print(grid.rich())
     shown = [line.split() for line in capture.get().splitlines()[1:]]
     assert shown == [line.split() for line in plain.splitlines()[: len(limits) + 1]]
-    assert plain.splitlines()[0].split() == " ".join(HEADS).split()
+    assert max(map(len, plain.splitlines()[: len(limits) + 1])) <= 105
     for limit in limits:
         assert limit_sentence(limit) in plain
+
+
+def test_every_number_of_a_limit_stands_in_its_file(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
+    frame = LIMITS.frame([*two, nothing_found])
+    first = frame.iloc[0]
+    limit = two[0]
+    assert limit.false_calls is not None
+    ends = limit.a90_interval_mm
+    numbers = (first["a90_95_mm"], first["a90_mm"], first["a90_low_mm"], first["a90_high_mm"], first["a50_mm"])
+    assert numbers == (limit.a90_95.value, limit.a90_mm, ends.low, ends.high, limit.a50_mm)
+    rate = limit.false_calls.interval_per_m2
+    assert (first["false_calls_low_per_m2"], first["false_calls_high_per_m2"]) == (rate.low, rate.high)
+    assert (first["targets"], first["boards"], first["hits"]) == (limit.targets, limit.boards, limit.hits)
+    assert first["a90_95_method"] == "likelihood ratio"
+    assert list(frame["a90_95_verdict"]) == ["demonstrated", "demonstrated", "not demonstrated"]
+    assert np.isnan(frame["a90_95_mm"].iloc[2])
 
 
 def test_boards_that_matter_and_failed_trials_are_told(two: list[SetUpLimit]) -> None:
@@ -168,7 +189,7 @@ def test_boards_that_matter_and_failed_trials_are_told(two: list[SetUpLimit]) ->
         design_effect=2.34,
         record=replace(two[0].record, failed=3),
     )
-    why = limit_rows([limit])[0].why
+    why = "; ".join(notes_of(limit))
     assert "design effect 2.3" in why
     assert "3 trials failed" in why
 
@@ -179,20 +200,20 @@ def test_repeats_are_no_targets_and_both_limits_are_told() -> None:
     assert limit.statement.independent is not None
     wrong = limit.statement.independent.value
     assert wrong < limit.a90_95.value
-    why = limit_rows([limit])[0].why
+    why = "; ".join(notes_of(limit))
     assert "480 inspections of 160 targets count as 160" in why
     assert f"were every inspection a target of its own, a90/95 would be {wrong:.2f} mm: wrong" in why
 
 
 def test_few_targets_are_told() -> None:
     limit = limits_of(SetUp(), holes=2)[0]
-    assert "40 independent targets; MIL-HDBK-1823A asks for at least 60" in limit_rows([limit])[0].why
+    assert "40 independent targets; MIL-HDBK-1823A asks for at least 60" in "; ".join(notes_of(limit))
 
 
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
 def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
-    text = with_interval(value, Interval(value - down, value + up))
+    text = with_interval(value, value - down, value + up)
     numbers = [float(one) for one in re.findall(r"-?\d+\.\d\d", text)]
     assert np.allclose(numbers, [value, value - down, value + up], atol=0.0051)
 
@@ -202,11 +223,13 @@ def test_numbers_are_held_to_their_units() -> None:
 
 
 def test_intervals_without_ends() -> None:
-    assert interval_text(UNKNOWN) == "unknown"
-    assert with_interval(1.0, UNKNOWN) == "1.00"
-    assert with_interval(1.0, Interval(0.5, np.inf)) == "1.00 (0.50 to ∞)"
-    assert with_interval(np.inf, Interval(2.0, np.inf)) == "∞ (2.00 to ∞)"
-    assert with_interval(np.nan, Interval(2.0, 3.0)) == "none"
+    unknown = (UNKNOWN.low, UNKNOWN.high)
+    assert interval(*unknown) == "unknown"
+    assert with_interval(1.0, *unknown) == "1.00"
+    assert with_interval(1.0, 0.5, np.inf) == "1.00 (0.50 to ∞)"
+    assert with_interval(np.inf, 2.0, np.inf) == "∞ (2.00 to ∞)"
+    assert with_interval(np.nan, 2.0, 3.0) == "none"
+    assert Estimate(3.2, 2.9, 3.6).text() == "3.20 (2.90 to 3.60)"
 
 
 def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
@@ -226,9 +249,10 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
     assert list(camera.lines) == [f"distance={at} m, {n}" for at in ("0.5", "1") for n in ("1 frame", "50 frames")]
     assert list(distance.lines) == ["a, 1 frame", "a, 50 frames", "b, 1 frame", "b, 50 frames"]
     assert distance.lines["b, 50 frames"].limits == (limits[5], limits[7])
-    rows = axis_rows(distance)
-    assert [row[:2] for row in rows[:3]] == [("a, 1 frame", "0.5 m"), ("", "1 m"), ("a, 50 frames", "0.5 m")]
-    assert {len(row) for row in rows} == {len(axis_heads(distance))}
+    grid = axis_grid(distance)
+    rows = [tuple(cell.text for cell in row) for row in grid.rows]
+    assert [row[:2] for row in rows[1:3]] == [("a, 1 frame", "1 m"), ("a, 50 frames", "0.5 m")]
+    assert grid.heads[:2] == ("set-ups", "distance (m)")
     step = distance.lines["a, 1 frame"].steps[0]
     assert rows[1][-1].startswith(f"× {limits[2].a90_mm / limits[0].a90_mm:.2f} ({step.interval.low:.2f} to")
     assert rows[1][-1].endswith(" *") == step.beyond_chance
@@ -261,7 +285,7 @@ def test_no_axis_without_two_values(two: list[SetUpLimit]) -> None:
     assert axis_groups(axis_lines(two[:1])) == []
     (frames,) = axis_groups(axis_lines(two))
     assert list(frames.lines) == [""]
-    assert axis_heads(frames)[0] == "frames"
+    assert axis_grid(frames).heads[0] == "frames"
 
 
 def test_of_many_set_ups_those_from_the_smallest_limit_to_the_largest_are_shown(two: list[SetUpLimit]) -> None:

@@ -14,9 +14,10 @@ from test_study_limits_text import example
 
 from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
-from harness.report.study_page import study_html, write_study_report
-from harness.report.study_rows import limit_sentence, unbroken
-from harness.report.study_terminal import study_text
+from harness.report.study_page import study_html, study_parts, write_study_report
+from harness.tables.grid import text_of
+from harness.tables.limits import limit_sentence
+from harness.tables.text import unbroken
 from harness.vocabulary.errors import UserError
 from scenes.target.thesis import DIAMETERS_IN
 
@@ -192,14 +193,14 @@ def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
     told = (
         "1 frame: the threshold is 83 deviations, above 10: something other than noise sets it (calibration board 1, "
     )
-    assert study_text(high).startswith(f"warning: {told}at x, y = −120, 33 mm)")
+    assert text_of(study_parts(high)).startswith(f"warning: {told}at x, y = −120, 33 mm)")
     assert f"warning: {told}" in words(html(high)).replace("\u00a0", " ").partition("is found 90 %")[0]
     off = np.full(4, np.nan)
-    assert f"warning: {told}off the board)" in study_text(warned(83.0, x_mm=off, y_mm=off))
-    assert "warning" not in study_text(warned(10.0))
+    assert f"warning: {told}off the board)" in text_of(study_parts(warned(83.0, x_mm=off, y_mm=off)))
+    assert "warning" not in text_of(study_parts(warned(10.0)))
     given = replace(high.record, set_ups=(replace(high.record.set_ups[0], calibrated=None),))
     told_nothing = evaluate_study(given, study_tables(small(SetUp())), {}, draws=20)
-    assert "warning" not in study_text(told_nothing)
+    assert "warning" not in text_of(study_parts(told_nothing))
     assert "What set each threshold" not in html(told_nothing)
 
 

@@ -43,7 +43,7 @@ def sweep(yaml: Path, out: Path, *arguments: str, **environment: str) -> subproc
 
 def results(out: Path) -> Path:
     """The one folder of results."""
-    (found,) = (out / "tiny").iterdir()
+    (found,) = (out / "tiny").glob("[0-9a-f]*")
     return found
 
 

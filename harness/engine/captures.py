@@ -14,7 +14,9 @@ from harness.experiment.points import Experiment, Point, recording_of
 from harness.experiment.schema import CaptureSource
 from harness.inspection.judging import judged as judged_cloud
 from harness.inspection.told import choice_by, choice_facts, pictures, print_warnings
+from harness.listing.latest import point_to
 from harness.report.findings import Judged, write_findings
+from harness.tables.outputs import CAPTURES, EXPERIMENT
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import record
@@ -34,7 +36,7 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
     if dry_run:
         print(f"{experiment.config.name}: valid; {len(experiment.points)} points of a real capture; results: {folder}")
         return 0
-    write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     rows = []
     for number, point in enumerate(experiment.points):
         judged, threshold, choice = _judged(point)
@@ -61,7 +63,8 @@ def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: 
         for left in judged.cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")
     table = pd.DataFrame(rows).assign(results_version=RESULTS_VERSION)
-    write_text(folder / "summary.csv", table.to_csv(index=False))
+    write_text(folder / CAPTURES.name, table.to_csv(index=False))
+    point_to(folder)
     print(f"findings: {folder}")
     return 0
 

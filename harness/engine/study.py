@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import datetime
-import io
 import json
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,13 +20,18 @@ from harness.engine.outcome import Outcome
 from harness.engine.plan import Plan, plan_of
 from harness.engine.rates import learn
 from harness.engine.run import render_missing, run_plan
-from harness.engine.tables import STUDY_ORDERS, Tables, tables_of
+from harness.engine.tables import origin_of, summaries, tables_of, write_tables
 from harness.engine.work import STATES, Engine
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment
 from harness.experiment.schema import SimulatedSource
+from harness.listing.latest import point_to
+from harness.tables.grid import Grid, show
+from harness.tables.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
+from harness.tables.schema import write_table
+from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import atomic_path, write_text
+from harness.vocabulary.files import write_text
 from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
 from harness.vocabulary.provenance import record
@@ -39,12 +43,6 @@ from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-    from rich.table import Table
-
-
-PROVENANCE = "provenance.json"
 MOST_FAILURES = 200
 """That are told one by one; the journal has all."""
 MOST_VIEWS = 64
@@ -63,7 +61,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     try:
         plan = plan_of(experiment, _cache(out))
         # The first file written: an unwritable folder shows before any work is done.
-        write_text(folder / "experiment.yaml", resolved_yaml(experiment))
+        write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         journal = Journal(folder / "journal")
         with in_use(_cache(out)), locked(folder, options.shard), engine_of(options, detectors) as engine:
             with progress_display() as show:
@@ -77,30 +75,31 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             tables = tables_of(_records(journal, outcome), experiment)
             provenance = _provenance(experiment, plan, outcome, tables, origin, started)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
-            _write_tables(folder, tables, provenance, is_study=experiment.config.study is not None)
-            table: RenderableType
+            write_tables(folder, tables, provenance)
+            write_text(folder / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
             if experiment.config.study is None:
                 _write_report(folder, experiment, outcome, tables, provenance)
-                table, text = _final_table(tables)
+                shown = _final_table(tables)
             else:
-                table, text = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
+                shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
         if options.cache_limit_gb is not None:
             trim_cache(_cache(out), round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
-    _conclude(folder, table, text, outcome)
+    point_to(folder)
+    _conclude(folder, shown, outcome)
     return 1 if outcome.failures else 0
 
 
 def _refuse_newer(folder: Path) -> None:
     """Results of a newer tofpod are not written over. Raises UserError."""
     try:
-        version = strict_json(bounded_bytes(folder / PROVENANCE, RECORD_BYTES))["results_version"]
+        version = strict_json(bounded_bytes(folder / PROVENANCE.name, RECORD_BYTES))["results_version"]
     except (OSError, ValueError, KeyError, TypeError):
         return
     if type(version) is int and version > RESULTS_VERSION:
-        check_version(version, RESULTS_VERSION, folder / PROVENANCE, "a result folder")
+        check_version(version, RESULTS_VERSION, folder / PROVENANCE.name, "a result folder")
 
 
 def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
@@ -120,23 +119,23 @@ def _write_study(
     experiment: Experiment,
     plan: Plan,
     outcome: Outcome,
-    tables: Tables,
+    tables: ResultTables,
     provenance: dict[str, Any],
     engine: Engine,
-) -> tuple[RenderableType, str]:
-    """A study's record and report; its limits as a table and as text."""
+) -> list[str | Grid]:
+    """Write a study's record, tables and report. Returns what a terminal shows of it."""
     from harness.engine.study_examples import shown_in, study_examples
     from harness.engine.study_record import failed_by_point, record_of
     from harness.evaluation.study.record import record_text
     from harness.evaluation.study.result import evaluate_study
-    from harness.report.study_page import write_study_report
-    from harness.report.study_terminal import study_table, study_text
+    from harness.report.study_page import study_parts, write_study_report
+    from harness.tables.study import study_tables
 
     failed = failed_by_point(plan, (failure.what for failure in outcome.failures), outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)
     if not study.set_ups:
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
-    write_text(folder / "study.json", record_text(study))
+    write_text(folder / STUDY.name, record_text(study))
     result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
     shown = shown_in(plan, result.limits)
     # of trials that were run on other machines the views may not be here
@@ -144,8 +143,10 @@ def _write_study(
     outcome.failures += lost
     examples = study_examples([] if lost else shown, outcome.thresholds)
     title = experiment.config.title or experiment.config.name
+    for table, rows in study_tables(result).items():
+        write_table(folder, table, table.frame(rows), origin_of(provenance))
     write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
-    return study_table(result), study_text(result)
+    return study_parts(result)
 
 
 def _table_one_mm(experiment: Experiment) -> list[float]:
@@ -195,7 +196,7 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 
 
 def _provenance(
-    experiment: Experiment, plan: Plan, outcome: Outcome, tables: Tables, origin: dict[str, Any], started: str
+    experiment: Experiment, plan: Plan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any], started: str
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
     views = _views_of_set_ups(plan)
@@ -245,53 +246,22 @@ def _indirect_noise_mm(views: list[NoiseFreeView]) -> dict[str, float]:
     return noise
 
 
-def _write_tables(folder: Path, tables: Tables, provenance: dict[str, Any], *, is_study: bool) -> None:
-    """Parquet with the provenance in its schema, the summary as CSV (a study's boards have none hole by hole), the
-    provenance as JSON."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from harness.evaluation.summary import summarise_holes
-
-    numbers = {k: provenance[k] for k in ("results_version", "experiment", "digest", "seed", "commit", "dirty")}
-    note = json.dumps({**numbers, "versions": provenance["versions"]}, sort_keys=True)
-    stored_tables = {"trials": tables.holes, "runs": tables.runs, "probes": tables.probes, "noise": tables.noise}
-    stored_tables |= {"registrations": tables.registrations, "walls": tables.walls}
-    stored_tables |= {name: getattr(tables, name) for name in STUDY_ORDERS}
-    for name, table in stored_tables.items():
-        if table.empty and name not in ("trials", "runs"):
-            continue
-        stored = pa.Table.from_pandas(table, preserve_index=False)
-        stored = stored.replace_schema_metadata({**(stored.schema.metadata or {}), b"tofpod": note.encode()})
-        with atomic_path(folder / f"{name}.parquet") as path:
-            pq.write_table(stored, path)
-    if not is_study:
-        buffer = io.StringIO()
-        summary = summarise_holes(tables.holes, list(tables.axes["path"])).assign(results_version=RESULTS_VERSION)
-        summary.to_csv(buffer, index=False, float_format="%.6g")
-        write_text(folder / "summary.csv", buffer.getvalue())
-    write_text(folder / PROVENANCE, json.dumps(provenance, indent=2) + "\n")
-
-
 def _write_report(
-    folder: Path, experiment: Experiment, outcome: Outcome, tables: Tables, provenance: dict[str, Any]
+    folder: Path, experiment: Experiment, outcome: Outcome, tables: ResultTables, provenance: dict[str, Any]
 ) -> None:
+    for table, frame in summaries(tables, outcome.examples).items():
+        write_table(folder, table, frame, origin_of(provenance))
     from harness.report.page import write_report
 
     title = experiment.config.title or experiment.config.name
     write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title)
 
 
-def _conclude(folder: Path, table: RenderableType, text: str, outcome: Outcome) -> None:
-    """The final table, what did not end well, and where to look."""
-    from rich.console import Console
-
-    if sys.stdout.isatty():
-        Console().print(table)
-    else:
-        print(text)
+def _conclude(folder: Path, shown: list[str | Grid], outcome: Outcome) -> None:
+    """Print the final table, what did not end well, and where to look."""
+    show(shown)
     _tell_failures(outcome)
-    print(f"report: {folder / 'report.html'}")
+    print(f"report: {folder / REPORT.name}")
 
 
 def _tell_failures(outcome: Outcome) -> None:
@@ -314,8 +284,8 @@ def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> i
     return 1 if outcome.failures else 0
 
 
-def _final_table(tables: Tables) -> tuple[Table, str]:
-    """What a terminal shows at the end, and the same as plain text: by the kind of experiment."""
+def _final_table(tables: ResultTables) -> list[str | Grid]:
+    """What a terminal shows at the end, by the kind of experiment."""
     from harness.evaluation.maps import compare_maps
     from harness.evaluation.set_ups import compare_set_ups, set_ups_of
     from harness.evaluation.summary import summarise_holes
@@ -327,9 +297,9 @@ def _final_table(tables: Tables) -> tuple[Table, str]:
     if not tables.registrations.empty:
         compared = compare_maps(tables, summary)
         ways = Ways.of(tables, compared)
-        return terminal.maps_table(compared, ways), terminal.maps_text(compared, ways)
+        return [terminal.maps_grid(compared, ways)]
     if len(set_ups_of(tables)) > 1:
         compared = compare_set_ups(tables, summary, set_ups_of(tables))
         layout = Layout.of(tables, compared)
-        return terminal.set_ups_table(compared, layout), terminal.set_ups_text(compared, layout)
-    return terminal.terminal_table(summary), terminal.terminal_text(summary)
+        return [terminal.set_ups_grid(compared, layout)]
+    return [terminal.holes_grid(summary)]

@@ -8,9 +8,9 @@ from typing import Any
 import pandas as pd
 
 from harness.engine.plan import PACKAGES, Batch, Group, Plan
-from harness.engine.tables import Tables
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.points import Experiment, Point, detector_version
+from harness.tables.trials import ResultTables
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
 
@@ -19,7 +19,7 @@ SIMULATION = ("scenes.sensor.source",)
 
 
 def record_of(
-    experiment: Experiment, plan: Plan, tables: Tables, failed: Mapping[str, int], provenance: Mapping[str, Any]
+    experiment: Experiment, plan: Plan, tables: ResultTables, failed: Mapping[str, int], provenance: Mapping[str, Any]
 ) -> StudyRecord:
     """The record of a study. ``failed``: trials that raised, by point digest. Set-ups no trial of which ended are left
     out, as nothing can be said of them."""
@@ -36,7 +36,7 @@ def record_of(
     )
 
 
-def _set_up(point: Point, group: Group, tables: Tables, failed: int) -> SetUpRecord | None:
+def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> SetUpRecord | None:
     frames = point.config.capture.frames
     holes, runs = (_of(table, point.variant, frames) for table in (tables.holes, tables.runs))
     if holes.empty:

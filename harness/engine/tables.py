@@ -3,85 +3,78 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from harness.engine.walls import wall_rows
+from harness.evaluation.map_case import map_cases
+from harness.evaluation.maps import compare_maps, maps_of
+from harness.evaluation.noise import noise_against_frames
+from harness.evaluation.registration import by_views
+from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.summary import false_calls, summarise_holes
 from harness.experiment.points import MAIN, Experiment, Point
 from harness.experiment.schema import LabelledVariation
 from harness.experiment.unfold import FRAMES
+from harness.tables.schema import Table, write_table
+from harness.tables.trials import (
+    CLAIMS,
+    FALSE_CALLS,
+    NOISE,
+    NOISE_BY_FRAMES,
+    PROBES,
+    REGISTRATION_ERRORS,
+    REGISTRATIONS,
+    RUNS,
+    SET_UPS,
+    STUDY_ONLY,
+    SUMMARY,
+    TRIALS,
+    ResultTables,
+)
 from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.units import MM
+from harness.vocabulary.versions import RESULTS_VERSION
 
-STUDY_ORDERS = {
-    "sites": ["variant", "frames", "board", "repeat", "true_diameter_mm", "hole"],
-    "findings": ["variant", "frames", "role", "board", "repeat"],
-    "operating": ["variant", "frames", "role", "board", "repeat"],
-    "pixels": ["variant", "frames", "board", "repeat"],
-}
-ORDERS = {
-    "holes": ["variant", "frames", "board", "repeat", "true_diameter_mm", "hole"],
-    "runs": ["variant", "role", "frames", "board", "repeat"],
-    "noise": ["variant", "frames", "repeat"],
-    "registrations": ["variant", "role", "frames", "repeat", "view"],
-}
+RECORDED = {"holes": TRIALS, "runs": RUNS, "noise": NOISE, "registrations": REGISTRATIONS}
+"""Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
+OF_STUDY = {table.name: table for table in STUDY_ONLY}
 
 ROWS_AT_ONCE = 20_000
-"""As mappings some 30 MB."""
+"""Rows that are held as mappings, some 30 MB, before they become a frame."""
 
 
-@dataclass(frozen=True)
-class Tables:
-    """All results of an experiment as pandas frames; the columns are those of `harness.engine.trial`'s rows.
-
-    ``holes``: one row per variant, frames, repeat and hole. ``runs``: per variant, frames, repeat and role.
-    ``probes``: per variant, frames and probe pixel, over repeats. ``noise``: per variant, frames and hole-free repeat
-    (columns of `harness.engine.board_noise`). ``registrations``: per registration that was made, under the first
-    variant that shares it (columns of `harness.engine.maps`); empty where there are no maps. All five carry a column
-    per axis other than the number of frames, named by its path, where there are any. ``variants``: one row per set-up,
-    then per variation: variant, reason, settings, is_variation, reference (the set-up to compare with, or empty),
-    switches (JSON, or empty), and the axes. ``axes``: path, name, unit of each of those axes, in their order.
-    ``walls``: what of each hole's wall is shadowed, by number of views (`harness.evaluation.walls`); empty likewise.
-    Of a study all have a column ``board``, probes and noise are empty, and ``sites``, ``findings``, ``operating``,
-    ``pixels`` are those of `harness.evaluation.study.tables.StudyTables`; of any other experiment these are empty.
-    """
-
-    holes: pd.DataFrame
-    runs: pd.DataFrame
-    probes: pd.DataFrame
-    variants: pd.DataFrame
-    noise: pd.DataFrame
-    axes: pd.DataFrame
-    registrations: pd.DataFrame = field(default_factory=pd.DataFrame)
-    walls: pd.DataFrame = field(default_factory=pd.DataFrame)
-    sites: pd.DataFrame = field(default_factory=pd.DataFrame)
-    findings: pd.DataFrame = field(default_factory=pd.DataFrame)
-    operating: pd.DataFrame = field(default_factory=pd.DataFrame)
-    pixels: pd.DataFrame = field(default_factory=pd.DataFrame)
-
-
-def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> Tables:
-    """Collect records into tables in a fixed order; equal for equal records in equal order."""
-    collected = {name: _Rows() for name in (*ORDERS, *STUDY_ORDERS)}
+def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> ResultTables:
+    """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
+    every axis is a column of all tables but those of a study alone."""
+    collected = {name: _Rows() for name in (*RECORDED, *OF_STUDY)}
     probes: list[dict[str, Any]] = []
     for record in records:
         probes.extend(record.get("probes", ()))
         for name, rows in collected.items():
             rows.add(record.get(name, ()))
-    axes, variants = _axes(experiment), _variants(experiment)
-    placed = variants.set_index("variant")[list(axes["path"])]
+    paths = list(experiment.points[0].axes)
+    names = names_of(paths)
+    axes = pd.DataFrame(
+        [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths],
+        columns=["path", "name", "unit"],
+    )
+    variants = _variants(experiment)
+    placed = variants.set_index("variant")[paths]
 
     def with_axes(table: pd.DataFrame) -> pd.DataFrame:
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
-    ordered = {name: with_axes(_ordered(collected[name].table(), order)) for name, order in ORDERS.items()}
-    of_study = {name: _ordered(collected[name].table(), order) for name, order in STUDY_ORDERS.items()}
+    ordered = {name: with_axes(_ordered(collected[name].table(), table)) for name, table in RECORDED.items()}
+    of_study = {name: _ordered(collected[name].table(), table) for name, table in OF_STUDY.items()}
     walls = wall_rows(experiment) if experiment.config.study is None else pd.DataFrame()
-    return Tables(**ordered, **of_study, probes=with_axes(_probes(probes)), variants=variants, axes=axes, walls=walls)
+    return ResultTables(
+        **ordered, **of_study, probes=with_axes(_probes(probes)), variants=variants, axes=axes, walls=walls
+    )
 
 
 class _Rows:
@@ -116,21 +109,10 @@ def _one_a_threshold(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
 
 
-def _ordered(table: pd.DataFrame, order: list[str]) -> pd.DataFrame:
-    order = [name for name in order if name in table]
-    return _numbers(table if table.empty else table.sort_values(order, kind="stable", ignore_index=True))
-
-
-def _axes(experiment: Experiment) -> pd.DataFrame:
-    """The axes that tell set-ups apart; switches first, then in the file's order."""
-    paths = list(experiment.points[0].axes)
-    names = names_of(paths)
-    rows = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
-    return pd.DataFrame(rows, columns=["path", "name", "unit"])
-
-
-def _numbers(table: pd.DataFrame) -> pd.DataFrame:
-    """Columns that JSON filled with None hold numbers with NaN."""
+def _ordered(table: pd.DataFrame, declared: Table) -> pd.DataFrame:
+    """The rows in the declared order; columns that JSON filled with None hold numbers with NaN."""
+    order = [name for name in declared.order if name in table]
+    table = table if table.empty else table.sort_values(order, kind="stable", ignore_index=True)
     for column in table.columns:
         if table[column].dtype == object and not table[column].map(lambda v: isinstance(v, str)).any():
             table[column] = table[column].astype(float)
@@ -166,7 +148,7 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
                 }
             )
         )
-    columns = ["variant", "frames", "pixel", "mean_error_mm", "temporal_std_mm", "displacement_std_mm", "repeats"]
+    columns = [column.name for column in PROBES.columns]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
 
 
@@ -181,7 +163,7 @@ def _displacements(errors_mm: np.ndarray) -> np.ndarray:
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """What each set-up and variation changes, why it is plausible, and where it lies on the axes."""
+    """Changes of each set-up and variation, the reasons for them, and places on the axes."""
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:
@@ -225,3 +207,46 @@ def _reason(experiment: Experiment, point: Point) -> str:
         if named:
             return variation.reason
     return ""
+
+
+# ---------------------------------------------------------------- files
+
+
+def origin_of(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what stands in the schema of every Parquet file."""
+    keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")
+    return {key: provenance[key] for key in keys}
+
+
+def write_tables(folder: Path, tables: ResultTables, provenance: Mapping[str, Any]) -> None:
+    """Write the tables of trials."""
+    for table, frame in tables.stored().items():
+        write_table(folder, table, frame, origin_of(provenance))
+
+
+def summaries(tables: ResultTables, examples: Sequence[Any] = ()) -> dict[Table, pd.DataFrame]:
+    """Return the summaries of an experiment that is no study: all that its page shows. ``examples``: pictures that
+    claims are scored with."""
+    from harness.thesis.cameras import claim_c11
+    from harness.thesis.claims import score_claims
+    from harness.thesis.verdicts import claims_table
+    from harness.thesis.views import score_views
+
+    paths, variants = list(tables.axes["path"]), set_ups_of(tables)
+    summary = summarise_holes(tables.holes, paths)
+    found = {NOISE_BY_FRAMES: noise_against_frames(tables.probes), FALSE_CALLS: false_calls(tables.runs)}
+    if not tables.registrations.empty:
+        own = tables.registrations[tables.registrations["variant"].isin(variants)]
+        found[SET_UPS] = compare_maps(tables, summary)
+        found[REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
+        found[CLAIMS] = claims_table(score_views(map_cases(tables, summary)))
+    elif len(variants) > 1:
+        verdict = claim_c11(summary[summary["variant"].isin(variants)], paths)
+        found[SET_UPS] = compare_set_ups(tables, summary, variants)
+        found[CLAIMS] = claims_table([verdict] if verdict else [])
+    else:
+        found[CLAIMS] = claims_table(score_claims(tables, MAIN, examples, summary))
+    for frame in found.values():
+        for name in {"found", "undecided", "reasons"} & set(frame.columns):
+            frame[name] = frame[name].map("; ".join)
+    return {SUMMARY: summary.assign(results_version=RESULTS_VERSION), **found}

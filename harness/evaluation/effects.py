@@ -11,7 +11,7 @@ import numpy as np
 
 from harness.evaluation.intervals import Interval
 from harness.evaluation.limits import Ladder, ladder_of, percentile
-from harness.evaluation.summary import ResultTables
+from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from harness.evaluation.maps import MapSetUp, maps_of
 from harness.evaluation.paired import Change, SizeErrors, run_change, run_ratio, size_errors
-from harness.evaluation.summary import HoleState, Measure, ResultTables, found_holes, with_columns
+from harness.evaluation.summary import HoleState, Measure, found_holes, with_columns
+from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.set_ups import compare_set_ups
-from harness.evaluation.summary import ResultTables
+from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:

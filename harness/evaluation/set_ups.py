@@ -8,7 +8,8 @@ import numpy as np
 
 from harness.evaluation.limits import Ladder, found_limit_mm, ladder_of
 from harness.evaluation.noise import noise_against_frames
-from harness.evaluation.summary import ResultTables, false_calls
+from harness.evaluation.summary import false_calls
+from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd

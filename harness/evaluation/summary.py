@@ -1,13 +1,12 @@
-"""From rows per trial to rates, means and intervals: the numbers of summary.csv, the report and the final table."""
+"""Rates, means and intervals from rows per trial: the numbers of summary.csv, the report and the final table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Literal
 
 from harness.evaluation import intervals
+from harness.tables.trials import TRIALS, TRUTH
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +17,7 @@ Measure = Literal["extent", "model"]
 MAIN = "main"
 """The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
 STATES = ("found", "wrong depth", "invalid", "invisible")
-"""What the pixels of a hole tell, whatever the detector says."""
+"""States of a hole as its pixels tell them, whatever the detector says."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, else as undecided."
@@ -26,57 +25,8 @@ FOUND_RULE = (
 FEWEST_TRIALS = 4
 """4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain."""
 GROUP = ["variant", "frames", "hole"]
-TRUTH = ["kind", "true_diameter_mm", "true_depth_mm", "seen_depth_mm", "true_x_mm", "true_y_mm", "true_offset_mm"]
-MEASURED = ["diameter_mm", "offset_mm", "error_mm"]
+TRUTH_COLUMNS = [column.name for column in TRUTH]
 FITTED = ["model_diameter_se_mm", "model_depth_mm", "model_depth_se_mm"]
-COLUMNS = [
-    *GROUP,
-    *TRUTH,
-    "repeat",
-    "detected",
-    "state",
-    "median_residual_mm",
-    "invalid_fraction",
-    *FITTED,
-    *(f"{measure}_{name}" for measure in ("extent", "model") for name in MEASURED),
-]
-
-
-class ResultTables(Protocol):
-    """What an experiment leaves: one row per trial and hole, per run, per probe pixel, per variant.
-
-    ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
-    ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
-    quiet_threshold (of hole-free runs), scale_mm, surface_noise_mm, frames_used, left_out, seconds_*; of maps also
-    views_used, views_left_out and seconds_map.
-    ``probes``: variant, frames, pixel, mean_error_mm, temporal_std_mm, displacement_std_mm, repeats; in sensor order.
-    ``variants``: variant, reason, settings (JSON text), is_variation, reference, switches (JSON text).
-    ``noise``: variant, frames, repeat, valid_share, pitch_u_mm, pitch_v_mm, single_frame_mm, correlation_u1 ... _v3;
-    empty for maps.
-    ``axes``: path, name, unit of what tells set-ups apart; every other table but ``walls`` has a column for each path.
-    ``registrations``: one row for each registration of maps, under the first variant that shares it: variant, frames,
-    repeat, role, view (1 ...; the reference is 0), method, tre_mm, tre_in_plane_mm, tre_across_mm (root mean square
-    over the board), predicted_in_plane_mm, predicted_across_mm (NaN without an estimate), guess_tre_mm, residual_mm,
-    overlap, pairs, marks, iterations, converged, seconds, failure (empty for none). Empty without maps.
-    ``walls``: views, hole, true_diameter_mm, depth_mm and the shares of `harness.evaluation.walls`. Empty without maps.
-    """
-
-    @property
-    def holes(self) -> pd.DataFrame: ...
-    @property
-    def runs(self) -> pd.DataFrame: ...
-    @property
-    def probes(self) -> pd.DataFrame: ...
-    @property
-    def variants(self) -> pd.DataFrame: ...
-    @property
-    def noise(self) -> pd.DataFrame: ...
-    @property
-    def axes(self) -> pd.DataFrame: ...
-    @property
-    def registrations(self) -> pd.DataFrame: ...
-    @property
-    def walls(self) -> pd.DataFrame: ...
 
 
 def by_hole(names: pd.Series) -> pd.Series:
@@ -103,7 +53,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 
     holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
-    out = groups[[*axes, *TRUTH]].first()
+    out = groups[[*axes, *TRUTH_COLUMNS]].first()
     out["n"] = groups.size()
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
@@ -121,7 +71,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
     """The table of holes, with its columns where it came without any because no trial on the damaged board ended."""
-    return holes if "hole" in holes else holes.reindex(columns=COLUMNS)
+    return holes if "hole" in holes else holes.reindex(columns=[column.name for column in TRIALS.columns])
 
 
 def status_of(rate_low: float, rate_high: float) -> HoleState:
@@ -185,7 +135,7 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """What only the model gives: depth, and the standard errors that each fit states, held against the truth."""
+    """Results of the model alone: depth, and the standard errors that each fit states, held against the truth."""
     import pandas as pd
 
     fits = holes[[*GROUP, "true_diameter_mm", "model_diameter_mm", *FITTED]].copy()
@@ -212,13 +162,6 @@ def _order(column: pd.Series) -> pd.Series:
         first_seen = {name: place for place, name in enumerate(dict.fromkeys(column))}
         return column.map(lambda name: -1 if name == MAIN else first_seen[name])
     return column
-
-
-def bounded(value: float, low: float, high: float, digits: int = 2) -> str:
-    """An estimate with its interval as text: ``0.50 (0.37 to 0.63)``; a dash where unknown."""
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def hole_list(names: Iterable[str]) -> str:

@@ -1,1 +1,1 @@
-"""What `harness.ls` lists and `harness.clean` removes: plug-ins, result folders, stored renders."""
+"""Plug-ins, result folders and stored renders, as `harness.ls` lists and `harness.clean` removes them."""

@@ -107,7 +107,7 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
 
 
 def _legal(declared: Declared, path: tuple[str, ...]) -> str:
-    """What a setting may be; of one that chooses a kind, all kinds."""
+    """Legal values of a setting; all kinds of a setting that chooses a kind."""
     from harness.vocabulary.declaration.shape import kinds_of, legal_at
 
     around = kinds_of(declared.at(path[:-1]) or {})

@@ -1,35 +1,47 @@
-"""Folders of results: what is in them, how far they are, who is at work in them. Only read, and no link is followed."""
+"""Folders of results: how far they are, what they found, what tells them apart. They are only read, and no link is
+followed."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import os
 import re
 import stat
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from harness.listing.latest import DIGEST_NAME, latest_run
+from harness.listing.text import many
+from harness.tables.outputs import CAPTURES, EXPERIMENT, PROVENANCE, REPORT
+from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.json_text import strict_json
 from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
 from harness.vocabulary.locks import lock, opened_lock
+from harness.vocabulary.path_names import names_of, value_text
+from harness.vocabulary.seeds import canonical_json
+from harness.vocabulary.versions import RESULTS_VERSION
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
 ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?")
-"""Of a journal; those of version 3 and before end in .json."""
+"""Name of a journal's record; those of version 3 and before end in .json."""
 
 POINT_NAME = re.compile(r"point-[0-9]{3,6}")
-"""Of a folder with the findings in one real capture."""
+"""Name of a folder with the findings in a real capture."""
+SHOWN_SETTINGS = 6
 
 
 @dataclass(frozen=True)
 class ResultFolder:
     """One run's results. ``state``: complete, unfinished, running or broken, with ``note`` in words. ``done``,
     ``failed`` and ``planned``: trials as the provenance has them, None without one; ``records``: of its journal.
-    ``version``: of the results, None where none stands in them."""
+    ``version``: of the results, None where none stands in them. ``limits``: set_up, a90_95_mm (None where it is not
+    demonstrated) and verdict of each set-up of a study; ``differs``: settings, by dotted path, that are not the same in
+    all runs of the experiment; ``is_latest``: whether ``latest`` points to it."""
 
     path: Path
     experiment: str
@@ -46,22 +58,87 @@ class ResultFolder:
     failed: int | None = None
     planned: int | None = None
     version: int | None = None
+    limits: tuple[dict[str, Any], ...] = ()
+    differs: dict[str, Any] = field(default_factory=dict)
+    is_latest: bool = False
 
     def to_data(self) -> dict[str, Any]:
-        """For programs."""
+        """Return JSON's types."""
         return {**self.__dict__, "path": str(self.path)}
+
+    @property
+    def limit_text(self) -> str:
+        """The detection limit that was found, with its set-up; the span of several; empty of what is no study."""
+        found = [row for row in self.limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"]
+        if not found:
+            return "a90/95 not demonstrated" if self.limits else ""
+        best, worst = (pick(found, key=lambda row: row["a90_95_mm"]) for pick in (min, max))
+        ends = [best] if best is worst else [best, worst]
+        missing = len(self.limits) - len(found)
+        beside = f"; not demonstrated by {missing} of {len(self.limits)} set-ups" if missing else ""
+        return "a90/95 " + " to ".join(f"{row['a90_95_mm']:.2f} mm ({row['set_up']})" for row in ends) + beside
+
+    @property
+    def differs_text(self) -> str:
+        """Settings that tell the run from others of its experiment, at most `SHOWN_SETTINGS`."""
+        names = names_of(self.differs)
+        said = [f"{names[path]}={value_text(path, value)}" for path, value in self.differs.items()]
+        more = len(said) - SHOWN_SETTINGS
+        return ", ".join(said[:SHOWN_SETTINGS]) + (f" and {more} more" if more > 0 else "")
 
 
 def result_folders(out: Path, experiment: str | None = None) -> Iterator[ResultFolder]:
-    """Every folder of results below ``out``, or those of one experiment, in order of their names."""
+    """Yield every folder of results below ``out``, or those of one experiment, in order of their names."""
     for parent in folders_in(out, EXPERIMENT_NAME):
-        if experiment is None or parent.name == experiment:
-            for path in folders_in(parent, DIGEST_NAME):
-                yield described(path)
+        if experiment is not None and parent.name != experiment:
+            continue
+        runs = [described(path) for path in folders_in(parent, DIGEST_NAME)]
+        settings = [_settings(run.path) for run in runs] if len(runs) > 1 else [{} for _ in runs]
+        paths = dict.fromkeys(path for some in settings for path in some)
+        known = [some for some in settings if some]
+        apart = [path for path in paths if len({canonical_json(some.get(path)) for some in known}) > 1]
+        newest = latest_run(parent)
+        for run, some in zip(runs, settings, strict=True):
+            differs = {path: some.get(path) for path in apart} if some else {}
+            yield replace(run, limits=_limits(run.path), differs=differs, is_latest=run.digest == newest)
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    """Every setting of a run's resolved experiment by its dotted path; empty where it cannot be read."""
+
+    def leaves(data: dict[str, Any], before: str) -> Iterator[tuple[str, Any]]:
+        for key, value in data.items():
+            if isinstance(value, dict) and value:
+                yield from leaves(value, f"{before}{key}.")
+            else:
+                yield f"{before}{key}", value
+
+    try:
+        found = dict(leaves(read_yaml(path / EXPERIMENT.name).data, ""))
+        canonical_json(found)
+    except (UserError, ValueError, OSError):
+        return {}
+    return found
+
+
+def _limits(path: Path) -> tuple[dict[str, Any], ...]:
+    """The detection limits of a study; empty where there are none or they cannot be read."""
+    rows = []
+    try:
+        with contextlib.closing(io.StringIO(bounded_bytes(path / "limits.csv", TEXT_BYTES).decode())) as text:
+            for row in csv.DictReader(text):
+                size = row["a90_95_mm"]
+                said = {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]}
+                if not all(word.isprintable() for word in said.values()):
+                    return ()
+                rows.append({**said, "a90_95_mm": float(size) if size else None})
+    except (UserError, OSError, ValueError, KeyError, TypeError, csv.Error):
+        return ()
+    return tuple(rows)
 
 
 def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """Folders with such names, links left out, sorted."""
+    """Return folders with such names, links left out, sorted."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         found = [entry for entry in entries if names.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)]
         return sorted(Path(entry.path) for entry in found)
@@ -69,50 +146,61 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def described(path: Path) -> ResultFolder:
-    """What a folder of results holds; a broken one is described as such."""
-    size, records = _measured(path)
-    has_report = (path / "report.html").is_file()
+    """Describe what a folder of results holds; a broken folder is described as such."""
+    size = records = 0
+    for entry in files_below(path):
+        with contextlib.suppress(OSError):
+            file = entry.stat(follow_symlinks=False)
+            size += getattr(file, "st_blocks", -(-file.st_size // 512)) * 512
+            records += ENTRY_NAME.fullmatch(entry.name) is not None and stat.S_ISREG(file.st_mode)
+    has_report = (path / REPORT.name).is_file()
     found = ResultFolder(path, path.parent.name, path.name, "broken", "", size, records, has_report)
     try:
-        said = _provenance(path / "provenance.json")
+        said = _provenance(path / PROVENANCE.name)
     except (UserError, ValueError) as error:
         return replace(found, note=f"broken: provenance.json: {error}")
-    return _without_provenance(found) if said is None else _with_provenance(found, said)
-
-
-def _without_provenance(found: ResultFolder) -> ResultFolder:
-    """Of a run that is not over, or of real captures, which have no trials."""
-    judged = len(folders_in(found.path, POINT_NAME))
-    if judged and not found.records:
-        state = "complete" if (found.path / "summary.csv").is_file() else "unfinished"  # which is written last
-        return replace(found, state=state, note=f"{state}: {_count(judged, 'real capture')} judged")
-    if not found.records and not (found.path / "experiment.yaml").is_file():
-        return replace(found, note="broken: it has neither an experiment nor records")
-    state = "running" if in_use(found.path) else "unfinished"
-    return replace(found, state=state, note=f"{state}: {_count(found.records, 'record')}")
-
-
-def _with_provenance(found: ResultFolder, said: dict[str, Any]) -> ResultFolder:
-    done, failed = _trials(said)
+    if said is None:  # a run that is not over, or real captures, which have no trials
+        judged = len(folders_in(path, POINT_NAME))
+        if not judged and not records and not (path / EXPERIMENT.name).is_file():
+            return replace(found, note="broken: it has neither an experiment nor records")
+        if judged and not records:  # their table is written last
+            state = "complete" if (path / CAPTURES.name).is_file() else "unfinished"
+            return replace(found, state=state, note=f"{state}: {many(judged, 'real capture')} judged")
+        state = "running" if in_use(path) else "unfinished"
+        return replace(found, state=state, note=f"{state}: {many(records, 'record')}")
+    trials, failures = said.get("trials"), said.get("failures")
+    done = _whole(trials.get("done")) if isinstance(trials, dict) else None
+    failed = None
+    if isinstance(trials, dict) and done is not None:
+        done += _whole(trials.get("resumed")) or 0
+        failed = _whole(trials.get("failed"))
+        if failed is None:  # earlier results only list them
+            failed = len(failures) if isinstance(failures, list) else 0
+    state = "running" if in_use(path) else "unfinished" if failed else "complete"
+    note, planned = state, None
+    if done is not None and failed is not None:
+        planned = done + failed
+        note += ": " + (f"{done} of {many(planned, 'trial')} done, {failed} failed" if failed else many(done, "trial"))
     version, dirty = _whole(said.get("results_version")), said.get("dirty")
-    state = "running" if in_use(found.path) else "unfinished" if failed else "complete"
+    if version is not None and version != RESULTS_VERSION:
+        age = "newer" if version > RESULTS_VERSION else "older"
+        note += f" ({age}: results version {version}, this tofpod writes {RESULTS_VERSION})"
     return replace(
         found,
         state=state,
-        note=_note(state, done, failed, version),
+        note=note,
         date=_text(said.get("started")),
         commit=_text(said.get("commit")),
         dirty=dirty if isinstance(dirty, bool) else None,
         done=done,
         failed=failed,
-        planned=None if done is None or failed is None else done + failed,
+        planned=planned,
         version=version,
     )
 
 
 def in_use(path: Path) -> bool:
-    """Whether a sweep is at work in this folder; False where the system has no locks. Holds it for no longer than it
-    takes to ask."""
+    """Return whether a sweep is at work in this folder; False where the system has no locks."""
     from harness.engine.lock import LOCK
 
     if not (path / LOCK).is_file():
@@ -124,19 +212,8 @@ def in_use(path: Path) -> bool:
         return False
 
 
-def _measured(path: Path) -> tuple[int, int]:
-    """What a folder takes on the disk, and how many records its journal has."""
-    size = records = 0
-    for entry in files_below(path):
-        with contextlib.suppress(OSError):
-            found = entry.stat(follow_symlinks=False)
-            size += getattr(found, "st_blocks", -(-found.st_size // 512)) * 512
-            records += ENTRY_NAME.fullmatch(entry.name) is not None and stat.S_ISREG(found.st_mode)
-    return size, records
-
-
 def files_below(path: Path) -> Iterator[os.DirEntry[str]]:
-    """Everything below a folder that is no folder; a link is what it is, and not followed."""
+    """Yield everything below a folder that is no folder; links are not followed."""
     try:
         entries = os.scandir(path)
     except OSError:
@@ -160,34 +237,6 @@ def _provenance(path: Path) -> dict[str, Any] | None:
     if not isinstance(said, dict):
         raise ValueError("is no provenance")
     return said
-
-
-def _trials(said: dict[str, Any]) -> tuple[int | None, int | None]:
-    """Trials done, in this run or before, and failed; None where the provenance does not say."""
-    trials, failures = said.get("trials"), said.get("failures")
-    if not isinstance(trials, dict) or (done := _whole(trials.get("done"))) is None:
-        return None, None
-    failed = _whole(trials.get("failed"))
-    if failed is None:  # earlier results only list them
-        failed = len(failures) if isinstance(failures, list) else 0
-    return done + (_whole(trials.get("resumed")) or 0), failed
-
-
-def _note(state: str, done: int | None, failed: int | None, version: int | None) -> str:
-    from harness.vocabulary.versions import RESULTS_VERSION
-
-    note = state
-    if done is not None and failed is not None:
-        some = f"{done} of {_count(done + failed, 'trial')} done, {failed} failed"
-        note += f": {some if failed else _count(done, 'trial')}"
-    if version is not None and version != RESULTS_VERSION:
-        age = "newer" if version > RESULTS_VERSION else "older"
-        note += f" ({age}: results version {version}, this tofpod writes {RESULTS_VERSION})"
-    return note
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" + ("" if number == 1 else "s")
 
 
 def _text(value: Any) -> str | None:

@@ -11,8 +11,8 @@ import numpy as np
 from harness.evaluation.profile import HoleInView, hole_shape, relative_radius, true_residual_mm
 from harness.report.canvas import BLUE, DAMAGE, GREY, INK, ORANGE, svg
 from harness.report.examples import ExampleCloud
-from harness.report.measures import inches
 from harness.report.residual_scale import residual_bar, residual_image, residual_norm
+from harness.tables.text import inches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

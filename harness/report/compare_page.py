@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from harness.evaluation.intervals import UNKNOWN
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.verdict import ComparedSetUps, Comparison
 from harness.report.compare_figure import compare_svg
 from harness.report.compare_rows import HEADS, LEFT, TESTS, answer, cells, remarks, rule
-from harness.report.page_parts import mm, template
-from harness.report.study_rows import estimate_text
+from harness.report.page_parts import template
+from harness.tables.limits import estimate_of
+from harness.tables.text import mm
 
 CLASSES: Mapping[str, str] = {"worse": "no", "newly failing": "no", "better": "yes", "newly working": "yes"}
 
@@ -48,8 +48,8 @@ def _sizes(row: ComparedSetUps) -> tuple[str, ...]:
             texts += ["–", "–", "–", "–"]
             continue
         texts += [
-            estimate_text(limit, limit.a50_mm, UNKNOWN),
-            estimate_text(limit, limit.a90_mm, limit.a90_interval_mm),
+            estimate_of(limit, limit.a50_mm).text(),
+            estimate_of(limit, limit.a90_mm, limit.a90_interval_mm).text(),
             mm(limit.a90_95.value) if limit.a90_95.demonstrated else "not demonstrated",
             f"{limit.hits}/{limit.inspections}",
         ]

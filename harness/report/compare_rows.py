@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from harness.evaluation.pod.statement import finite
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.verdict import MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
-from harness.report.page_parts import aligned, mm
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from harness.tables.grid import Cell, Grid, Tone
+from harness.tables.text import mm, p_value
 
 COMPARISON_VERSION = 1
 """Of compare.json; raised when a key changes its meaning."""
@@ -22,13 +20,13 @@ LEFT = 3
 """Columns flush left."""
 SAID: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
 """Marks that the table does not explain by its numbers."""
-COLOURS: Mapping[Mark, str] = {
-    "worse": "bold red",
-    "newly failing": "bold red",
-    "only in first": "yellow",
-    "not comparable": "yellow",
-    "better": "green",
-    "newly working": "green",
+TONES: Mapping[Mark, Tone] = {
+    "worse": "bad",
+    "newly failing": "bad",
+    "only in first": "open",
+    "not comparable": "open",
+    "better": "good",
+    "newly working": "good",
 }
 TESTS = (
     "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
@@ -80,7 +78,7 @@ def cells(row: ComparedSetUps) -> tuple[str, ...]:
         f"-{row.hits.only_first} +{row.hits.only_second}" if row.hits else "–",
         _limit_p(row),
         " → ".join(f"{rate:.2f}" for rate in row.calls.rates_per_m2) if row.calls else "–",
-        p_text(row.calls_p[0]) if row.calls else "–",
+        p_value(row.calls_p[0]) if row.calls else "–",
     )
 
 
@@ -91,29 +89,15 @@ def remarks(comparison: Comparison) -> list[str]:
     return [*said, *([f"what differs: {'; '.join(differs)}"] if differs else [])]
 
 
-def p_text(p: float) -> str:
-    """A p-value with two digits."""
-    return "< 0.0001" if p < 0.0001 else f"{p:.2g}"
+def comparison_grid(comparison: Comparison) -> Grid:
+    """Return the table of a comparison; the colour is that of the mark."""
+    rows = ([Cell(text, TONES.get(row.mark, "")) for text in cells(row)] for row in comparison.rows)
+    return Grid.of(HEADS, rows, LEFT)
 
 
-def compare_text(comparison: Comparison) -> str:
-    """The comparison as plain lines: table, remarks, the answer."""
-    table = aligned([HEADS, *(cells(row) for row in comparison.rows)], left=LEFT)
-    return "\n".join([*table, *_closing(comparison)])
-
-
-def compare_table(comparison: Comparison) -> Table:
-    """The same table for a terminal, with colour."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False, collapse_padding=True, caption="\n".join(_closing(comparison)).strip())
-    table.caption_justify, table.caption_style = "left", ""
-    for place, head in enumerate(HEADS):
-        table.add_column(head, justify="left" if place < LEFT else "right", no_wrap=True)
-    for row in comparison.rows:
-        table.add_row(*(Text(text, style=COLOURS.get(row.mark, "")) for text in cells(row)))
-    return table
+def comparison_parts(comparison: Comparison) -> list[str | Grid]:
+    """Return what a terminal shows of a comparison: table, remarks, the answer."""
+    return [comparison_grid(comparison), "", *remarks(comparison), answer(comparison)]
 
 
 def compare_data(comparison: Comparison) -> dict[str, Any]:
@@ -126,10 +110,6 @@ def compare_data(comparison: Comparison) -> dict[str, Any]:
         "worse": [row.label for row in comparison.rows if row.is_worse],
         "set_ups": [_row_data(row) for row in comparison.rows],
     }
-
-
-def _closing(comparison: Comparison) -> list[str]:
-    return ["", *remarks(comparison), answer(comparison)]
 
 
 def _changed(comparison: Comparison) -> list[str]:
@@ -148,7 +128,7 @@ def _both(row: ComparedSetUps, size_mm: Callable[[SetUpLimit], float]) -> str:
 
 def _limit_p(row: ComparedSetUps) -> str:
     test = row.limit_test(0)
-    return f"{p_text(row.limit_p[0])}{' (a90)' if test == 'a90' else ''}" if test else "–"
+    return f"{p_value(row.limit_p[0])}{' (a90)' if test == 'a90' else ''}" if test else "–"
 
 
 def _percent(row: ComparedSetUps) -> str:

@@ -14,7 +14,7 @@ from harness.evaluation.pod.false_calls import SITES_PER_TARGET
 from harness.evaluation.pod.planning import CALLS, LEAST_SIGNALS, FramesPlan, HoleFree, Recommendation
 from harness.evaluation.pod.repeats import RepeatedStudies
 from harness.evaluation.pod.statement import finite
-from harness.report.page_parts import aligned
+from harness.tables.grid import aligned
 
 WIDE = 110
 """Characters of a line on the terminal, where words have to be broken."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from harness.report.findings_picture import save_blind_map, save_picture
+from harness.tables.outputs import ANNOTATED, BLIND, CLOUD, FINDINGS, FINDINGS_DATA
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.files import atomic_path
 from harness.vocabulary.units import MM
@@ -31,9 +32,9 @@ COLUMNS = (
 FINDINGS_VERSION = 2
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 VERSION_COLUMN = "findings_version"
-BLIND_MAP = "blind.png"
+BLIND_MAP = BLIND.name
 """Where the cloud has a pixel grid."""
-FILES = ("findings.csv", "findings.json", "annotated.png", BLIND_MAP, "cloud.ply")
+FILES = (FINDINGS.name, FINDINGS_DATA.name, ANNOTATED.name, BLIND_MAP, CLOUD.name)
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def write_findings(
     judged: Judged,
     about: Mapping[str, Any],
     title: str,
-    cloud_name: str = "cloud.ply",
+    cloud_name: str = CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
     """Write all files of a run into ``folder`` (made where it is missing); all of them or none.
@@ -134,9 +135,9 @@ def write_findings(
     try:
         with ExitStack() as stack:
             part = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
-            part["findings.csv"].write_text(csv_text(judged.findings), encoding="utf-8")
-            part["findings.json"].write_text(json_text(judged, about), encoding="utf-8")
-            save_picture(part["annotated.png"], judged.cloud, judged.evidence, judged.detections, title)
+            part[FINDINGS.name].write_text(csv_text(judged.findings), encoding="utf-8")
+            part[FINDINGS_DATA.name].write_text(json_text(judged, about), encoding="utf-8")
+            save_picture(part[ANNOTATED.name], judged.cloud, judged.evidence, judged.detections, title)
             part[cloud_name].write_bytes(ply_bytes(judged.cloud, judged.detections))
             for name, write in further.items():
                 write(part[name])

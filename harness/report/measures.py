@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.evaluation.summary import Measure
 from harness.report.canvas import BLUE, GREY, INK, ORANGE, PALE, RED, SKY, svg
+from harness.tables.text import inches
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,26 +21,6 @@ MEASURES: tuple[tuple[Measure, str, str], ...] = (
     ("extent", "thesis' measure", ORANGE),
     ("model", "model of the blurred hole", BLUE),
 )
-INCHES = {
-    1: "1/16",
-    2: "1/8",
-    3: "3/16",
-    4: "1/4",
-    5: "5/16",
-    6: "3/8",
-    7: "7/16",
-    8: "1/2",
-    10: "5/8",
-    12: "3/4",
-    16: "1",
-}
-
-
-def inches(diameter_mm: float) -> str:
-    """A drill's size as a fraction of an inch where it is one of the common ones, else empty: ``1/4 in``."""
-    sixteenths = diameter_mm / 25.4 * 16
-    known = INCHES.get(round(sixteenths)) if abs(sixteenths - round(sixteenths)) < 1e-3 else None
-    return f"{known} in" if known else ""
 
 
 def sizes_figure(summary: pd.DataFrame, few: int, many: int) -> str:

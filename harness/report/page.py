@@ -11,23 +11,17 @@ import numpy as np
 from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.profile import RINGS, hole_shapes
 from harness.evaluation.set_ups import set_ups_of
-from harness.evaluation.summary import (
-    MAIN,
-    ResultTables,
-    false_calls,
-    found_holes,
-    found_rule,
-    hole_list,
-    summarise_holes,
-)
+from harness.evaluation.summary import MAIN, false_calls, found_holes, found_rule, hole_list, summarise_holes
 from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_figure
 from harness.report.examples import ExampleCloud, MappedExample
-from harness.report.measures import inches, positions_figure, sizes_figure
+from harness.report.measures import positions_figure, sizes_figure
 from harness.report.noise import noise_figure
-from harness.report.page_parts import MARKS, call_row, closing, mm, rate_cell, template
+from harness.report.page_parts import MARKS, call_row, closing, rate_cell, template
 from harness.report.perspectives_page import map_files, map_text, perspectives_html
 from harness.report.set_ups_page import set_ups_html
 from harness.report.view3d import write_view3d
+from harness.tables.text import inches, mm
+from harness.tables.trials import ResultTables
 from harness.thesis.claims import RULES, score_claims, verdicts_by_variant
 from harness.thesis.verdicts import FEW, MANY, Verdict
 from harness.vocabulary.files import write_text

@@ -1,15 +1,15 @@
-"""What every page of results has in common: templates, the closing sections, ways to write numbers."""
+"""Common parts of all pages of results: templates, the closing sections, ways to write numbers."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from harness.evaluation.summary import STATES, ResultTables, bounded
+from harness.evaluation.summary import STATES
+from harness.tables.text import bounded, mm
+from harness.tables.trials import ResultTables
 from harness.vocabulary.versions import GENERATOR
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def template(name: str, folder: Path | None = None) -> Template:
 
 
 def closing(tables: ResultTables, provenance: Mapping[str, Any], experiment_yaml_text: str) -> dict[str, Any]:
-    """What the sections from failures to the resolved experiment need, and the looks of verdicts."""
+    """Return the values of the sections from failures to the resolved experiment, and the looks of verdicts."""
     return closing_sections(provenance, experiment_yaml_text, _left_out(tables.runs))
 
 
@@ -102,7 +102,7 @@ def _failure(failure: Any) -> str:
 
 
 def _left_out(runs: pd.DataFrame) -> str:
-    """How many frames averaging left out as disturbed, over all runs."""
+    """Number of frames that averaging left out as disturbed, over all runs, as a sentence."""
     out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
     return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
 
@@ -144,19 +144,3 @@ def _plain(value: Any) -> str:
     if value is None:
         return "not recorded"
     return value if isinstance(value, str) else json.dumps(value, default=str)
-
-
-def mm(value: float, digits: int = 2) -> str:
-    """A number of millimetres, or a dash where there is none."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
-
-
-def aligned(lines: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """A plain table: columns of one width each, the first ``left`` flush left, the others flush right."""
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))] if lines else []
-    return [
-        "  ".join(
-            f"{text:{'<' if column < left else '>'}{widths[column]}}" for column, text in enumerate(line)
-        ).rstrip()
-        for line in lines
-    ]

@@ -17,7 +17,7 @@ from harness.evaluation.map_case import (
 )
 from harness.evaluation.maps import compare_maps
 from harness.evaluation.registration import by_views, summarise_registrations
-from harness.evaluation.summary import ResultTables, found_rule, summarise_holes
+from harness.evaluation.summary import found_rule, summarise_holes
 from harness.report.examples import MappedExample
 from harness.report.page_parts import closing, template
 from harness.report.perspectives_rows import (
@@ -39,6 +39,7 @@ from harness.report.views_figures import (
     shadow_figure,
     two_views_figure,
 )
+from harness.tables.trials import ResultTables
 from harness.thesis.verdicts import Verdict
 from harness.thesis.views import duels_of, score_views
 

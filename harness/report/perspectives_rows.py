@@ -12,9 +12,11 @@ from harness.evaluation.map_case import AgainstOne, MapCase, against_one
 from harness.evaluation.map_text import change_text, ratio_text, span
 from harness.evaluation.maps import MapSetUp, label_of, maps_of
 from harness.evaluation.registration import PARTS, trusted
-from harness.evaluation.summary import ResultTables, bounded, hole_list
-from harness.report.page_parts import mm, shade
+from harness.evaluation.summary import hole_list
+from harness.report.page_parts import shade
 from harness.report.set_ups_rows import count_text, found_text, limit_text
+from harness.tables.text import bounded, mm
+from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.statement import ModelRow, PodStatement
-from harness.report.page_parts import aligned, template
+from harness.report.page_parts import template
 from harness.report.pod_figure import answer, pod_svg, sized
+from harness.tables.grid import aligned
 
 VALIDITY = (
     "The limit speaks of inspections like these: the same kind of flaws and parts, the same procedure, the sizes that "

@@ -10,7 +10,7 @@ import numpy as np
 from harness.evaluation.effects import EffectCosts, effect_costs
 from harness.evaluation.limits import LIMIT_RULE
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
-from harness.evaluation.summary import ResultTables, false_calls, found_rule, summarise_holes
+from harness.evaluation.summary import false_calls, found_rule, summarise_holes
 from harness.report.clouds import residual_figure
 from harness.report.effects_figure import cost_text, effects_figure
 from harness.report.examples import ExampleCloud
@@ -26,6 +26,7 @@ from harness.report.set_ups_rows import (
     variation_rows,
 )
 from harness.report.sights import one_hole_figure, sights_figure
+from harness.tables.trials import ResultTables
 from harness.thesis.cameras import claim_c11
 from harness.thesis.verdicts import Verdict
 

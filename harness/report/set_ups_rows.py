@@ -11,9 +11,10 @@ import numpy as np
 
 from harness.evaluation.intervals import wilson
 from harness.evaluation.set_ups import compare_set_ups
-from harness.evaluation.summary import ResultTables, hole_list
-from harness.report.measures import inches
-from harness.report.page_parts import call_row, mm, shade
+from harness.evaluation.summary import hole_list
+from harness.report.page_parts import call_row, shade
+from harness.tables.text import inches, mm
+from harness.tables.trials import ResultTables
 from harness.thesis.cameras import claim_c11
 from harness.vocabulary.path_names import value_text
 

@@ -10,8 +10,8 @@ import numpy as np
 from harness.evaluation.profile import HoleInView
 from harness.report.canvas import DAMAGE, INK, svg
 from harness.report.examples import ExampleCloud
-from harness.report.measures import inches
 from harness.report.residual_scale import BOX, residual_bar, residual_image, residual_norm
+from harness.tables.text import inches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

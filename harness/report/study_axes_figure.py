@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.study.axes import FRAMES, AxisLine
+from harness.evaluation.study.axes import AxisLine
 from harness.evaluation.study.limit import SetUpLimit
 from harness.report.canvas import GREY, svg
 from harness.report.pod_figure import plain
 from harness.report.set_ups_figures import COLOURS, MARKERS
-from harness.report.study_rows import is_within_sizes, mm_text
-from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text
+from harness.tables import text
+from harness.tables.limits import is_within_sizes
+from harness.tables.study import AxisGroup, axis_value
+from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,57 +26,9 @@ if TYPE_CHECKING:
 ROOM = 1.3
 """Height of the figure over the largest size inspected."""
 WIDTH_CHARACTERS = 75
-"""That stand beside each other under the figure."""
+"""Characters of labels that fit beside each other under the figure."""
 MOST_IN_A_ROW = 8
 """Words above the figure."""
-
-
-@dataclass(frozen=True, eq=False)
-class AxisGroup:
-    """One axis: its ``values``, ascending where they are numbers, and its ``lines`` by what tells them apart."""
-
-    path: str
-    name: str
-    values: tuple[Any, ...]
-    lines: dict[str, AxisLine]
-
-    @property
-    def numeric(self) -> bool:
-        """Whether the values have places on a scale."""
-        return all(line.numeric for line in self.lines.values())
-
-    @property
-    def title(self) -> str:
-        """The axis with its unit."""
-        unit = unit_of(self.path)
-        return f"{self.name} ({unit})" if unit else self.name
-
-
-def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
-    """The lines axis by axis, in their order; a line is called by those of its other axes that differ among lines."""
-    names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
-    groups = []
-    for path in dict.fromkeys(line.axis for line in lines):
-        of_axis = [line for line in lines if line.axis == path]
-        others = dict.fromkeys(other for line in of_axis for other in line.held)
-        varied = [other for other in others if len({on_one_line(line.held.get(other)) for line in of_axis}) > 1]
-        labels = [
-            ", ".join(_held(other, names[other], line.held[other]) for other in varied if other in line.held)
-            for line in of_axis
-        ]
-        every = [value for line in of_axis for value in line.values]
-        values = [value for at, value in enumerate(every) if value not in every[:at]]
-        if all(line.numeric for line in of_axis):
-            values.sort()
-        groups.append(AxisGroup(path, names[path], tuple(values), dict(zip(labels, of_axis, strict=True))))
-    return groups
-
-
-def axis_value(path: str, value: Any) -> str:
-    """A value in words: ``50 frames``, ``0.7 m``, ``kinect_v2``."""
-    if path == FRAMES:
-        return f"{value} frame{'s' if value > 1 else ''}"
-    return value_text(path, value)
 
 
 def axis_figure(axis: AxisGroup, name: str) -> str:
@@ -112,12 +65,6 @@ def axis_figure(axis: AxisGroup, name: str) -> str:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
     return svg(name, (8.6, 4.4 + 0.13 * len(shown)), _alt(axis), draw)
-
-
-def _held(path: str, name: str, value: Any) -> str:
-    """What a line is held at: ``kinect_v2`` says what it is, ``albedo=0.2`` has to."""
-    text = axis_value(path, value)
-    return text if path == FRAMES or isinstance(value, str) else f"{name}={text}"
 
 
 def _ticks(axes: Axes, axis: AxisGroup, places: np.ndarray) -> None:
@@ -188,11 +135,11 @@ def _missing(axes: Axes, places: Sequence[tuple[Any, float]], lines: Sequence[Ax
         here = [limit for line in lines for at, limit in zip(line.values, line.limits, strict=True) if at == value]
         without = sum(not is_within_sizes(limit) for limit in here)
         if without:
-            text = "no limit" + (f"\n({without} of {len(here)})" if len(here) > 1 else "")
+            said = "no limit" + (f"\n({without} of {len(here)})" if len(here) > 1 else "")
             above = (0, 6 + (24 if close and number % 2 else 0))
             at_top: Any = axes.get_xaxis_transform()
             axes.annotate(
-                text, (x, 1.0), above, at_top, "offset points", ha="center", va="bottom", fontsize=8, color=GREY
+                said, (x, 1.0), above, at_top, "offset points", ha="center", va="bottom", fontsize=8, color=GREY
             )
 
 
@@ -200,7 +147,7 @@ def _alt(axis: AxisGroup) -> str:
     said = []
     for label, line in axis.lines.items():
         sizes = (
-            f"{axis_value(axis.path, value)}: {mm_text(limit.a90_mm, limit.largest_mm)} mm"
+            f"{axis_value(axis.path, value)}: {text.size(limit.a90_mm, limit.largest_mm)} mm"
             for value, limit in zip(line.values, line.limits, strict=True)
         )
         said.append(f"{f'{label}: ' if label else ''}{', '.join(sizes)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,38 +12,40 @@ from harness.evaluation.study.surface import depth_varies
 from harness.report.examples import StudyExample
 from harness.report.page_parts import closing_sections, template
 from harness.report.set_ups_figures import COLOURS
-from harness.report.study_axes_figure import AxisGroup, axis_figure, axis_groups
-from harness.report.study_axes_rows import (
-    SURFACE_HEADS,
-    axis_heads,
-    axis_note,
-    axis_rows,
-    size_tables,
-    surface_rows,
-)
-from harness.report.study_calls_figure import calls_figure
+from harness.report.study_axes_figure import axis_figure
 from harness.report.study_examples_figure import examples_figure
-from harness.report.study_operating_figure import operating_figure
-from harness.report.study_pod_figures import MOST_PANELS, curves_figure, signals_figure, with_room
-from harness.report.study_rows import is_within_sizes, limit_notes, limit_rows, name_of, study_answer, unbroken
-from harness.report.study_surface_figure import surface_figure
-from harness.report.study_tables import (
-    CHANCE_HEADS,
-    OPERATING_HEADS,
-    SET_BY_HEADS,
-    SIGNAL_HEADS,
-    THRESHOLD_HEADS,
-    chance_rows,
+from harness.report.study_figures import (
+    MOST_PANELS,
+    calls_figure,
+    curves_figure,
+    operating_figure,
+    signals_figure,
+    surface_figure,
+    with_room,
+)
+from harness.tables.grid import Grid
+from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, name_of, study_answer
+from harness.tables.schema import Table
+from harness.tables.study import (
+    CHANCE,
+    OPERATING,
+    SET_BY,
+    SIGNALS,
+    SURFACES,
+    THRESHOLDS,
+    AxisGroup,
+    axis_grid,
+    axis_groups,
+    axis_note,
     operating_notes,
-    operating_rows,
-    set_by_rows,
     signal_notes,
-    signal_rows,
     signal_tests,
+    size_grids,
+    study_tables,
     threshold_note,
-    threshold_rows,
     threshold_warnings,
 )
+from harness.tables.text import unbroken
 from harness.vocabulary.files import write_text
 
 MOST_NAMED = 3
@@ -66,6 +67,14 @@ def write_study_report(
     return path
 
 
+def study_parts(result: StudyResult) -> list[str | Grid]:
+    """Return what a terminal shows of a study: warnings, limits, what to know beside them, the answer."""
+    warnings = [f"warning: {text}" for text in threshold_warnings(result.limits)]
+    notes = limit_notes(result.limits)
+    grid = LIMITS.grid(result.limits, terminal=True)
+    return [*warnings, grid, *([""] if notes else []), *notes, "", study_answer(result.limits)]
+
+
 def study_html(
     result: StudyResult,
     examples: Sequence[StudyExample],
@@ -73,41 +82,50 @@ def study_html(
     resolved_yaml: str,
     title: str,
 ) -> str:
-    """The page as text; see `write_study_report`."""
-    limits = result.limits
-    rows = limit_rows(limits)
-    surfaces = [(one.limit, one.surface) for one in result.set_ups if one.surface is not None]
-    groups = axis_groups(result.axes)
+    """Return the page as text; see `write_study_report`."""
+    limits, rows = result.limits, study_tables(result)
+    groups = {f"axis-{number}": group for number, group in enumerate(axis_groups(result.axes), 1)}
     shown = _examples_by_set_up(result, examples)
+
+    def table(of: Table) -> Any:
+        return of.grid(rows[of]).html() if rows[of] else None
+
+    tests = signal_tests(limits)
     return template("study.html").render(
         title=title,
         answer=unbroken(study_answer(limits)),
-        rule=_rule(result),
-        limits=[replace(row, name=unbroken(row.name)) for row in rows],
-        limit_notes=[unbroken(note) for note in limit_notes(rows)],
+        rule="Fixed beforehand: a damage is found where the centre of a finding lies within "
+        f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
+        "board are no further targets.",
+        limits=table(LIMITS),
+        limit_notes=[unbroken(note) for note in limit_notes(limits)],
+        set_ups=len(limits),
         most_panels=MOST_PANELS,
-        axes=[_axis(group, _axis_name(number)) for number, group in enumerate(groups)],
+        axes=[
+            {
+                "title": group.name,
+                "figure": name,
+                "caption": _axis_caption(group),
+                "table": axis_grid(group).html(),
+                "note": axis_note(group),
+            }
+            for name, group in groups.items()
+        ],
         has_depths=any(depth_varies(limit.record.inspected.depth_mm) for limit in limits),
-        surface_heads=SURFACE_HEADS,
-        surface_rows=surface_rows(surfaces),
+        surfaces=table(SURFACES),
         surface_notes=_surface_notes(result),
-        chance_heads=CHANCE_HEADS,
-        chance_rows=chance_rows(result.set_ups),
-        threshold_heads=THRESHOLD_HEADS,
-        threshold_rows=threshold_rows(limits),
+        chance=table(CHANCE),
+        thresholds=table(THRESHOLDS),
         threshold_note=threshold_note(result.record),
         warnings=[unbroken(text) for text in threshold_warnings(limits)],
-        set_by_heads=SET_BY_HEADS,
-        set_by_rows=set_by_rows(limits),
-        signal_heads=SIGNAL_HEADS,
-        signal_rows=signal_rows(limits),
-        signal_tests=signal_tests(limits),
+        set_by=table(SET_BY),
+        signals=table(SIGNALS),
+        signal_tests=tests.html() if tests else None,
         signal_notes=signal_notes(limits),
-        operating_heads=OPERATING_HEADS,
-        operating_rows=operating_rows(result.set_ups),
+        operating=table(OPERATING),
         operating_notes=operating_notes(result.set_ups),
         examples=[(name_of(limit), name) for name, (limit, _) in shown.items()],
-        size_tables=size_tables(limits, [one.sizes for one in result.set_ups]),
+        sizes=[grid.html() for grid in size_grids(result.set_ups)],
         validity=result.validity,
         figures=_figures(result, groups, shown),
         **closing_sections(provenance, resolved_yaml),
@@ -115,7 +133,9 @@ def study_html(
 
 
 def _figures(
-    result: StudyResult, groups: Sequence[AxisGroup], examples: Mapping[str, tuple[SetUpLimit, Sequence[StudyExample]]]
+    result: StudyResult,
+    groups: Mapping[str, AxisGroup],
+    examples: Mapping[str, tuple[SetUpLimit, Sequence[StudyExample]]],
 ) -> dict[str, str]:
     """The figures that the data allow, as SVG text by name."""
     shown = with_room(result.set_ups)
@@ -123,7 +143,7 @@ def _figures(
     surfaces = [(one.limit, one.surface) for one in shown if one.surface is not None]
     signals = [one.limit for one in shown if one.limit.signals is not None]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
-    figures = {_axis_name(number): axis_figure(group, _axis_name(number)) for number, group in enumerate(groups)}
+    figures = {name: axis_figure(group, name) for name, group in groups.items()}
     if inspected:
         figures["curves"] = curves_figure(inspected)
     if surfaces:
@@ -140,35 +160,14 @@ def _figures(
     }
 
 
-def _rule(result: StudyResult) -> str:
-    return (
-        "Fixed beforehand: a damage is found where the centre of a finding lies within "
-        f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
-        "board are no further targets."
-    )
-
-
-def _axis_name(number: int) -> str:
-    return f"axis-{number + 1}"
-
-
-def _axis(group: AxisGroup, name: str) -> dict[str, Any]:
+def _axis_caption(group: AxisGroup) -> str:
     caption = (
         "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95. What lies far beyond the "
         "largest size inspected (dotted) is an arrow. No limit: a90/95 is not demonstrated within the sizes inspected."
     )
     if len(group.lines) > len(COLOURS):
         caption += f" The first {len(COLOURS)} of {len(group.lines)} lines; the table goes on."
-    if not group.numeric:
-        caption += " The values have no order."
-    return {
-        "title": group.name,
-        "figure": name,
-        "caption": caption,
-        "heads": axis_heads(group),
-        "rows": axis_rows(group),
-        "note": axis_note(group),
-    }
+    return caption if group.numeric else f"{caption} The values have no order."
 
 
 def _examples_by_set_up(
@@ -185,7 +184,7 @@ def _examples_by_set_up(
 
 
 def _surface_notes(result: StudyResult) -> list[str]:
-    """Why there is no surface over diameter and depth, or what to know beside one; set-ups of one reason together."""
+    """Reasons why there is no surface over diameter and depth, or what to know beside one, with their set-ups."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for one in result.set_ups:
         reason = ("No surface", one.surface_why) if one.surface is None else ("Surface", one.surface.note)

@@ -10,9 +10,9 @@ import numpy as np
 from harness.evaluation.map_case import LARGE_MM, AgainstOne
 from harness.report.canvas import BLUE, GREY, INK, ORANGE, PALE, svg
 from harness.report.examples import MappedExample
-from harness.report.measures import inches
 from harness.report.registration_figures import colour_of, method_text
 from harness.report.view3d import SEVERAL, VIEW_COLOURS
+from harness.tables.text import inches
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,15 +12,8 @@ from harness.evaluation.intervals import Interval, bootstrap, mean_difference, s
 from harness.evaluation.map_text import span
 from harness.evaluation.noise import noise_law
 from harness.evaluation.profile import AveragedCloud, hole_shapes
-from harness.evaluation.summary import (
-    MAIN,
-    Measure,
-    ResultTables,
-    found_holes,
-    hole_list,
-    summarise_holes,
-    with_columns,
-)
+from harness.evaluation.summary import MAIN, Measure, found_holes, hole_list, summarise_holes, with_columns
+from harness.tables.trials import ResultTables
 from harness.thesis.verdicts import FEW, MANY, Answer, Rules, Verdict, decide, is_above_zero, rule_of
 
 if TYPE_CHECKING:

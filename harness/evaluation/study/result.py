@@ -23,8 +23,8 @@ from harness.evaluation.study.over_boards import DRAWS
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.evaluation.study.surface import PodSurface, surface_of
 from harness.evaluation.study.table_one import SizeRow, pod_at
-from harness.evaluation.study.tables import StudyTables
 from harness.evaluation.study.validity import Section, validity_of
+from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,7 +68,7 @@ class StudyResult:
 
 def evaluate_study(
     record: StudyRecord,
-    tables: StudyTables,
+    tables: ResultTables,
     facts: Mapping[str, Any],
     *,
     diameters_mm: Sequence[float] = (),
@@ -83,7 +83,7 @@ def evaluate_study(
 
 
 def _set_up(
-    record: SetUpRecord, tables: StudyTables, radius_mm: float, diameters_mm: Sequence[float], draws: int
+    record: SetUpRecord, tables: ResultTables, radius_mm: float, diameters_mm: Sequence[float], draws: int
 ) -> SetUpResult:
     def own(table: pd.DataFrame) -> pd.DataFrame:
         if table.empty:

@@ -1,0 +1,263 @@
+"""The table of detection limits, and limits in words: the answer, a sentence for each set-up, notes beside them.
+
+A curve says nothing of sizes that nobody inspected: what lies beyond the largest is written ``> 15.9``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.evaluation.intervals import UNKNOWN, Interval
+from harness.evaluation.pod.curve import Bound
+from harness.evaluation.pod.false_calls import FalseCallRate
+from harness.evaluation.study.limit import SetUpLimit
+from harness.tables import text
+from harness.tables.schema import Column, Estimate, Table
+
+MOST_ANSWERS = 3
+"""Set-ups that the first words of a page name each by itself; of more they give the span."""
+NOT_DEMONSTRATED = "not demonstrated"
+BEYOND = "lies beyond the largest size inspected"
+"""Words of a statement's note on an extrapolated bound; pages have words of their own for it."""
+
+
+def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
+    """Return whether ``bound`` (a90/95 unless given) is demonstrated by sizes that were inspected."""
+    bound = bound or limit.a90_95
+    return bound.demonstrated and not limit.beyond(bound.value)
+
+
+def name_of(limit: SetUpLimit) -> str:
+    """Return the set-up and its frames, for places where lines break."""
+    return text.unbroken(limit.record.label)
+
+
+def bound_estimate(limit: SetUpLimit, bound: Bound) -> Estimate:
+    """Return a bound as a table shows it; NaN where it is not demonstrated."""
+    return Estimate(bound.value if bound.demonstrated else np.nan, most=limit.largest_mm)
+
+
+def bound_text(bound: Estimate) -> str:
+    """Return a bound in mm without its unit, or that there is none."""
+    return NOT_DEMONSTRATED if np.isnan(bound.value) else bound.text()
+
+
+def estimate_of(limit: SetUpLimit, size_mm: float, interval: Interval = UNKNOWN) -> Estimate:
+    """Return a50 or a90 as a table shows it: at most the smallest size where everything was found."""
+    return Estimate(size_mm, interval.low, interval.high, limit.largest_mm, limit.is_at_most)
+
+
+def rate_estimate(calls: FalseCallRate | None) -> Estimate:
+    """Return false calls per square metre with their exact Poisson interval; NaN where nothing was inspected."""
+    if calls is None:
+        return Estimate(np.nan)
+    return Estimate(calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
+
+
+def rate_text(rate: Estimate) -> str:
+    """Return a rate of false calls as text."""
+    return "none inspected" if np.isnan(rate.value) else rate.text()
+
+
+def a50_of(limit: SetUpLimit) -> Estimate:
+    """Return a50 with its interval."""
+    return estimate_of(limit, limit.a50_mm, limit.a50_interval_mm)
+
+
+def a90_of(limit: SetUpLimit) -> Estimate:
+    """Return a90 with its interval."""
+    return estimate_of(limit, limit.a90_mm, limit.a90_interval_mm)
+
+
+FOUND_50, FOUND_90 = (f"diameter found {share} % of the time" for share in (50, 90))
+BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
+EFFECT = "variance of a90 with boards as units over that with damages as units"
+SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
+CALLS = (
+    Column(
+        "false_calls_per_m2",
+        "calls/m² (95 %)",
+        lambda one: rate_estimate(one.false_calls),
+        "false calls on hole-free boards, with the exact 95 % Poisson interval",
+        rate_text,
+        interval=True,
+    ),
+    Column("false_calls", "", "false_calls.calls", "false calls counted"),
+    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "hole-free face inspected"),
+)
+
+
+def _verdict(limit: SetUpLimit, bound: Bound) -> str:
+    beyond = "beyond the sizes inspected" if bound.demonstrated else NOT_DEMONSTRATED
+    return "demonstrated" if is_within_sizes(limit, bound) else beyond
+
+
+def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
+    """Hits by depth and by missing returns, where they were counted apart."""
+    seen = limit.record.inspected
+    if seen.by_depth is None or seen.by_no_return is None:
+        return None
+    return int(seen.by_depth.sum()), int(seen.by_no_return.sum())
+
+
+def _found(limit: SetUpLimit) -> str:
+    kinds = _kinds(limit)
+    beside = "" if kinds is None else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
+    return f"{limit.hits} of {limit.inspections}{beside}"
+
+
+LIMITS = Table(
+    "limits",
+    "one row per set-up and number of frames of a study: its detection limit and what it rests on",
+    (
+        SET_UP,
+        Column("variant", "", "record.variant", "name of the set-up"),
+        Column("frames", "", "record.frames", "frames averaged"),
+        Column("<axis>", "", "record.axes", "value on each axis of the experiment, by its dotted path", spread=True),
+        Column(
+            "a90_95_mm",
+            "a90/95 (mm)",
+            lambda one: bound_estimate(one, one.a90_95),
+            "upper bound of a90 at 95 % confidence, the limit to quote; empty where not demonstrated",
+            bound_text,
+            tone=lambda one: "key" if is_within_sizes(one) else "bad",
+        ),
+        Column("a90_95_verdict", "", lambda one: _verdict(one, one.a90_95), "demonstrated, beyond the sizes, or not"),
+        Column("a90_95_method", "", "a90_95.method", "how the bound was taken"),
+        Column(
+            "over_boards_mm",
+            "over boards (mm)",
+            lambda one: bound_estimate(one, one.over_boards),
+            "a90/95 that allows for damages of one board faring alike",
+            bound_text,
+            tone=lambda one: "" if is_within_sizes(one, one.over_boards) else "bad",
+        ),
+        Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), "likewise"),
+        Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
+        Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, likewise", **BRIEF),
+        Column("is_at_most", "", "is_at_most", "everything was found: a50 and a90 are at most this"),
+        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest diameter inspected"),
+        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest diameter inspected"),
+        *CALLS,
+        Column("", "found", _found, brief=False),
+        Column("hits", "", "hits", "damages found"),
+        Column("inspections", "", "inspections", "damages inspected, repeats counted"),
+        Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
+        Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
+        Column("hit_rate", "", ("rate", "rate_interval"), "hits by inspections, with an interval over boards"),
+        Column("targets", "targets", "targets", "damages, each counted once"),
+        Column("boards", "boards", "boards", "damaged boards"),
+        Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
+        Column("threshold", "", "record.threshold", "in the detector's units"),
+        Column("threshold_mm", "", "record.threshold_mm", "the same times the mean scale"),
+        Column("calibration_runs", "", "record.calibration_runs", "hole-free runs that set it; 0: given"),
+        Column("detector", "", "record.detector", "name of the detector"),
+        Column("detector_version", "", "record.detector_version", "its version"),
+        Column("failed", "", "record.failed", "trials that failed"),
+        Column("notes", "", lambda one: "; ".join(notes_of(one)), "what to know beside the limit"),
+    ),
+    title="detection limits: found 50 and 90 % of the time, and 90 % with 95 % confidence",
+)
+
+
+def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
+    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
+
+
+# ---------------------------------------------------------------- words
+
+
+def study_answer(limits: Sequence[SetUpLimit]) -> str:
+    """Return what the study says: a sentence for each set-up, or the span of the limits of many."""
+    if not limits:
+        return "No set-up was inspected, so there is no answer."
+    if len(limits) <= MOST_ANSWERS:
+        return " ".join(limit_sentence(limit) for limit in limits)
+    shown = sorted((one for one in limits if is_within_sizes(one)), key=lambda one: one.a90_95.value)
+    if not shown:
+        return (
+            f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected{_sizes(*limits)}."
+        )
+    best, worst = shown[0], shown[-1]
+    span = (
+        f"Of {len(limits)} set-ups, the smallest limit (a90/95) is {text.size(best.a90_95.value)} mm "
+        f"({best.record.label}), the largest {text.size(worst.a90_95.value)} mm ({worst.record.label})"
+    )
+    without = len(limits) - len(shown)
+    few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
+    return f"{span}{few} no limit within the sizes inspected." if without else f"{span}."
+
+
+def limit_sentence(limit: SetUpLimit) -> str:
+    """Return ``50 frames: damage of 5.31 mm is found 90 % of the time with 95 % confidence (a90/95), at ...``."""
+    if not limit.a90_95.demonstrated:
+        reason = _reason(limit)
+        if reason.startswith("a chance that does not grow with size"):
+            reason = "the hits do not grow clearly with diameter"
+        # without its statistics, which stand in the notes
+        found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
+    elif not is_within_sizes(limit):
+        found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
+    else:
+        confidence = f"{100 * limit.a90_95.confidence:.0f} %"
+        size = text.size(limit.a90_95.value)
+        found = f"damage of {size} mm is found 90 % of the time with {confidence} confidence (a90/95)"
+    calls, rate = limit.false_calls, ""
+    if calls is not None:
+        ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
+        at, low, high = (f"{end:.2g}" if end < 99.5 else f"{end:.0f}" for end in ends)
+        joint = ", at" if is_within_sizes(limit) else ";"
+        rate = f"{joint} {at} false call{'' if at == '1' else 's'} per m² ({low} to {high})"
+    return f"{limit.record.label}: {found}{rate}."
+
+
+def notes_of(limit: SetUpLimit) -> list[str]:
+    """Return why there is no limit, or what makes it a cautious or a doubtful one."""
+    said = [] if limit.a90_95.demonstrated else [_reason(limit)]
+    stated = limit.statement
+    if stated is None:
+        said += [limit.a90_95.method] if limit.a90_95.demonstrated else []
+    else:
+        if limit.a90_95.demonstrated and not is_within_sizes(limit):
+            said.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
+        said += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
+        if (wrong := stated.independent) is not None:
+            size = text.size(wrong.value, limit.largest_mm)
+            claimed = f"would be {size} mm" if wrong.demonstrated else "would not be demonstrated either"
+            said.append(
+                f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.targets} "
+                "targets"
+            )
+    if limit.boards_matter:
+        effect = f"design effect {limit.design_effect:.1f}"
+        said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
+    only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
+    if only:
+        said.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
+    if limit.record.failed:
+        said.append(f"{limit.record.failed} trials failed and are missing")
+    return said
+
+
+def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
+    """Return what to know beside the limits: what all of them have in common, then a line for each set-up."""
+    notes = [(limit.record.label, notes_of(limit)) for limit in limits]
+    shared = [one for one in notes[0][1] if all(one in said for _, said in notes)] if len(notes) > 1 else []
+    own = [(name, [one for one in said if one not in shared]) for name, said in notes]
+    every = [f"every set-up: {'; '.join(shared)}"] if shared else []
+    return every + [f"{name}: {'; '.join(said)}" for name, said in own if said]
+
+
+def _reason(limit: SetUpLimit) -> str:
+    return limit.a90_95.why.removeprefix(f"{NOT_DEMONSTRATED}: ")
+
+
+def _sizes(*limits: SetUpLimit) -> str:
+    """`` (4.3 to 15.9 mm)``: the diameters inspected; empty without any."""
+    low, high = _ends_mm(*limits)
+    return "" if np.isnan(low) else f" ({low:.3g} to {high:.3g} mm)"

@@ -1,0 +1,67 @@
+"""Files that programs leave in a folder of results: those who write them, `harness.clean` and `results/README.md` take
+their names from here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+Place = Literal["results", "capture"]
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file, or with * and ? in its ``name`` several; ``note``: what it is; ``place``: a folder of results, or that of
+    a real capture inside; ``of``: which experiments write it, empty for all."""
+
+    name: str
+    note: str
+    place: Place = "results"
+    of: str = ""
+
+
+REPORT = Output("report.html", "the report, one file, readable offline")
+EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
+PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
+STUDY = Output("study.json", "every inspection of every set-up: what `harness.compare` reads", of="study")
+MAPS = Output("map-*.html", "a map that turns in the browser", of="views")
+CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
+COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
+COMPARISON_PAGE = Output("compare.html", "the same as a page", of="check")
+FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
+FINDINGS_DATA = Output(
+    "findings.json", "the same with both measures, target, settings, provenance", "capture", "capture"
+)
+ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
+TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture", "capture")
+BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
+CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
+FILES = (
+    REPORT, EXPERIMENT, PROVENANCE, STUDY, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE,
+    FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
+)  # fmt: skip
+JOURNAL = "journal"
+"""Folder of the records of trials."""
+LATEST = "latest"
+"""Link to the newest run of an experiment, beside its runs."""
+LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
+
+
+def outputs() -> Iterator[Output]:
+    """Yield every file, those of tables included."""
+    from harness.tables.study import STUDY_TABLES
+    from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
+
+    yield from FILES
+    for tables, of in ((STORED, ""), (SUMMARISED, "other"), (STUDY_TABLES, "study")):
+        for table in tables:
+            for name in table.files:
+                yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)
+
+
+def is_output(name: str, place: Place) -> bool:
+    """Return whether a file of this name is what a program writes at this place."""
+    return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

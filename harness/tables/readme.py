@@ -1,0 +1,70 @@
+"""The text of `results/README.md`: ``python -m harness.tables.readme > results/README.md`` writes it anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from harness.tables.outputs import FILES, JOURNAL, LATEST
+from harness.tables.schema import Table
+from harness.tables.study import STUDY_TABLES
+from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
+
+HEAD = f"""# Results
+
+Written by `python -m harness.tables.readme` from the declarations in `harness/tables`; a test keeps it current.
+
+Sweeps write into `results/<experiment>/<digest>/`; the digest names everything that decides a number.
+`results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file with its name where the
+system makes no links). `python -m harness.ls results` lists all runs, the settings that tell them apart and the
+detection limits that they found; `python -m harness.clean results` removes them. `{JOURNAL}/` holds finished trials,
+from which the same command resumes. `baselines/` holds what `harness.check` compares with. Noise-free renders are kept
+in `results/.cache/renders/`. All but the baselines can be deleted at any time."""
+TABLES = """
+# Tables
+
+Parquet holds every digit, units and notes of columns in its schema, and where the numbers come from (key `tofpod`:
+commit, versions, seed). CSV holds six digits. Units are the endings of names; an empty cell is unknown, or not
+demonstrated. `x_low`, `x_high` are the ends of the 95 % interval of `x`. Tables without rows are not written; an
+experiment with axes has a further column for each, named by its dotted path."""
+GROUPS = {
+    "": "Every sweep",
+    "study": "A study of detection limits, too",
+    "views": "An experiment with several views, too",
+    "capture": "An experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
+    "check": "`harness.check`, too",
+}
+
+
+def results_readme() -> str:
+    """Return the whole text."""
+    return "\n".join([*_lines()])
+
+
+def _lines() -> Iterator[str]:
+    yield HEAD
+    for of, title in GROUPS.items():
+        yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
+        yield from (f"| `{one.name}` | {one.note} |" for one in FILES if one.of == of)
+    yield TABLES
+    of_trials = [table for table in STORED if table not in STUDY_ONLY]
+    yield from _tables("Trials", of_trials)
+    yield from _tables("Summaries of an experiment that is no study", SUMMARISED)
+    yield from _tables("Detection limits of a study", STUDY_TABLES)
+    yield from _tables("Trials of a study", STUDY_ONLY)
+    yield ""
+
+
+def _tables(title: str, tables: Iterable[Table]) -> Iterator[str]:
+    yield f"\n## {title}"
+    for table in tables:
+        yield f"\n### {', '.join(f'`{name}`' for name in table.files)}\n"
+        yield f"{table.note[0].upper()}{table.note[1:]}.\n"
+        yield "| column | content |"
+        yield "|---|---|"
+        for column in table.stored:
+            names = f"`{column.name}`" + (", `_low`, `_high`" if len(column.names) > 1 else "")
+            yield f"| {names} | {column.note} |"
+
+
+if __name__ == "__main__":
+    print(results_readme(), end="")
