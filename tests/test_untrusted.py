@@ -21,6 +21,7 @@ from harness.inspection.poses import read_poses
 from harness.inspection.steps import assign
 from harness.scorecard.capture_program import read_mask
 from harness.scorecard.judge import read_baseline
+from harness.vocabulary.archives import read_npy
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import inside, write_text
@@ -270,3 +271,10 @@ def test_odd_paths_of_a_capture(tmp_path, path):
     )
     (tmp_path / "a.yaml").write_text(text)
     assert "a.yaml" in refusal(lambda: load_experiment(tmp_path / "a.yaml"))
+
+
+def test_a_header_with_an_open_bracket_is_refused(tmp_path: Path) -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (4, 4, ".ljust(117) + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(64))
+    with pytest.raises(UserError, match="cannot be read as arrays"):
+        read_npy(tmp_path / "a.npy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,8 +31,11 @@ ORDERS = {
     "registrations": ["variant", "role", "frames", "repeat", "view"],
 }
 
-ROWS_AT_ONCE = 20_000
-"""As mappings some 30 MB."""
+ROWS_AT_ONCE = 2000
+"""Rows that are kept as mappings, some 3 MB."""
+UNKNOWN = np.iinfo(np.int32).min
+"""Stands among whole numbers for a value that is not known."""
+PIXELS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Tables:
 
     ``holes``: one row per variant, frames, repeat and hole. ``runs``: per variant, frames, repeat and role.
     ``probes``: per variant, frames and probe pixel, over repeats. ``noise``: per variant, frames and hole-free repeat
-    (columns of `harness.engine.board_noise`). ``registrations``: per registration that was made, under the first
+    (columns of `harness.engine.trial`). ``registrations``: per registration that was made, under the first
     variant that shares it (columns of `harness.engine.maps`); empty where there are no maps. All five carry a column
     per axis other than the number of frames, named by its path, where there are any. ``variants``: one row per set-up,
     then per variation: variant, reason, settings, is_variation, reference (the set-up to compare with, or empty),
@@ -69,7 +73,9 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> T
     collected = {name: _Rows() for name in (*ORDERS, *STUDY_ORDERS)}
     probes: list[dict[str, Any]] = []
     for record in records:
-        probes.extend(record.get("probes", ()))
+        for row in record.get("probes", ()):
+            errors = np.array([UNKNOWN if value is None else value for value in row["error_tenth_um"]], np.int32)
+            probes.append({**row, "error_tenth_um": errors})
         for name, rows in collected.items():
             rows.add(record.get(name, ()))
     axes, variants = _axes(experiment), _variants(experiment)
@@ -98,13 +104,18 @@ class _Rows:
             self._flush()
 
     def table(self) -> pd.DataFrame:
-        """All rows."""
+        """All rows; nothing is left here."""
         self._flush()
-        return pd.concat(self._frames, ignore_index=True) if len(self._frames) > 1 else self._frames[0]
+        frames, self._frames = self._frames, []
+        return pd.concat(frames, ignore_index=True) if len(frames) > 1 else frames[0]
 
     def _flush(self) -> None:
         if self._rows or not self._frames:
-            self._frames.append(pd.DataFrame(_one_a_threshold(self._rows)))
+            frame = pd.DataFrame(_one_a_threshold(self._rows))
+            for column in [name for name in frame.columns if frame[name].dtype == object]:
+                # each word once: every record brings its own copy
+                frame[column] = [sys.intern(value) if type(value) is str else value for value in frame[column]]
+            self._frames.append(frame)
         self._rows = []
 
 
@@ -148,21 +159,24 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
         grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])
     tables = []
     for (variant, frames), errors in grouped.items():
-        mm = np.array(errors, dtype=float) * 1e-7 / MM
-        displacement = _displacements(mm)
-        mm = mm - displacement[:, None]
-        with np.errstate(invalid="ignore"):
-            std = mm.std(axis=0, ddof=1) if len(mm) > 1 else np.full(mm.shape[1], np.nan)
+        tenth_um = np.array(errors)
+        displacement = _displacements(tenth_um)
+        mean, std = np.empty((2, tenth_um.shape[1]))
+        for pixels in np.array_split(np.arange(tenth_um.shape[1]), -(-tenth_um.shape[1] // PIXELS_AT_ONCE) or 1):
+            mm = _in_mm(tenth_um[:, pixels]) - displacement[:, None]
+            mean[pixels] = mm.mean(axis=0)
+            with np.errstate(invalid="ignore"):
+                std[pixels] = mm.std(axis=0, ddof=1) if len(mm) > 1 else np.nan
         tables.append(
             pd.DataFrame(
                 {
                     "variant": variant,
                     "frames": frames,
-                    "pixel": np.arange(mm.shape[1]),
-                    "mean_error_mm": mm.mean(axis=0),
+                    "pixel": np.arange(tenth_um.shape[1]),
+                    "mean_error_mm": mean,
                     "temporal_std_mm": std,
-                    "displacement_std_mm": displacement.std(ddof=1) if len(mm) > 1 else np.nan,
-                    "repeats": len(mm),
+                    "displacement_std_mm": displacement.std(ddof=1) if len(displacement) > 1 else np.nan,
+                    "repeats": len(displacement),
                 }
             )
         )
@@ -170,18 +184,24 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
 
 
-def _displacements(errors_mm: np.ndarray) -> np.ndarray:
-    """(repeats,): each repeat's median error over the probes, less the median repeat's; 0 where none is known."""
-    known = np.isfinite(errors_mm).any(axis=1)
-    medians = np.zeros(len(errors_mm))
+def _in_mm(tenth_um: np.ndarray) -> np.ndarray:
+    """Errors in mm; NaN where they are not known."""
+    return np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
+
+
+def _displacements(tenth_um: np.ndarray) -> np.ndarray:
+    """(repeats,) mm: each repeat's median error over the probes, less the median repeat's; 0 where none is known."""
+    known = (tenth_um != UNKNOWN).any(axis=1)
+    medians = np.zeros(len(tenth_um))
+    for repeat in np.flatnonzero(known):
+        medians[repeat] = np.nanmedian(_in_mm(tenth_um[repeat]))
     if known.any():
-        medians[known] = np.nanmedian(errors_mm[known], axis=1)
         medians[known] -= np.median(medians[known])
     return medians
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """What each set-up and variation changes, why it is plausible, and where it lies on the axes."""
+    """The changes of each set-up and variation, their reasons, and their places on the axes."""
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:

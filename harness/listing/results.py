@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +17,8 @@ from harness.vocabulary.locks import lock, opened_lock
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
-ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?")
-"""Of a journal; those of version 3 and before end in .json."""
+ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?|[0-9]{6}-[0-9a-f]{8}\.jsonl")
+"""Files of a journal: `harness.engine.journal.SEGMENT_NAME`, and those of version 5 and before, of one trial each."""
 
 POINT_NAME = re.compile(r"point-[0-9]{3,6}")
 """Of a folder with the findings in one real capture."""
@@ -70,7 +69,13 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 def described(path: Path) -> ResultFolder:
     """What a folder of results holds; a broken one is described as such."""
-    size, records = _measured(path)
+    from harness.engine.journal import Journal
+
+    size = _measured(path)
+    try:
+        records = len(Journal(path / "journal"))
+    except UserError:  # of a newer tofpod, or reached through a link
+        records = 0
     has_report = (path / "report.html").is_file()
     found = ResultFolder(path, path.parent.name, path.name, "broken", "", size, records, has_report)
     try:
@@ -113,7 +118,7 @@ def _with_provenance(found: ResultFolder, said: dict[str, Any]) -> ResultFolder:
 def in_use(path: Path) -> bool:
     """Whether a sweep is at work in this folder; False where the system has no locks. Holds it for no longer than it
     takes to ask."""
-    from harness.engine.lock import LOCK
+    from harness.engine.shard import LOCK
 
     if not (path / LOCK).is_file():
         return False
@@ -124,15 +129,14 @@ def in_use(path: Path) -> bool:
         return False
 
 
-def _measured(path: Path) -> tuple[int, int]:
-    """What a folder takes on the disk, and how many records its journal has."""
-    size = records = 0
+def _measured(path: Path) -> int:
+    """What a folder takes on the disk, in bytes."""
+    size = 0
     for entry in files_below(path):
         with contextlib.suppress(OSError):
             found = entry.stat(follow_symlinks=False)
             size += getattr(found, "st_blocks", -(-found.st_size // 512)) * 512
-            records += ENTRY_NAME.fullmatch(entry.name) is not None and stat.S_ISREG(found.st_mode)
-    return size, records
+    return size
 
 
 def files_below(path: Path) -> Iterator[os.DirEntry[str]]:

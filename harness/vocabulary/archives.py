@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO
 
 import numpy as np
@@ -35,7 +36,7 @@ KINDS = "biufcUSmM"
 
 DAMAGES = (
     *(ValueError, OSError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError, OverflowError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
+    *(zipfile.BadZipFile, zlib.error, struct.error, TokenError),
 )
 """What a wrong byte raises in numpy and zipfile; RuntimeError: an encrypted entry; MemoryError: more than there is."""
 
