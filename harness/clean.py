@@ -86,7 +86,7 @@ def _clean_results(options: argparse.Namespace) -> int:
     size = sum(one.size_bytes for one in files)
     for folder in folders:
         print(folder)
-    what = "records of trials" if options.journal_only else "files"
+    what = "files of journals" if options.journal_only else "files"
     if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size_text(size)}", len(files)):
         return 0 if options.dry_run or not files else 1
     with ExitStack() as held:
@@ -102,7 +102,7 @@ def _clean_results(options: argparse.Namespace) -> int:
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
     """Hold a folder of results. Raises UserError where a sweep does, or where it cannot be written."""
-    from harness.engine.lock import locked
+    from harness.engine.shard import locked
 
     with ExitStack() as held:
         try:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
+MOST_STUDIES = 100_000
+"""Simulated studies are kept in memory."""
 LEAST = 10
 """Fewer targets are no study: the same number of rows that python -m harness.pod asks for."""
 MOST = 10_000
@@ -229,8 +231,9 @@ def _check(options: argparse.Namespace, guess: _Guess) -> None:
         raise UserError(
             f"--pod {options.pod:g} --confidence {options.confidence:g}", legal="0 < pod < 1, 0.5 < confidence < 1"
         )
-    if options.studies < LEAST:
-        raise UserError(f"--studies {options.studies}", legal=f"{LEAST} or more; quantiles of fewer mean nothing")
+    if not LEAST <= options.studies <= MOST_STUDIES:
+        legal = f"{LEAST} to {MOST_STUDIES}; quantiles of fewer mean nothing, and more take the memory"
+        raise UserError(f"--studies {options.studies}", legal=legal)
     a_pod = guess.curve.size_at(options.pod)
     if options.goal is not None and not options.goal > a_pod:
         raise UserError(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import dataclass, field
+from math import isclose
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from harness.engine.journal import Entry, Journal
+    from harness.engine.journal import Journal
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -35,27 +36,29 @@ def _parser() -> argparse.ArgumentParser:
 
 @dataclass
 class Merged:
-    """What was copied, and what was wrong with the rest; ``different``: keys whose results are not alike."""
+    """Counts of trials that were copied, and that were there. Of the latter, ``alike`` differ in last digits, and those
+    with the keys ``different`` in more; ``damaged``: lines and files of journals that were left out."""
 
     copied: int = 0
     known: int = 0
-    damaged: list[Path] = field(default_factory=list)
+    alike: int = 0
+    damaged: list[str] = field(default_factory=list)
     different: list[str] = field(default_factory=list)
 
 
 def _run(options: argparse.Namespace) -> int:
     from harness.engine.journal import Journal
-    from harness.engine.lock import locked
-    from harness.vocabulary.files import write_text
+    from harness.engine.shard import locked
+    from harness.vocabulary.files import write_bytes
+    from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
 
     _refuse_others(options.folders, options.into)
     merged = Merged()
     declared = next((path for folder in options.folders if (path := folder / "experiment.yaml").is_file()), None)
-    if declared is not None:
-        # written again where it is there: a folder that cannot be written shows before anything is copied
-        write_text(options.into / "experiment.yaml", declared.read_text())
-    else:
+    if declared is None:
         raise UserError(f"{options.folders[0]}: has no experiment.yaml", fix="name folders as sweeps leave them")
+    # written again where it is there: a folder that cannot be written shows before anything is copied
+    write_bytes(options.into / "experiment.yaml", bounded_bytes(declared, TEXT_BYTES))
     with locked(options.into):
         into = Journal(options.into / "journal")
         for folder in options.folders:
@@ -67,35 +70,45 @@ def _run(options: argparse.Namespace) -> int:
 
 def merge_into(into: Journal, other: Journal, merged: Merged) -> None:
     """Copy what ``into`` lacks, or has not done. Raises UserError where a newer tofpod wrote either."""
-    from harness.engine.journal import read_entry
-
-    for key, path in other.entries():
-        entry = read_entry(path, key)
-        if entry is None:
-            merged.damaged.append(path)
-            continue
+    for key, entry in other.entries():
         known = into.read(key)
         if known is None or (known.state != "done" and entry.state == "done"):
             into.write(key, entry)
-            merged.copied += 1
+            merged.copied += key not in other.thresholds
             continue
-        merged.known += 1
-        both_done = known.state == entry.state == "done"
-        if both_done and known.text != entry.text and _numbers(known) != _numbers(entry):
-            merged.different.append(key)
-
-
-def _numbers(entry: Entry) -> object:
-    """A record without its timings, which no two runs have in common."""
-    return _without_seconds(entry.record)
+        merged.known += key not in other.thresholds
+        if known.state == entry.state == "done" and known.text != entry.text:
+            first, second = (_without_seconds(one.record) for one in (known, entry))
+            merged.alike += first != second and _alike(first, second)
+            if not _alike(first, second):
+                merged.different.append(key)
+    merged.damaged += other.damaged
+    into.sync()
 
 
 def _without_seconds(value: object) -> object:
+    """A record without its timings, which no two runs have in common."""
     if isinstance(value, dict):
         return {name: _without_seconds(one) for name, one in value.items() if not name.startswith("seconds")}
     if isinstance(value, list):
         return [_without_seconds(one) for one in value]
     return value
+
+
+def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
+    """Return whether two values agree as unlike processors make them agree: to a thousandth, or in mm to 1 um.
+    Whole numbers are counts, which must be equal, but for errors in tenths of a micrometre."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        names = first.keys() if first.keys() == second.keys() else [""]
+        return all(_alike(first.get(n), second.get(n, n), in_tenth_um=n == "error_tenth_um") for n in names)
+    if isinstance(first, list) and isinstance(second, list):
+        same = len(first) == len(second)
+        return same and all(_alike(a, b, in_tenth_um=in_tenth_um) for a, b in zip(first, second, strict=True))
+    if isinstance(first, float) and isinstance(second, float):
+        return isclose(first, second, rel_tol=1e-3, abs_tol=1e-3)
+    if in_tenth_um and isinstance(first, int) and isinstance(second, int):
+        return abs(first - second) <= 10
+    return bool(first == second)
 
 
 def _refuse_others(folders: list[Path], into: Path) -> None:
@@ -127,8 +140,10 @@ def _refuse_others(folders: list[Path], into: Path) -> None:
 def _told(merged: Merged, into: Journal) -> int:
     print(f"{into.folder}: {merged.copied} trials copied, {merged.known} were there")
     if merged.damaged:
-        some = ", ".join(str(path) for path in merged.damaged[:3])
+        some = ", ".join(merged.damaged[:3])
         print(f"{len(merged.damaged)} damaged or older records left out, to be run again: {some}", file=sys.stderr)
+    if merged.alike:
+        print(f"{merged.alike} trials differ in last digits, as unlike processors make them; the first copied was kept")
     if merged.different:
         some = ", ".join(merged.different[:3])
         print(

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from harness.engine.processes import ONE_THREAD
+from harness.engine.setup import SetUpRef, load_set_up
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 60.0
@@ -130,7 +131,18 @@ def threads() -> dict[str, int]:
     return {str(one["filepath"]): one["num_threads"] for one in threadpool_info()} | {"cv2": cv2.getNumThreads()}
 
 
-def note_and_sleep(path: str, seconds: float) -> int:
-    Path(path).write_text(str(os.getpid()))
+def note_node_and_sleep(path: str, seconds: float) -> int:
+    """Note the dask worker that this process belongs to."""
+    Path(path).write_text(str(os.getppid()))
     time.sleep(seconds)
     return 0
+
+
+def pid_after(seconds: float) -> int:
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def probes_of(set_up: SetUpRef) -> int:
+    """Load a set-up; how many probes it has."""
+    return len(load_set_up(set_up).probes)

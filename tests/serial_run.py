@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from harness.engine.journal import Journal
-from harness.engine.outcome import Outcome
-from harness.engine.plan import Plan
+from harness.engine.plan import SweepPlan
+from harness.engine.processes import SerialEngine
 from harness.engine.run import run_plan
-from harness.engine.serial import SerialEngine
+from harness.engine.work import Outcome
 
 
-def run_serially(plan: Plan, folder: Path, **asked: Any) -> Outcome:
+def run_serially(plan: SweepPlan, folder: Path, **asked: Any) -> Outcome:
     """Run what the journal in ``folder`` lacks."""
     with SerialEngine() as engine:
         return run_plan(plan, Journal(folder), engine, lambda _: None, **asked)

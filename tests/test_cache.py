@@ -129,6 +129,14 @@ def test_truncated_files_are_absent(stored, share):
     assert read_view(stored) is None
 
 
+def test_a_file_that_states_no_version_is_absent(stored):
+    parts = parts_of(stored)
+    facts = json.loads(parts["facts.json"])
+    del facts["version"]
+    put_together(stored, {**parts, "facts.json": json.dumps(facts).encode()})
+    assert stored_view(stored) is None
+
+
 def test_a_file_of_another_version_is_absent(stored):
     with_facts(stored)
     assert read_view(stored) is not None

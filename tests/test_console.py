@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from harness.engine.console import PLAIN_EVERY_S, Pace, duration, plain_text, progress_display, rate_text
-from harness.engine.outcome import Progress, StageCounts
+from harness.engine.work import Progress, StageCounts
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -174,7 +174,7 @@ def test_rates(rate, text):
 SHOWN = """
 import time
 from harness.engine.console import progress_display
-from harness.engine.outcome import Progress, StageCounts
+from harness.engine.work import Progress, StageCounts
 with progress_display() as show:
     for k in range(12):
         trials = StageCounts(done=40000 * k, found=400, failed=k // 9, total=1000000)

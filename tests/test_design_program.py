@@ -252,6 +252,7 @@ def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str])
         ([*TOLD, "--targets", "60", "9"], "--targets 9"),
         ([*TOLD, "--targets", "20000"], "10 to 10000"),
         ([*TOLD, "--studies", "1"], "--studies 1"),
+        ([*TOLD, "--studies", "100000000"], "10 to 100000"),
         ([*TOLD, "--pod", "1"], "0 < pod < 1"),
         ([*TOLD, "--confidence", "0.4"], "0.5 < confidence < 1"),
         ([*TOLD, "--goal", "6.5"], "not above the guess's own 7"),

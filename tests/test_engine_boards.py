@@ -12,11 +12,8 @@ from scipy import ndimage
 
 from detectors.interface import Detection, Evidence
 from detectors.thesis import ThesisConfig, ThesisDetector
-from harness.engine.boards import FINDING_OCTAVES, PIXEL_OCTAVES, grid, study_rows
-from harness.engine.judge import Judgement
-from harness.engine.setup import INTACT_MARGIN_PX, _eroded, met_on_face
-from harness.engine.sight import Sight
-from harness.engine.sight_kernels import highest_within, pixel_areas
+from harness.engine.judge import FINDING_OCTAVES, PIXEL_OCTAVES, JudgedCloud, grid, study_rows
+from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, _eroded, highest_within, met_on_face, pixel_areas
 from harness.evaluation.match import match
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import Region
@@ -25,7 +22,7 @@ from scenes.target.face import face_of
 from scenes.target.truth import truth_of
 
 
-def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
+def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud]:
     """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far from both 5."""
     target = TargetConfig.from_data(
         {
@@ -50,7 +47,7 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
     }
     undamaged = np.ones(x.shape, bool)
     undamaged.ravel()[np.concatenate(list(outlines.values()))] = False
-    sight = Sight(cloud, T_board_cloud, target, truth, outlines, places, undamaged, {1: 0.01, 2: 0.01})
+    known = KnownCloud(cloud, T_board_cloud, target, truth, outlines, places, undamaged, {1: 0.01, 2: 0.01})
     score = np.zeros(x.shape)
     score[:, 90:] = np.nan
     score[29, 19], score[10, 50] = 9.0, 5.0
@@ -61,7 +58,7 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
             return tuple(one for one in (hit, call) if one.score > threshold)
 
     evidence = SimpleNamespace(score=score)
-    judgement = Judgement(
+    judgement = JudgedCloud(
         run={"threshold": threshold},
         holes=[{"hole": "1"}, {"hole": "2"}],
         detector=Found(),  # type: ignore[arg-type]
@@ -70,12 +67,12 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[Sight, Judgement]:
         places_m=np.array([points[29, 19, :2], points[10, 50, :2]]),
         pairs={0: 0},
     )
-    return sight, judgement
+    return known, judgement
 
 
 def test_what_a_damaged_board_gives():
-    sight, judgement = sight_and_judgement()
-    rows = study_rows(sight, judgement, 0.01, hole_free=False)
+    known, judgement = sight_and_judgement()
+    rows = study_rows(known, judgement, 0.01, hole_free=False)
     assert [row["signal"] for row in rows.holes] == [9.0, 0.0]
     assert rows.run["inspected_m2"] == pytest.approx(90 * 60e-6)  # ten columns of 100 were not judged
     findings = rows.of_study["findings"]
@@ -87,15 +84,15 @@ def test_what_a_damaged_board_gives():
     assert at[8.0] == (1, 1)
     assert at[16.0] == (0, 0)
     of_pixels = {row["hole"]: row for row in rows.of_study["pixels"]}
-    assert of_pixels["1"]["pixels"] == len(sight.outlines[1])
+    assert of_pixels["1"]["pixels"] == len(known.outlines[1])
     assert of_pixels["1"]["above"][of_pixels["1"]["threshold"].index(4.0)] == 1
     assert of_pixels[""]["above"][of_pixels[""]["threshold"].index(4.0)] == 1
     assert rows.of_study["sites"] == []
 
 
 def test_a_hole_free_board_gives_the_same_places_as_sites():
-    sight, judgement = sight_and_judgement()
-    rows = study_rows(sight, judgement, 0.01, hole_free=True)
+    known, judgement = sight_and_judgement()
+    rows = study_rows(known, judgement, 0.01, hole_free=True)
     assert rows.holes == []
     assert [(row["hole"], row["detected"], row["signal"]) for row in rows.of_study["sites"]] == [
         ("1", True, 9.0),
@@ -107,9 +104,9 @@ def test_a_hole_free_board_gives_the_same_places_as_sites():
 
 
 def test_a_place_where_nothing_was_judged_has_no_signal():
-    sight, judgement = sight_and_judgement()
+    known, judgement = sight_and_judgement()
     judgement.evidence.score[:] = np.nan
-    assert np.isnan(study_rows(sight, judgement, 0.01, hole_free=True).of_study["sites"][0]["signal"])
+    assert np.isnan(study_rows(known, judgement, 0.01, hole_free=True).of_study["sites"][0]["signal"])
 
 
 def test_the_grid_of_thresholds_holds_the_one_in_use():
@@ -122,7 +119,7 @@ def test_the_grid_of_thresholds_holds_the_one_in_use():
 
 def test_pixels_cover_the_face_however_it_is_tilted():
     """A camera's grid on a plane tilted by 40 degrees: the pixels' areas sum to the face's."""
-    sight, _ = sight_and_judgement()
+    known, _ = sight_and_judgement()
     slopes = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 281), np.linspace(-0.05, 0.05, 201)), axis=-1)
     tilt = np.deg2rad(40)
     depth = 1.0 / (1 - slopes[..., 0] * np.tan(tilt))  # z = 1 + x tan
@@ -130,7 +127,7 @@ def test_pixels_cover_the_face_however_it_is_tilted():
     inside = (np.abs(place[..., 0]) < 0.05) & (np.abs(place[..., 1]) < 0.03)
     place[~inside] = np.nan
     cloud = SimpleNamespace(organised=True)
-    tilted = replace(sight, cloud=cast("Cloud", cloud), places_m=place)
+    tilted = replace(known, cloud=cast("Cloud", cloud), places_m=place)
     assert tilted.area_m2(inside) == pytest.approx(100 * 60e-6, rel=0.01)
 
 
@@ -175,15 +172,15 @@ class FewerFound(ThesisDetector):
 @pytest.mark.parametrize("kind", [ThesisDetector, FewerFound])
 @pytest.mark.parametrize("min_points", [1, 3])
 def test_findings_at_other_thresholds_are_those_of_find(kind: type[ThesisDetector], min_points: int):
-    sight, judgement = sight_and_judgement()
+    known, judgement = sight_and_judgement()
     detector = kind(ThesisConfig.from_data({"min_points": min_points}))
-    score = np.random.default_rng(2).exponential(2.0, sight.cloud.valid.shape)
+    score = np.random.default_rng(2).exponential(2.0, known.cloud.valid.shape)
     evidence = Evidence(score, score, score, 1.0)
     judgement = replace(judgement, detector=detector, evidence=evidence)
-    (operating,) = study_rows(sight, judgement, 0.01, hole_free=False).of_study["operating"]
-    found = [detector.find(sight.cloud, evidence, one) for one in operating["threshold"]]
-    centres = [sight.on_board(np.array([one.centre_m for one in each]).reshape(-1, 3)) for each in found]
-    truth = np.array([damage.centre_board_m[:2] for damage in sight.truth])
+    (operating,) = study_rows(known, judgement, 0.01, hole_free=False).of_study["operating"]
+    found = [detector.find(known.cloud, evidence, one) for one in operating["threshold"]]
+    centres = [known.on_board(np.array([one.centre_m for one in each]).reshape(-1, 3)) for each in found]
+    truth = np.array([damage.centre_board_m[:2] for damage in known.truth])
     assert operating["findings"] == [len(each) for each in found]
     assert operating["hits"] == [len(match(truth, each, 0.01)) for each in centres]
     assert max(operating["findings"]) == 1 if kind is FewerFound else max(operating["findings"]) > 1

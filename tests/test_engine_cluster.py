@@ -8,8 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,9 @@ from cluster_processes import (
     hold_the_interpreter,
     kill_own_process,
     loaded,
-    note_and_sleep,
+    note_node_and_sleep,
+    pid_after,
+    probes_of,
     processes,
     raises,
     slow_square,
@@ -36,16 +39,13 @@ from cluster_processes import (
 from serial_run import records_of, run_serially
 from test_engine import TINY
 
-from harness.engine import cluster as cluster_engine
-from harness.engine import cluster_link
 from harness.engine.cluster import ClusterEngine
 from harness.engine.journal import Journal
+from harness.engine.options import code_of
 from harness.engine.plan import plan_of
-from harness.engine.rendering import render_into_cache
+from harness.engine.processes import SerialEngine, render_into_cache
 from harness.engine.run import run_plan
-from harness.engine.serial import SerialEngine
-from harness.engine.setup import load_set_up
-from harness.engine.work import Ended, Engine, Job, Limits
+from harness.engine.work import Ended, Job, JobEngine, Limits
 from harness.experiment.load import load_experiment
 from harness.vocabulary.errors import UserError
 from scenes.render.cache import read_view
@@ -53,13 +53,13 @@ from scenes.render.cache import read_view
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    """Two workers with nannies, which replace what dies."""
+    """Two nodes of one process each, with nannies, which replace a node that dies."""
     with processes(tmp_path_factory.mktemp("cluster")) as started:
         started.worker("--nworkers", "2", "--memory-limit", "1GB")
         yield started
 
 
-def run(engine: Engine, jobs: Iterable[Job]) -> dict[str, Ended]:
+def run(engine: JobEngine, jobs: Iterable[Job]) -> dict[str, Ended]:
     """Each job's end, by name."""
     waiting, under_way, ended = list(jobs)[::-1], 0, {}
     while waiting or under_way:
@@ -78,10 +78,11 @@ def squares(count: int, name: str = "square") -> list[Job]:
 
 
 NO_LIMITS = Limits()
+CODE = code_of(["thesis"])
 
 
 def engine_at(cluster: Processes, limits: Limits = NO_LIMITS) -> ClusterEngine:
-    return ClusterEngine(cluster.address, limits, 2)
+    return ClusterEngine(cluster.address, limits, 2, CODE)
 
 
 def test_results_are_those_of_this_process(cluster):
@@ -115,31 +116,27 @@ def test_a_job_that_kills_its_worker_costs_itself_only(cluster):
     with engine_at(cluster) as engine:
         ended = run(engine, jobs)
     killer = ended.pop("killer")
-    assert killer.state == "crashed" and "its worker died" in killer.why
+    assert killer.state == "crashed" and "SIGKILL" in killer.why
     assert len(ended) == 120
     assert all(how.state == "done" and how.value == int(name.split()[1]) ** 2 for name, how in ended.items())
 
 
-def test_a_worker_killed_from_outside_costs_nothing_among_others(cluster, tmp_path):
-    jobs = [*squares(40), Job("slow", "trials", note_and_sleep, (str(tmp_path / "pid"), 1.0)), *squares(40, "after")]
+def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
+    """SIGKILL to a dask worker in the middle of its jobs: they run on the other, and the nanny starts a new one."""
+    jobs = [Job(f"slow {n}", "trials", note_node_and_sleep, (str(tmp_path / f"{n}"), 0.4)) for n in range(12)]
     with engine_at(cluster) as engine:
-        for job in jobs:
-            engine.submit(job)
-        ended: dict[str, Ended] = {}
-        import threading
+        killed: list[int] = []
 
         def kill() -> None:
-            until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
-            os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+            until(lambda: list(tmp_path.iterdir()) and next(tmp_path.iterdir()).read_text())
+            killed.append(int(next(tmp_path.iterdir()).read_text()))
+            os.kill(killed[0], signal.SIGKILL)
 
         killing = threading.Thread(target=kill)
         killing.start()
-        while len(ended) < len(jobs):
-            ended |= {job.name: how for job, how in engine.ended()}
+        ended = run(engine, jobs)
         killing.join()
-    others = {name: how.state for name, how in ended.items() if name != "slow"}
-    assert set(others.values()) == {"done"} and len(others) == 80
-    assert ended["slow"].state in ("done", "crashed")  # crashed if by chance it was alone with its worker
+    assert {how.state for how in ended.values()} == {"done"} and len(ended) == 12 and killed
 
 
 def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
@@ -153,30 +150,31 @@ def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
     assert {how.state for how in again.values()} == {"done"}
 
 
-def test_a_job_that_stops_its_whole_process_is_ended_by_the_nanny(cluster, monkeypatch):
-    monkeypatch.setattr(cluster_engine, "GRACE_S", 2.0)
-    monkeypatch.setattr(cluster_link, "ENDS_S", 1.0)
-    with engine_at(cluster, Limits(seconds=1.0)) as engine:
+def test_a_job_that_stops_its_whole_process_is_ended_by_its_limit(cluster):
+    with engine_at(cluster, Limits(seconds=2.0)) as engine:
         ended = run(engine, [Job("endless", "trials", hold_the_interpreter, ()), *squares(100)])
-        endless = ended.pop("endless")
-        assert endless.state == "timed out" and "does not answer" in endless.why
-        assert {how.state for how in ended.values()} == {"done"}
-
-
-def test_a_job_that_eats_memory_ends_with_its_worker_and_says_why(cluster):
-    jobs = [*squares(20, "before"), Job("hungry", "trials", eat, (3000,)), *squares(20, "after")]
-    with engine_at(cluster) as engine:
-        ended = run(engine, jobs)
-    hungry = ended.pop("hungry")
-    assert hungry.state == "crashed" and "--memory-limit" in hungry.why
+    endless = ended.pop("endless")
+    assert endless.state == "timed out" and "in hold_the_interpreter" in endless.why
     assert {how.state for how in ended.values()} == {"done"}
 
 
-def test_a_limit_of_memory_is_told_before_the_nanny_acts(cluster):
+def test_a_job_that_eats_memory_meets_its_limit(cluster):
+    jobs = [*squares(20, "before"), Job("hungry", "trials", eat, (3000,)), *squares(20, "after")]
     with engine_at(cluster, Limits(memory_mb=600)) as engine:
-        ended = run(engine, [*squares(5), Job("hungry", "trials", eat, (3000,))])
-    assert ended["hungry"].state == "failed" and "out of memory" in ended["hungry"].why
-    assert ended["square 4"].value == 16
+        ended = run(engine, jobs)
+    hungry = ended.pop("hungry")
+    assert hungry.state == "failed" and "out of memory" in hungry.why and "--memory-limit" in hungry.why
+    assert {how.state for how in ended.values()} == {"done"}
+
+
+def test_a_node_of_several_processes_uses_them_all(tmp_path):
+    with processes(tmp_path / "cluster") as one:
+        one.worker("--nthreads", "3", "--no-nanny")
+        with engine_at(one) as engine:
+            assert engine.worker_count == 3
+            ended = run(engine, [Job(f"pid {n}", "trials", pid_after, (0.3,)) for n in range(12)])
+    assert len({how.value for how in ended.values()}) == 3
+    assert len({how.worker for how in ended.values()}) == 1
 
 
 def test_the_scheduler_gone_is_a_clear_message(tmp_path):
@@ -201,7 +199,7 @@ def test_the_scheduler_gone_is_a_clear_message(tmp_path):
     ],
 )
 def test_what_cannot_be_reached(scheduler, message):
-    with pytest.raises(UserError, match=message), ClusterEngine(scheduler, Limits(), 2):
+    with pytest.raises(UserError, match=message), ClusterEngine(scheduler, Limits(), 2, CODE):
         pass
 
 
@@ -235,7 +233,7 @@ def test_a_cluster_of_dask_jobqueue(tmp_path):
         "from harness.engine.cluster import ClusterEngine\n"
         "from harness.engine.work import Job, Limits\n"
         "if __name__ == '__main__':\n"
-        "    with ClusterEngine('jobqueue:local', Limits(), 1) as engine:\n"
+        "    with ClusterEngine('jobqueue:local', Limits(), 1, {}) as engine:\n"
         "        engine.submit(Job('one', 'trials', square, (12,)))\n"
         "        print(engine.ended()[0][1].value)\n"
     )
@@ -269,10 +267,10 @@ def renders_and_set_ups(experiment: Path, cache: Path) -> tuple[list[Job], list[
         )
         for job in plan.renders
     ]
-    views = [view for group in plan.groups for batch in group.batches for view in batch.views]
+    batches = [batch for group in plan.groups for batch in group.batches]
     loads = [
-        Job(f"load {n} {again}", "trials", load_set_up, (view.set_up,), (view.render.path,))
-        for n, view in enumerate(views)
+        Job(f"load {n} {again}", "trials", probes_of, (batch.set_ups[0],), (batch.renders[0].path,))
+        for n, batch in enumerate(batches)
         for again in range(4)
     ]
     return renders, loads
@@ -310,7 +308,7 @@ def test_a_render_that_fails_or_kills_its_process_costs_itself(cluster, tmp_path
     with engine_at(cluster) as engine:
         ended = run(engine, jobs)
         again = run(engine, squares(20))
-    assert ended["dies.npz"].state == "crashed" and "signal 9" in ended["dies.npz"].why
+    assert ended["dies.npz"].state == "crashed" and "SIGKILL" in ended["dies.npz"].why
     assert ended["fails.npz"].state == "failed" and "no such number" in ended["fails.npz"].why
     assert {how.state for name, how in ended.items() if "npz" not in name} == {"done"}
     assert {how.state for how in again.values()} == {"done"}
@@ -348,7 +346,11 @@ def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tmp_path):
     more = ("--set", "repeats=400", "--scheduler", cluster.address)
     command = sweep_command(experiment, "out", *more)
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
-    ended: Callable[[], list[Path]] = lambda: list(tmp_path.rglob("journal/*/damaged*.jsonl"))  # noqa: E731
+
+    def ended() -> list[str]:
+        journals = [Journal(folder) for folder in tmp_path.glob("out/tiny/[0-9a-f]*/journal")]
+        return [key for journal in journals for key in journal.trials() if key.startswith("damaged")]
+
     until(lambda: len(ended()) > 2 or process.poll() is not None, 2 * HOLD)
     process.send_signal(signal.SIGINT)
     began = time.monotonic()

@@ -1,11 +1,12 @@
-"""What a cluster's driver makes of workers that come and go: events as dask sends them, without any worker."""
+"""A cluster's driver and nodes that come and go: dask's client is in the test's hands, without any worker."""
 
 from __future__ import annotations
 
 import asyncio
 import platform
-import queue
+import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,197 +19,239 @@ pytest.importorskip("distributed")
 from cluster_processes import square
 
 from harness.engine import cluster as cluster_engine
-from harness.engine import plan
+from harness.engine import node
 from harness.engine.cluster import ClusterEngine
-from harness.engine.cluster_link import Answer, Joined, Left, Link, Parcel
-from harness.engine.cluster_worker import Carried, Worker
+from harness.engine.node import Bundle, Carried, NodeFacts
+from harness.engine.options import code_of
 from harness.engine.work import Ended, Job, Limits
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.sources import source_digest
-from scenes.render import cache, store
+from scenes.render import store
 
 FIRST, SECOND = "tcp://first:1", "tcp://second:1"
+CODE = code_of(["thesis"])
+DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}
 
 
-class FakeLink:
-    """Keeps what is sent; nobody does it."""
-
-    is_alive = True
-
-    def __init__(self) -> None:
-        self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.sent: list[Parcel] = []
-        self.addresses = {FIRST, SECOND}
-
-    def send(self, parcel: Parcel, bundle: object, needs: object) -> None:
-        self.sent.append(parcel)
-
-    def void(self, parcel: Parcel) -> None:
-        parcel.is_void = True
-
-    def sees(self, addresses: object, probe: str) -> dict[str, str | None]:
-        return {}
+def facts(*, can_render: bool = True, processes: int = 1) -> NodeFacts:
+    digests = DIGESTS if can_render else {"trials": DIGESTS["trials"]}
+    return NodeFacts(platform.python_version(), digests, processes, offers_render=False, sees=None)
 
 
-def worker(*, can_render: bool) -> Worker:
-    renders = source_digest(cache.CODE, cache.PACKAGES) if can_render else None
-    trials = source_digest(plan.BUILT_IN_CODE, plan.PACKAGES)
-    return Worker(platform.python_version(), trials, renders, threads=1, offers_render=False, sees=None)
+class FakeClient:
+    """Dask's client: nodes are what they are said to be; bundles are kept until the test answers them."""
+
+    status = "running"
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = SimpleNamespace(asyncio_loop=loop)
+        self.nodes: dict[str, NodeFacts | BaseException] = {}
+        self.sent: list[tuple[str, Bundle, asyncio.Future[Any]]] = []
+
+    def scheduler_info(self, n_workers: int) -> dict[str, Any]:
+        return {"workers": dict.fromkeys(self.nodes)}
+
+    def run(
+        self, function: Callable[..., Any], *arguments: Any, workers: list[str], asynchronous: bool = False, **_: Any
+    ):
+        if not asynchronous:
+            return {}
+        (address,) = workers
+        if function is node.examine:
+            return self._said(address)
+        answer = self.loop.asyncio_loop.create_future()
+        self.sent.append((address, arguments[0], answer))
+        return answer
+
+    async def _said(self, address: str) -> dict[str, Any]:
+        return {address: self.nodes.get(address, OSError("no answer"))}
+
+    def answer(self, number: int, said: Any = None) -> None:
+        """Let a bundle be carried out, or end as the test says."""
+        address, bundle, future = self.sent[number]
+        said = Carried(tuple(Ended("done", 1) for _ in bundle.jobs)) if said is None else said
+        self.loop.asyncio_loop.call_soon_threadsafe(future.set_result, {address: said})
 
 
-@pytest.fixture(autouse=True)
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def client(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeClient]:
     monkeypatch.setattr(cluster_engine, "LOOKS_S", 0.02)
-    monkeypatch.setattr(cluster_engine, "WAIT_FOR_WORKERS_S", 0.2)
+    monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    yield FakeClient(loop)
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join()
+    for task in asyncio.all_tasks(loop):
+        task.cancel()
+    loop.run_until_complete(asyncio.sleep(0))
+    loop.close()
 
 
-def engine_with(*events: object, scheduler: str = "tcp://driver:1") -> tuple[ClusterEngine, FakeLink]:
-    engine, link = ClusterEngine(scheduler, Limits(seconds=900.0), 1), FakeLink()
-    engine._link = link  # type: ignore[assignment]
-    for event in events:
-        link.events.put(event)
-    if events:
+def engine_with(client: FakeClient, *, scheduler: str = "tcp://driver:1", **nodes: NodeFacts) -> ClusterEngine:
+    """An engine that knows its nodes."""
+    engine = ClusterEngine(scheduler, Limits(seconds=900.0), 1, CODE)
+    engine._client = client
+    client.nodes |= {f"tcp://{name}:1": said for name, said in nodes.items()}
+    stepped(engine, lambda: len(engine._nodes) + len(engine._refused) == len(nodes))
+    return engine
+
+
+def stepped(engine: ClusterEngine, holds: Callable[[], object]) -> None:
+    end = time.monotonic() + 60.0
+    while not holds():
+        assert time.monotonic() < end, "waited too long"
         engine._step()
-    return engine, link
 
 
 def render(folder: Path, name: str = "a.npz") -> Job:
     return Job(name, "renders", square, (str(folder),))
 
 
-def answer(link: FakeLink, parcel: Parcel) -> None:
-    link.events.put(Answer(parcel, Carried(tuple(Ended("done", 1) for _ in parcel.jobs))))
+def trial(name: str) -> Job:
+    return Job(name, "trials", square, (1,))
 
 
-def test_renders_do_not_wait_for_ever_when_the_last_worker_that_renders_dies(tmp_path, capsys):
-    renderer, other = Joined(FIRST, worker(can_render=True)), Joined(SECOND, worker(can_render=False))
-    engine, link = engine_with(renderer, other)
+def handed_out(engine: ClusterEngine, client: FakeClient, count: int = 1) -> None:
+    engine._hand_out()
+    stepped(engine, lambda: len(client.sent) == count)
+
+
+def test_renders_do_not_wait_for_ever_when_the_last_node_that_renders_dies(tmp_path, client, capsys):
+    engine = engine_with(client, first=facts(), second=facts(can_render=False))
     engine.submit(render(tmp_path, "a.npz"))
     engine.submit(render(tmp_path, "b.npz"))
-    engine._hand_out()
-    link.events.put(Left(FIRST, None))
-    assert [(job.name, how.state) for job, how in engine.ended()] == [("a.npz", "crashed")]
+    handed_out(engine, client)
+    del client.nodes[FIRST]
     with pytest.raises(UserError, match="no worker that can render"):
         engine.ended()
     assert capsys.readouterr().err.count("waiting for a worker that can render") == 1
 
 
-def test_a_worker_of_another_version_is_left_out_while_others_are_there(tmp_path, capsys):
-    old = replace(worker(can_render=True), trials="of yesterday")
-    engine, link = engine_with(Joined(FIRST, old), Joined(SECOND, worker(can_render=True)))
+def test_a_node_of_another_version_is_left_out_while_others_are_there(tmp_path, client, capsys):
+    old = replace(facts(), digests={**DIGESTS, "trials": "of yesterday"})
+    engine = engine_with(client, first=old, second=facts())
     engine.submit(render(tmp_path))
-    engine._step()
-    engine._hand_out()
-    assert [parcel.address for parcel in link.sent] == [SECOND]
+    handed_out(engine, client)
+    assert [address for address, _, _ in client.sent] == [SECOND]
     assert capsys.readouterr().err.count("runs another version of tofpod") == 1
-    link.addresses.discard(SECOND)
-    link.events.put(Left(SECOND, None))
+    del client.nodes[SECOND]
     with pytest.raises(UserError, match="runs another version of tofpod"):
-        while True:
-            engine.ended()
+        engine.ended()
 
 
-def test_renders_wait_for_a_worker_that_joins_after_one_that_cannot_render(tmp_path):
-    engine, link = engine_with(Joined(FIRST, worker(can_render=False)))
-    engine.submit(render(tmp_path))
-    engine._step()
-    engine._hand_out()
-    assert not link.sent
-    link.events.put(Joined(SECOND, worker(can_render=True)))
-    engine._step()
-    engine._hand_out()
-    assert [parcel.address for parcel in link.sent] == [SECOND]
-    answer(link, link.sent[0])
-    assert [job.name for job, _ in engine.ended()] == ["a.npz"]
-
-
-def test_trials_go_on_where_no_worker_can_render(tmp_path):
-    engine, link = engine_with(Joined(FIRST, worker(can_render=False)))
-    engine.submit(Job("one", "trials", square, (1,)))
-    engine._hand_out()
-    time.sleep(0.3)  # beyond the limit, which holds only where renders wait
-    engine._step()
-    answer(link, link.sent[0])
+def test_a_node_whose_processes_load_edited_code_is_left_out_and_loses_nothing(client, capsys):
+    engine = engine_with(client, first=facts(), second=facts())
+    engine.submit(trial("one"))
+    handed_out(engine, client)
+    address = client.sent[0][0]
+    client.answer(0, UserError("the code of trials was edited while this sweep ran"))
+    stepped(engine, lambda: address not in engine._nodes)
+    assert "was edited while this sweep ran; it is not used any more" in capsys.readouterr().err
+    handed_out(engine, client, 2)
+    assert client.sent[1][0] != address
+    client.answer(1)
     assert [job.name for job, _ in engine.ended()] == ["one"]
 
 
-def test_a_worker_that_joins_twice_keeps_its_jobs():
-    engine, link = engine_with(Joined(FIRST, worker(can_render=True)))
-    engine.submit(Job("one", "trials", square, (1,)))
+def test_renders_wait_for_a_node_that_joins_after_one_that_cannot_render(tmp_path, client):
+    engine = engine_with(client, first=facts(can_render=False))
+    engine.submit(render(tmp_path))
     engine._hand_out()
-    link.events.put(Joined(FIRST, worker(can_render=True)))
-    answer(link, link.sent[0])
-    engine._step()
-    assert [job.name for job, _ in engine._done] == ["one"]
+    assert not client.sent
+    client.nodes[SECOND] = facts()
+    stepped(engine, lambda: SECOND in engine._nodes)
+    handed_out(engine, client)
+    assert [address for address, _, _ in client.sent] == [SECOND]
+    client.answer(0)
+    assert [job.name for job, _ in engine.ended()] == ["a.npz"]
 
 
-@pytest.mark.parametrize("leaves", [True, False])
-def test_a_worker_that_leaves_while_it_is_looked_at_never_joins(leaves):
-    heard: dict[str, Any] = {}
-
-    async def run(*_: object, **__: object) -> dict[str, Worker]:
-        if leaves:
-            heard["all"]((0.0, {"action": "remove-worker", "worker": FIRST}))
-        return {FIRST: worker(can_render=True)}
-
-    async def events() -> list[object]:
-        loop = SimpleNamespace(asyncio_loop=asyncio.get_running_loop(), add_callback=None)
-        no_workers = lambda n_workers: {"workers": {}}  # noqa: E731
-        client = SimpleNamespace(
-            loop=loop,
-            run=run,
-            scheduler_info=no_workers,
-            subscribe_topic=lambda topic, hear: heard.update({topic: hear}),
-        )
-        link = Link(client)
-        link.watch(lambda: None)
-        heard["all"]((0.0, {"action": "add-worker", "worker": FIRST}))
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        while not others:
-            await asyncio.sleep(0)
-            others = asyncio.all_tasks() - {asyncio.current_task()}
-        await asyncio.gather(*others)
-        return [link.events.get_nowait() for _ in range(link.events.qsize())]
-
-    assert [type(event) for event in asyncio.run(events())] == ([Left] if leaves else [Joined])
+def test_trials_go_on_where_no_node_can_render(client):
+    engine = engine_with(client, first=facts(can_render=False))
+    engine.submit(trial("one"))
+    handed_out(engine, client)
+    end = time.monotonic() + 0.3  # beyond the limit, which holds only where renders wait
+    while time.monotonic() < end:
+        engine._step()
+    client.answer(0)
+    assert [job.name for job, _ in engine.ended()] == ["one"]
 
 
-def test_a_worker_that_dies_while_it_is_looked_at_is_passed_over(capsys):
-    engine, link = engine_with()
-    link.events.put(Joined(FIRST, OSError("Timed out trying to connect")))
-    link.events.put(Joined(SECOND, worker(can_render=True)))
-    engine._step()
-    assert list(engine._places) == [SECOND]
-    assert "first:1 did not say what it is" in capsys.readouterr().err
+def test_a_node_that_dies_costs_nothing_and_jobs_that_see_many_die_are_crashed(client):
+    engine = engine_with(client, first=facts())
+    engine.submit(trial("one"))
+    for number in range(cluster_engine.TRIES):
+        handed_out(engine, client, number + 1)
+        assert not engine._done
+        client.answer(number, OSError("connection lost"))
+        stepped(engine, lambda number=number: engine._tries["one"] == number + 1 or engine._done)
+    ((job, ended),) = engine.ended()
+    assert (job.name, ended.state) == ("one", "crashed") and "its worker" in ended.why
+
+
+def test_a_node_that_leaves_while_it_is_looked_at_never_joins(client):
+    engine = engine_with(client, second=facts())
+    engine._asked.discard(FIRST)
+    engine._heed(FIRST, None, facts())
+    assert list(engine._nodes) == [SECOND]
+
+
+def test_a_node_that_dies_while_it_is_looked_at_is_passed_over(client, capsys):
+    engine = engine_with(client)
+    client.nodes = {FIRST: ValueError("half an answer"), SECOND: facts()}
+    stepped(engine, lambda: engine._nodes)
+    stepped(engine, lambda: "first:1 did not say what it is" in capsys.readouterr().err)
+    assert list(engine._nodes) == [SECOND]
 
 
 @pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'harness'"), AttributeError("no examine")])
-def test_a_worker_without_tofpod_is_refused_at_the_start(error):
-    engine, link = engine_with()
-    link.events.put(Joined(FIRST, error))
-    link.addresses.discard(SECOND)
+def test_a_worker_without_tofpod_is_refused_at_the_start(client, error):
+    engine = engine_with(client)
+    client.nodes[FIRST] = error
     with pytest.raises(UserError, match="cannot run tofpod"):
-        while not engine._places:
-            engine._step()
+        stepped(engine, lambda: engine._nodes)
 
 
-def test_a_batch_system_is_waited_for_as_long_as_it_takes(monkeypatch, capsys):
+def test_views_that_a_node_has_let_go_of_are_sent_again(tmp_path, client):
+    view = tmp_path / "view.npz"
+    view.write_bytes(b"content")
+    engine = engine_with(client, first=facts())
+    engine.submit(replace(trial("one"), needs=(view,)))
+    handed_out(engine, client)
+    assert client.sent[0][1].views == {"view.npz": b"content"}
+    client.answer(0, Carried(missing=("view.npz",)))
+    stepped(engine, lambda: engine._waiting["trials"])
+    handed_out(engine, client, 2)
+    assert client.sent[1][1].views == {"view.npz": b"content"}
+    client.answer(1)
+    assert [job.name for job, _ in engine.ended()] == ["one"]
+    engine.submit(replace(trial("two"), needs=(view,)))
+    handed_out(engine, client, 3)
+    assert client.sent[2][1].views == {} and client.sent[2][1].needs == ("view.npz",)
+    engine.__exit__()
+
+
+def test_a_batch_system_is_waited_for_as_long_as_it_takes(monkeypatch, client, capsys):
     monkeypatch.setattr(cluster_engine, "TELL_AGAIN_S", 0.1)
-    engine, _ = engine_with(scheduler="jobqueue:slurm")
-    end = time.monotonic() + 60.0
+    engine = engine_with(client, scheduler="jobqueue:slurm")
     said = ""
-    while said.count("look into its queue") < 3 and time.monotonic() < end:
-        engine._step()
+
+    def is_told() -> bool:
+        nonlocal said
         said += capsys.readouterr().err
-    assert said.count("as long as its queue takes") == 1 and said.count("look into its queue") == 3
-    started_by_hand, _ = engine_with()
+        return said.count("look into its queue") >= 3
+
+    stepped(engine, is_told)
+    assert said.count("as long as its queue takes") == 1
+    started_by_hand = engine_with(client)
     with pytest.raises(UserError, match="no worker came"):
-        while time.monotonic() < end:
-            started_by_hand._step()
+        stepped(started_by_hand, lambda: False)
 
 
-def test_what_a_killed_driver_leaves_in_the_cache_is_a_leftover(tmp_path):
-    engine, _ = engine_with(Joined(FIRST, worker(can_render=True)))
+def test_the_probe_of_a_killed_driver_is_a_leftover(tmp_path, client):
+    engine = engine_with(client, first=facts())
     engine.submit(render(tmp_path))
     assert len(list(tmp_path.iterdir())) == 1
     assert [one.path for one in store.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())

@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import signal
 import time
+from multiprocessing.connection import Connection
 
 import faulty_jobs
 import pytest
 
-from harness.engine.processes import LocalEngine
-from harness.engine.serial import SerialEngine
-from harness.engine.work import STATES, Ended, Engine, Job, Limits, attempt
+from harness.engine.processes import LocalEngine, SerialEngine
+from harness.engine.work import STATES, Ended, Job, JobEngine, Limits, attempt
 from harness.vocabulary.errors import UserError
 
 
-def run(engine: Engine, jobs: list[Job]) -> dict[str, Ended]:
+def run(engine: JobEngine, jobs: list[Job]) -> dict[str, Ended]:
     """All jobs, by name."""
     waiting, found = list(jobs), {}
     with engine:
@@ -127,7 +127,7 @@ def test_leaving_early_ends_processes_at_once():
 
 
 def test_processes_that_cannot_start_are_a_message(monkeypatch):
-    monkeypatch.setattr("harness.engine.processes._serve", faulty_jobs.dies_at_once)
+    monkeypatch.setattr("harness.engine.processes.serve", faulty_jobs.dies_at_once)
     with pytest.raises(UserError, match="3 worker processes in a row died as they started"):
         run(LocalEngine(1, Limits()), doubles(1))
 
@@ -164,16 +164,16 @@ def test_time_in_which_everything_stood_still_is_not_counted(monkeypatch):
     from harness.engine import processes
 
     clock = {"ahead_s": 0.0}
-    real, real_wait = time.monotonic, processes.wait
+    real, real_poll = time.monotonic, Connection.poll
     monkeypatch.setattr(processes.time, "monotonic", lambda: real() + clock["ahead_s"])
 
-    def stopped(pipes, timeout):
-        heard = real_wait(pipes, timeout)
-        if not heard and clock["ahead_s"] == 0.0 and engine._busy()[0].is_ready:
+    def stopped(pipe: Connection, timeout: float = 0.0) -> bool:
+        heard = real_poll(pipe, timeout)
+        if not heard and clock["ahead_s"] == 0.0:
             clock["ahead_s"] = 3600.0
         return heard
 
-    monkeypatch.setattr(processes, "wait", stopped)
+    monkeypatch.setattr(Connection, "poll", stopped)
     engine = LocalEngine(1, Limits(seconds=60.0))
     found = run(engine, [Job("sleeps", "trials", time.sleep, (3.0,))])
     assert clock["ahead_s"] == 3600.0 and found["sleeps"].state == "done"

@@ -14,13 +14,14 @@ from tiny_sweep import TINY
 
 from harness.engine import run as engine_run
 from harness.engine.journal import Entry, Journal, record_text
-from harness.engine.outcome import Outcome
-from harness.engine.plan import Plan, plan_of
+from harness.engine.judge import FINDING_OCTAVES, grid
+from harness.engine.plan import SweepPlan, parts_of, plan_of
 from harness.engine.run import run_plan
 from harness.engine.shard import Shard
 from harness.engine.trial import TrialTask
-from harness.engine.work import Ended, Job, Stage, State
+from harness.engine.work import Ended, Job, Outcome, Stage, State
 from harness.experiment.load import load_experiment
+from harness.merge import Merged, merge_into
 
 STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
 
@@ -28,8 +29,10 @@ STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
 class Pretended:
     """An engine: records are made up from the task, jobs end in the order that ``seed`` draws, or badly by ``ends``."""
 
-    def __init__(self, seed: int = 0, ends: Callable[[Job], State | None] = lambda job: None) -> None:
-        self._rng, self._ends = random.Random(seed), ends
+    def __init__(
+        self, seed: int = 0, ends: Callable[[Job], State | None] = lambda job: None, factor: float = 1.0
+    ) -> None:
+        self._rng, self._ends, self._factor = random.Random(seed), ends, factor
         self._jobs: list[Job] = []
         self.begun: Counter[str] = Counter()
 
@@ -55,17 +58,30 @@ class Pretended:
             return [(job, Ended("done", (False, 0.1)))]
         if job.name.startswith("pictures"):
             return [(job, Ended("done", [job.name]))]
-        return [(job, Ended("done", made_up(job.arguments[0])))]
+        return [(job, Ended("done", made_up(job.arguments[0], self._factor)))]
 
 
-def made_up(task: TrialTask) -> str:
+def made_up(task: TrialTask, factor: float = 1.0) -> str:
+    """A record. ``factor``: by which this machine's scores differ from another's."""
     word = hashlib.sha256(f"{task.board} {task.repeat} {task.role}".encode()).digest()
-    quiet = 3 + word[0] / 256
+    quiet = factor * (3 + word[0] / 256)
     runs = [
-        {"point": one.digest, "quiet_threshold": quiet if one.threshold is None else None, "inspected_m2": 0.06}
+        {
+            "point": one.digest,
+            "variant": one.variant,
+            "frames": one.frames,
+            "quiet_threshold": quiet if one.threshold is None else None,
+            "inspected_m2": 0.06,
+            "threshold": one.threshold,
+        }
         for one in task.points
     ]
-    return record_text({"runs": runs})
+    operating = [
+        {"variant": one.variant, "frames": one.frames, "threshold": grid(one.threshold, FINDING_OCTAVES).tolist()}
+        for one in task.points
+        if one.threshold is not None
+    ]
+    return record_text({"runs": runs, "operating": operating})
 
 
 PLANS = {
@@ -79,19 +95,18 @@ PLANS = {
 
 
 @pytest.fixture(params=PLANS)
-def plan(request: pytest.FixtureRequest, tmp_path: Path) -> Plan:
+def plan(request: pytest.FixtureRequest, tmp_path: Path) -> SweepPlan:
     text, changes = PLANS[request.param]
     (tmp_path / "tiny.yaml").write_text(text)
     return plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path / "renders")
 
 
-def go(plan: Plan, folder: Path, engine: Pretended, **asked: object) -> Outcome:
+def go(plan: SweepPlan, folder: Path, engine: Pretended, **asked: object) -> Outcome:
     return run_plan(plan, Journal(folder), engine, lambda _: None, **asked)  # type: ignore[arg-type]
 
 
 def records(folder: Path) -> dict[str, str | None]:
-    found = {key: Journal(folder).read(key) for key, _ in Journal(folder).entries()}
-    return {key: entry.text for key, entry in found.items() if entry is not None}
+    return {key: entry.text for key, entry in Journal(folder).entries()}
 
 
 def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
@@ -207,13 +222,51 @@ def test_shards_that_finish_each_others_calibration(plan, tmp_path):
         assert total >= plan.trial_count
 
 
+def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Path:
+    """Two shards, each with a folder of its own, the second on a machine whose scores differ by a factor; merged into
+    a third folder."""
+    into = Journal(home / "into")
+    for number, own in ((1, 1.0), (2, factor)):
+        go(plan, home / str(number), Pretended(factor=own), shard=Shard(number, 2))
+        merged = Merged()
+        merge_into(into, Journal(home / str(number)), merged)
+        assert not merged.different or factor == 1.01
+    return home / "into"
+
+
+def test_shards_of_unlike_machines_lose_no_work(plan, tmp_path):
+    """Their thresholds differ in the last digits: nothing is judged again, and all rows state the threshold in use."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    into = shards_of_unlike_machines(plan, tmp_path, 1 + 1e-9)
+    joined = go(plan, into, Pretended())
+    assert (joined.trials.done, joined.trials.found, joined.failures) == (0, plan.trial_count, [])
+    assert joined.thresholds == pytest.approx(whole.thresholds, rel=1e-8)
+    for key in joined.finished:
+        entry = Journal(into).read(key)
+        assert entry is not None and entry.record is not None
+        of = {(run["variant"], run["frames"]): joined.thresholds[run["point"]] for run in entry.record["runs"]}
+        assert all(run["threshold"] in (None, of[run["variant"], run["frames"]]) for run in entry.record["runs"])
+        for row in entry.record["operating"]:
+            assert row["threshold"] == grid(of[row["variant"], row["frames"]], FINDING_OCTAVES).tolist()
+
+
+def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
+    into = shards_of_unlike_machines(plan, tmp_path, 1.01)
+    joined = go(plan, into, Pretended())
+    judged = [parts_of(plan, Shard(number, 2))[1] for number in (1, 2)]
+    groups = zip(plan.groups, *judged, strict=True)
+    both = [group for group, first, second in groups if first and second and group.first]
+    calibrates = any(point.config.threshold.calibrate is not None for group in both for point in group.points)
+    assert (joined.trials.done > 0) == calibrates
+    assert joined.failures == [] and joined.trials.over == plan.trial_count
+
+
 def test_work_ahead_is_bounded(tmp_path, monkeypatch):
     """However many repeats: a few thousand tasks are in memory, and the engine gets its first at once."""
     (tmp_path / "tiny.yaml").write_text(TINY)
     changes = ["repeats=100000", "threshold={k: 5.0}"]
     plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path)
     state = engine_run._Run(plan, Journal(tmp_path / "journal"), Pretended(), lambda _: None, Shard(), False)
-    state.start()
     assert state.feed()
     assert state._ahead <= engine_run.AHEAD + 256
     assert state.outcome.trials.total == 200_000

@@ -12,10 +12,8 @@ from tiny_sweep import TINY, content, results, sweep
 
 from harness import merge
 from harness.engine.journal import Journal, record_text
-from harness.engine.lock import locked
-from harness.engine.parts import parts_of
-from harness.engine.plan import Plan, plan_of
-from harness.engine.shard import Shard
+from harness.engine.plan import SweepPlan, parts_of, plan_of
+from harness.engine.shard import Shard, locked
 from harness.experiment.load import load_experiment
 from harness.vocabulary.errors import UserError
 
@@ -30,7 +28,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def plan(home: Path) -> Plan:
+def plan(home: Path) -> SweepPlan:
     return plan_of(load_experiment(home / "tiny.yaml"), home / "whole" / ".cache" / "renders")
 
 
@@ -115,7 +113,7 @@ def two(home, tmp_path) -> tuple[Path, Path]:
 def test_merging_twice_copies_once(two, capsys):
     other, into = two
     assert merge.main([str(other), "--into", str(into)]) == 0
-    count = len(list(Journal(other / "journal").entries()))
+    count = len(Journal(other / "journal"))
     assert f"{count} trials copied, 0 were there" in capsys.readouterr().out
     assert merge.main([str(other), "--into", str(into)]) == 0
     assert f"0 trials copied, {count} were there" in capsys.readouterr().out
@@ -126,7 +124,7 @@ def test_what_is_done_takes_the_place_of_what_is_not(two):
     from harness.engine.journal import Entry
 
     other, into = two
-    keys = [key for key, _ in Journal(other / "journal").entries()]
+    keys = Journal(other / "journal").trials()
     Journal(into / "journal").write(keys[0], Entry("crashed", why="its process was ended by SIGKILL"))
     assert merge.main([str(other), "--into", str(into)]) == 0
     entry = Journal(into / "journal").read(keys[0])
@@ -138,7 +136,7 @@ def test_different_results_for_one_trial_are_told(two, capsys):
 
     other, into = two
     journal = Journal(other / "journal")
-    key = next(key for key, _ in journal.entries() if key.startswith("damaged"))
+    key = next(key for key in journal.trials() if key.startswith("damaged"))
     entry = journal.read(key)
     assert entry is not None and entry.record is not None
     assert merge.main([str(other), "--into", str(into)]) == 0
@@ -165,6 +163,14 @@ def test_mistakes_in_merging(two, tmp_path, capsys):
         assert merge.main(arguments) == 2
         assert said in capsys.readouterr().err
     assert not into.exists()
+
+
+def test_an_experiment_that_is_no_utf8_is_copied_as_it_is(two):
+    """The sweep that reads it says what is wrong with it."""
+    other, into = two
+    (other / "experiment.yaml").write_bytes(b"# tofpod experiment 1\nname: \xff\n")
+    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert (into / "experiment.yaml").read_bytes() == (other / "experiment.yaml").read_bytes()
 
 
 def test_a_shard_of_the_thesis_target(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 
@@ -55,3 +56,15 @@ def test_a_reader_that_leaves_ends_the_program_silently(lines: int, option: str)
 def test_another_pipe_that_breaks_is_a_bug() -> None:
     with pytest.raises(BrokenPipeError):
         raising(BrokenPipeError("a worker's"))
+
+
+def test_a_terminal_of_other_letters_shows_a_question_mark(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", terminal)
+
+    def body() -> int:
+        print("5.91 ± 0.08 – µm, ≥ 3 σ")
+        return 0
+
+    assert exit_code_of(body) == 0
+    assert terminal.buffer.getvalue().decode("latin-1") == "5.91 ± 0.08 ? µm, ? 3 ?\n"  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ import pytest
 
 from harness import clean, ls
 from harness.engine.journal import Entry, Journal
-from harness.engine.lock import locked
+from harness.engine.shard import locked
 from harness.listing.latest import latest_run, point_to
 from harness.listing.text import age_text, bytes_of, seconds_of, size_text
 from harness.vocabulary.errors import UserError
@@ -326,7 +326,9 @@ def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
         (first / "point-000" / name).write_text("x")
     for name in ("map-2-50.html", "limits.csv", "limits.parquet", "compare.json", "thresholds.csv", "claims.csv"):
         (first / name).write_text("x")
-    (first / "journal" / "00" / f".damaged-00007-{'7' * 16}.abcd1234.part.jsonl").write_text("half")
+    (first / "journal" / "00").mkdir()
+    for name in (f"damaged-00007-{'7' * 16}.jsonl", f".damaged-00007-{'7' * 16}.abcd1234.part.jsonl"):
+        (first / "journal" / "00" / name).write_text("of a journal of version 5")
     second = results(tmp_path, "1" * 16, records=2, trials={"done": 2})
     (second / "notes.md").write_text("mine")
     (second / "journal" / "notes.md").write_text("mine")
@@ -359,7 +361,7 @@ def test_the_journal_alone(tmp_path):
     other = results(tmp_path, "1" * 16, records=1)
     assert clean.main(["results", f"study/{'0' * 16}", "--journal-only", "--yes", "--out", str(tmp_path)]) == 0
     assert left_in(folder) == {"experiment.yaml", "provenance.json", "report.html"}
-    assert len(list(Journal(other / "journal").entries())) == 1
+    assert len(Journal(other / "journal")) == 1
 
 
 def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
@@ -367,7 +369,7 @@ def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
     with locked(second):
         assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 2
     assert "another sweep" in capsys.readouterr().err
-    assert all(len(list(Journal(one / "journal").entries())) == 2 for one in (first, second))
+    assert all(len(Journal(one / "journal")) == 2 for one in (first, second))
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def test_a_link_a_pipe_and_a_folder_are_no_locks(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     for name in ("link", "folder", "pipe"):
-        with pytest.raises(UserError, match="no plain file"):
+        with pytest.raises(UserError, match="not a regular file"):
             opened_lock(tmp_path / name)
     assert precious.read_text() == "content"
 

@@ -11,7 +11,7 @@ import pytest
 from synthetic_tables import CAMERAS, World, cameras, example, joined, placed, provenance, set_up_name, tables
 from test_limits import switched
 
-from harness.engine.board_noise import pair_noise
+from harness.engine.trial import pair_noise
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.report.page import write_report

@@ -1,1 +1,1 @@
-"""From points to trials to records: the plan, the workers, the journal."""
+"""Points become trials and records: the plan, the workers, the journal."""

@@ -29,7 +29,7 @@ from scenes.sensor.source import SimulatedCapture
 from scenes.sensor.totals import FrameTotals
 
 FEWEST_FRAMES = 20
-"""Below, frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
+"""Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
 and 25 of one with holes before a far wall. By number only, so that no result hangs on what was sorted before."""
 SURE = 5.0
 """Standard errors by which a frame's displacement keeps from a limit of the judge, so that noise cannot decide; fewer
@@ -56,7 +56,7 @@ def averages_of(
 
 
 def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
-    """Of the counts those that can be."""
+    """Return the averages that can be drawn at once."""
     summer = capture.unit.at_once
     if summer is None or counts[-1] > capture.n_frames:
         return {}
@@ -97,7 +97,7 @@ class _Verdict:
 
 
 def _verdict(capture: SimulatedCapture, summer: FrameSummer, n: int, config: AverageConfig) -> _Verdict | None:
-    """What `detectors.average` would judge of the first n frames; None where the pixels' noise might decide."""
+    """The judgement of `detectors.average` on the first n frames; None where the pixels' noise might decide."""
     shift_m = summer.z_by_error * capture.errors_m[:n]
     if not config.judge_frames:
         return _Verdict(np.ones(n, bool), ())
@@ -140,12 +140,12 @@ def _reference(shift_m: np.ndarray, limit_m: float, slack_m: float) -> float | N
 
 
 def _frame_noise_m(capture: SimulatedCapture, summer: FrameSummer) -> float:
-    """What the judge finds to be one frame's noise: with its rounding."""
+    """One frame's noise as the judge finds it: with its rounding."""
     return float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
-    """Whether so many pixels lose their range or change in single frames that whole frames may be left out for it."""
+    """Return whether frames may be left out because many of their pixels lose their range or change."""
     judged = 2 * cloud.count > cloud.n_frames
     if not judged.any():
         return True

@@ -83,7 +83,7 @@ def _judged(point: Point) -> tuple[Judged, float, Choice | None]:
 
 
 def _about(point: Point, cloud: Cloud, threshold: float, command: str) -> dict[str, object]:
-    """What stands beside the findings in their JSON."""
+    """Facts that stand beside the findings in their JSON."""
     return {
         "capture": {
             "frames_used": cloud.n_frames,

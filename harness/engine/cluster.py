@@ -1,90 +1,122 @@
-"""A cluster's workers by way of dask.distributed: any number of machines, workers that come, go and die.
+"""Jobs on a cluster by way of dask.distributed: each dask worker is a node that runs the local engine inside.
 
-Trials go in bundles that take about `BUNDLE_S`, two with each worker, so that it never waits for the network. A worker
-that dies leaves its bundles' jobs as suspects; each runs once more alone on a worker, and one that dies alone crashed.
+A node's processes do the jobs, enforce their limits and survive their deaths, as on this machine. The driver calls the
+nodes through the scheduler, with bundles of jobs, two at a time for each: dask neither queues nor retries them. When a
+node dies, its jobs go to others; a job that was aboard of `TRIES` nodes as they died counts as crashed.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import importlib
+import logging
 import platform
 import queue
+import re
 import secrets
+import sys
 import time
-import traceback
-from collections import Counter, deque
+import warnings
+from collections import Counter, OrderedDict, deque
+from collections.abc import Coroutine, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from harness.engine.cluster_link import Answer, Event, Joined, Left, Link, Parcel, bare, linked, tell
-from harness.engine.cluster_worker import Bundle, Carried, Worker
-from harness.engine.work import TRACEBACK_CHARACTERS, Ended, Job, Limits, Stage
+from harness.engine import node
+from harness.engine.node import Bundle, Carried, NodeFacts
+from harness.engine.processes import MOST_RENDERERS
+from harness.engine.work import Code, Ended, Job, Limits, Stage
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
 from harness.vocabulary.sources import source_digest
 
 BUNDLE_S = 0.25
-"""dask takes some 15 ms from one task to the next and 2 ms of the driver's processor for each."""
+"""Work in a bundle, for each process of a node: calling a node takes some 10 ms, of it 2 ms of the driver's time."""
 MOST_IN_BUNDLE = 32
-WITH_WORKER = 2
-"""Bundles: one that runs and one that waits."""
+"""Jobs in a bundle, for each process of a node."""
+WITH_NODE = 2
+"""Bundles at a node: its processes work on one while the other waits."""
 LOOKS_S = 1.0
-"""Between looks whether all is well."""
-GRACE_S = 30.0
-"""Beyond the time limits of all that a worker has: then its process does not answer, as its own clock should have."""
-WAIT_FOR_WORKERS_S = 60.0
-"""For workers that are started by hand. A batch system's queue may take hours: there a line is told now and then."""
+"""Interval at which the driver looks which nodes are there."""
+WAIT_FOR_NODES_S = 60.0
+"""Wait for workers that are started by hand. A batch system's queue may take hours: a line is printed now and then."""
 TELL_AGAIN_S = 300.0
-TRIES = 3
-"""Of a job that never began, as what it needs was lost on the way."""
+TRIES = 5
+ANSWERS_S = 5
+"""A scheduler that is there answers a connection in milliseconds."""
+EXAMINED_S = 60.0
+"""Time for a node to say what it is: it reads the sources, from a network's disk perhaps."""
+CLOSES_S = 1.0
+KINDS = {
+    "slurm": "SLURMCluster",
+    "pbs": "PBSCluster",
+    "lsf": "LSFCluster",
+    "sge": "SGECluster",
+    "htcondor": "HTCondorCluster",
+    "oar": "OARCluster",
+    "moab": "MoabCluster",
+    "local": "LocalCluster",
+}
+"""Classes of dask-jobqueue, each in a module of the kind's name; "local" starts its jobs on this machine."""
+LEGAL = "tcp://host:8786, tls://host:8786, or jobqueue: followed by one of " + ", ".join(KINDS)
 
 
 @dataclass
-class _Place:
-    """A worker that takes jobs. ``shares``: it sees the driver's cache of renders."""
+class _Node:
+    """A node that takes jobs. ``shares``: it sees the driver's cache of renders; otherwise ``holds`` names the views
+    that were sent to it, the last ones last."""
 
     address: str
+    processes: int
     can_render: bool
     offers_render: bool
     shares: bool
-    parcels: list[Parcel] = field(default_factory=list)
-    is_alone: bool = False
-    """What it has is a job that runs alone: a render, or a suspect."""
-    is_hung: bool = False
-    since: float = field(default_factory=time.monotonic)
+    bundles: dict[int, Bundle] = field(default_factory=dict)
+    """Bundles under way, by number."""
+    renders: int = 0
+    """Number of renders under way."""
+    holds: OrderedDict[str, None] = field(default_factory=OrderedDict)
 
 
 class ClusterEngine:
     """Jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like, asked for
-    ``workers_wanted``. ``limits`` are a trial's; renders have its limit of time only."""
+    ``workers_wanted``. ``limits`` are a trial's; renders have its limit of time only. ``code``: as `LocalEngine`."""
 
-    def __init__(self, scheduler: str, limits: Limits, workers_wanted: int) -> None:
+    def __init__(self, scheduler: str, limits: Limits, workers_wanted: int, code: Mapping[Stage, Code]) -> None:
         self._scheduler, self._limits, self._wanted = scheduler, limits, workers_wanted
-        self._link: Link
-        self._places: dict[str, _Place] = {}
+        self._code = dict(code)
+        self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
+        self._client: Any = None
+        self._nodes: dict[str, _Node] = {}
+        self._refused: dict[str, UserError] = {}
+        """Nodes that would give other numbers than this machine, by address: left out while others are there."""
+        self._asked: set[str] = set()
+        """Addresses of nodes that were asked what they are."""
         self._waiting: dict[Stage, deque[Job]] = {"renders": deque(), "trials": deque()}
-        self._suspects: deque[Job] = deque()
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
         self._tries: Counter[str] = Counter()
+        self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
+        """(address, number of the bundle, answer) of a node; without a number the answer is what the node is."""
+        self._number = 0
         self._mean_s = BUNDLE_S
-        """Of a trial; at first as if each were worth a bundle of its own."""
-        self._looked = time.monotonic()
+        """Mean duration of a trial; at first as if each were worth a bundle of its own."""
+        self._looked = float("-inf")
         self._lacking = ""
-        """Workers that could do what waits, since then; told last at ``_lack_told``."""
+        """Nodes that could do what waits, lacking since then; told last at ``_lack_told``."""
         self._lacking_since = self._lack_told = time.monotonic()
         self._probe: Path | None = None
         self._nonce = secrets.token_hex(16)
+        """Names this driver to the nodes."""
         self._told: set[str] = set()
-        self._refused: dict[str, UserError] = {}
-        """Workers that would give other numbers than this machine, by address: left out while others are there."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> ClusterEngine:
         with contextlib.ExitStack() as stack:
-            self._link = stack.enter_context(linked(self._scheduler, self._wanted))
-            self._link.watch(lambda: None if self._probe is None else str(self._probe))
-            while not self._places:
+            self._client = stack.enter_context(_connected(self._scheduler, self._wanted))
+            while not self._nodes:
                 self._step()
             self._stack = stack.pop_all()
         return self
@@ -93,20 +125,23 @@ class ClusterEngine:
         if self._probe is not None:
             with contextlib.suppress(OSError):
                 self._probe.unlink(missing_ok=True)
+        busy = [one.address for one in self._nodes.values() if one.bundles]
+        if busy and self._is_connected():
+            with contextlib.suppress(Exception):  # a node that cannot be told ends its bundles at its own time
+                dropped = self._client.run(node.drop, self._nonce, workers=busy, on_error="ignore", asynchronous=True)
+                asyncio.run_coroutine_threadsafe(_awaited(dropped), self._loop).result(CLOSES_S)
         self._stack.close()
 
     @property
     def worker_count(self) -> int:
-        """Workers that take jobs; as of the last look."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._heed(self._link.events.get_nowait())
-        return len(self._places)
+        """The processes of all nodes that take jobs."""
+        self._step(0.0)
+        return sum(one.processes for one in self._nodes.values())
 
     def room(self, stage: Stage) -> int:
-        """As much as keeps all workers busy, and the next bundles ready."""
-        each = 1 if stage == "renders" else WITH_WORKER * self._bundle_size() + 1
-        return max(1, each * len(self._places)) + 1 - self._out[stage]
+        """Room for as much as keeps all nodes busy, and the next bundles ready."""
+        each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
+        return max(1, each * sum(one.processes for one in self._nodes.values())) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
         """Take a job."""
@@ -117,7 +152,7 @@ class ClusterEngine:
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where the scheduler is gone, or for long no worker is left that could
+        """Wait for jobs to end. Raises UserError where the scheduler is gone, or for long no node is left that could
         do what waits."""
         while not self._done:
             self._hand_out()
@@ -130,106 +165,161 @@ class ClusterEngine:
     # ---------------------------------------------------------------- what goes out
 
     def _bundle_size(self) -> int:
+        """Trials in a bundle, for each process of a node."""
         return max(1, min(MOST_IN_BUNDLE, round(BUNDLE_S / max(self._mean_s, 1e-4))))
 
     def _hand_out(self) -> None:
-        """First a bundle for every worker, then a second one; while suspects wait for a free worker, no second one."""
-        for most in range(1 if self._suspects else WITH_WORKER):
-            if self._suspects or any(self._waiting.values()):
-                for place in list(self._places.values()):
-                    if len(place.parcels) == most and not (place.is_alone or place.is_hung):
-                        self._hand_to(place)
-
-    def _hand_to(self, place: _Place) -> None:
+        """Send every node first a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
-        is_free = not place.parcels
-        may_render = place.can_render and (place.offers_render or not self._some_offer())
-        if is_free and self._suspects and (may_render or self._suspects[0].stage == "trials"):
-            self._send(place, (self._suspects.popleft(),), alone=True)
-        elif renders and may_render and (place.offers_render or not trials):
-            # trials first, as renders make more of them; where workers are set aside for renders, these first there
-            if is_free and not self._found_here(renders[0], place):
-                self._send(place, (renders.popleft(),), alone=True)
-        elif trials:
-            share = -(-len(trials) // (WITH_WORKER * len(self._places)))
-            count = min(self._bundle_size(), share)
-            self._send(place, tuple(trials.popleft() for _ in range(count)))
+        some_offer = any(one.offers_render and one.can_render for one in self._nodes.values())
+        for most in range(WITH_NODE):
+            for to in list(self._nodes.values()):
+                may_render = to.can_render and (to.offers_render or not some_offer)
+                # a node of one process does one thing at a time: trials first, as renders make more of them, but
+                # where nodes are set aside for renders, these first there
+                may_render &= to.processes > 1 or not (to.bundles or (trials and not to.offers_render))
+                if renders and may_render and to.renders < min(MOST_RENDERERS, to.processes):
+                    job = renders.popleft()
+                    if to.shares or not self._is_in_cache(job):
+                        self._send(to, [job])
+                elif trials and len(to.bundles) - to.renders <= most and not (to.processes == 1 and to.renders):
+                    share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
+                    count = min(self._bundle_size() * to.processes, max(share, to.processes), len(trials))
+                    self._send(to, [trials.popleft() for _ in range(count)])
 
-    def _some_offer(self) -> bool:
-        return any(place.offers_render and place.can_render for place in self._places.values())
-
-    def _found_here(self, job: Job, place: _Place) -> bool:
-        """Whether this machine's cache holds a render that a worker could not find there; then it is done."""
-        if place.shares:
-            return False
+    def _is_in_cache(self, job: Job) -> bool:
+        """Return whether this machine's cache holds a render that a node cannot see; then the job is done."""
         from scenes.render.cache import read_view
 
         found = read_view(Path(job.arguments[-1]) / job.name)
         if found is not None:
-            self._waiting["renders"].popleft()
             self._over(job, Ended("done", (True, found.seconds), worker="this process"))
         return found is not None
 
-    def _send(self, place: _Place, jobs: tuple[Job, ...], *, alone: bool = False) -> None:
-        parcel = Parcel(jobs, place.address)
-        needs = () if place.shares else dict.fromkeys(path for job in jobs for path in job.needs)
-        limits = self._limits if jobs[0].stage == "trials" else Limits(self._limits.seconds, None)
-        if not place.parcels:
-            place.since = time.monotonic()
-        place.parcels.append(parcel)
-        place.is_alone = alone
-        try:
-            self._link.send(parcel, Bundle(jobs, limits, place.shares), needs)
-        except (OSError, RuntimeError):
-            # no way to the scheduler, or no worker left that could take a view
-            self._look_for_scheduler()
-            place.parcels.remove(parcel)
-            place.is_alone = False
-            self._return(jobs)
+    def _send(self, to: _Node, jobs: list[Job]) -> None:
+        self._number += 1
+        number = self._number
+        needs: list[str] = []
+        views: dict[str, bytes] = {}
+        for path in () if to.shares else dict.fromkeys(path for job in jobs for path in job.needs):
+            if path.name not in to.holds:
+                try:
+                    views[path.name] = path.read_bytes()
+                except OSError:
+                    continue  # the trial itself tells that the view cannot be read
+            needs.append(path.name)
+            to.holds[path.name] = None
+            to.holds.move_to_end(path.name)
+        while len(to.holds) > node.KEPT_VIEWS:
+            to.holds.popitem(last=False)
+        bundle = Bundle(tuple(jobs), self._limits, to.shares, tuple(needs), views)
+        to.bundles[number] = bundle
+        to.renders += jobs[0].stage == "renders"
+        self._call(to.address, number, node.carry_out, bundle, self._code, self._nonce)
+
+    def _call(self, address: str, number: int | None, function: Any, *arguments: Any) -> None:
+        """Have a node run a function; what it returns or raises becomes an event."""
+
+        async def call() -> None:
+            said: Any = None
+            # the scheduler tells of a worker shortly before it knows the way to it
+            for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
+                await asyncio.sleep(pause_s)
+                try:
+                    calling = self._client.run(
+                        function, *arguments, workers=[address], on_error="return", asynchronous=True
+                    )
+                    answers = await (calling if number is not None else asyncio.wait_for(calling, EXAMINED_S))
+                    said = answers.get(address, OSError("no answer"))
+                except Exception as error:
+                    said = error
+                if not isinstance(said, OSError | KeyError):
+                    break
+            self._events.put((address, number, said))
+
+        asyncio.run_coroutine_threadsafe(call(), self._loop)
+
+    @property
+    def _loop(self) -> asyncio.AbstractEventLoop:
+        loop: asyncio.AbstractEventLoop = self._client.loop.asyncio_loop
+        return loop
 
     # ---------------------------------------------------------------- what comes in
 
-    def _step(self) -> None:
-        """Take what has happened, waiting for it at most `LOOKS_S`."""
-        with contextlib.suppress(queue.Empty):
-            self._heed(self._link.events.get(timeout=LOOKS_S))
-            while not self._link.events.empty():
-                self._heed(self._link.events.get())
+    def _step(self, waits_s: float = LOOKS_S) -> None:
+        """Take what has happened, waiting for it at most so long."""
         if time.monotonic() - self._looked >= LOOKS_S:
+            self._look_for_nodes()
             self._looked = time.monotonic()
-            self._look_for_scheduler()
-            self._look_for_workers()
-            self._look_for_overdue()
+        with contextlib.suppress(queue.Empty):
+            self._heed(*self._events.get(timeout=waits_s))
+            while True:
+                self._heed(*self._events.get_nowait())
 
-    def _heed(self, event: Event) -> None:
-        if isinstance(event, Joined):
-            self._joined(event)
-        elif isinstance(event, Left):
-            self._left(event)
-        elif not event.parcel.is_void:
-            self._answered(event)
+    def _look_for_nodes(self) -> None:
+        """Ask new nodes what they are, and give up those that are gone."""
+        there = set(self._addresses())
+        for address in there - self._asked:
+            self._asked.add(address)
+            self._call(address, None, node.examine, self._code, None if self._probe is None else str(self._probe))
+        for address in self._asked - there:
+            self._asked.discard(address)
+            self._refused.pop(address, None)
+            self._gone(address)
+        self._look_for_lack()
 
-    def _joined(self, event: Joined) -> None:
-        if event.address in self._places:
-            return  # it came again before its first look ended: what it has stays with it
-        if isinstance(event.said, BaseException) and not isinstance(event.said, ImportError | AttributeError):
+    def _addresses(self) -> list[str]:
+        """The workers that the scheduler knows. Raises UserError where it is gone."""
+        if self._is_connected():
+            with contextlib.suppress(OSError):
+                return list(self._client.scheduler_info(n_workers=-1)["workers"])
+        raise UserError(
+            f"the scheduler at {self._scheduler} is gone",
+            fix="start it again; finished trials are kept, and the same command goes on",
+        )
+
+    def _is_connected(self) -> bool:
+        """Return whether the scheduler is there. One that was away has forgotten its workers."""
+        return self._client is not None and bool(self._client.status == "running")
+
+    def _heed(self, address: str, number: int | None, said: Any) -> None:
+        if number is None:
+            self._examined(address, said)
+            return
+        one = self._nodes.get(address)
+        bundle = None if one is None else one.bundles.pop(number, None)
+        if one is None or bundle is None:
+            return  # the node was given up meanwhile
+        one.renders -= bundle.jobs[0].stage == "renders"
+        if isinstance(said, Carried):
+            self._carried(one, bundle, said)
+        elif isinstance(said, UserError):  # its processes run other code, or cannot start
+            self._refused[address] = UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix)
+            self._tell_once(f"{self._refused[address].message}; it is not used any more")
+            self._return(bundle.jobs)
+            self._gone(address)
+        else:
+            self._look_for_nodes()
+            self._lost(bundle.jobs, f"its worker did not answer ({type(said).__name__}: {said})", address)
+
+    def _examined(self, address: str, said: NodeFacts | BaseException) -> None:
+        """Use a node, or leave it out with a line that says why."""
+        if address not in self._asked:
+            return
+        if isinstance(said, BaseException) and not isinstance(said, ImportError | AttributeError):
             # it died meanwhile, or the network failed: no sign of another installation
-            said = f"{type(event.said).__name__}: {event.said}"
-            return self._tell_once(
-                f"the worker at {bare(event.address)} did not say what it is ({said}); it is not used"
-            )
+            why = f"did not say what it is ({type(said).__name__}: {said}); it is not used"
+            self._tell_once(f"the worker at {_bare(address)} {why}")
+            return
         try:
-            self._places[event.address] = self._place_of(event.address, event.said)
+            self._nodes[address] = self._node_of(address, said)
         except UserError as mistake:
-            self._refused[event.address] = mistake
+            self._refused[address] = mistake
             self._tell_once(f"{mistake.message}; it is not used")
 
-    def _place_of(self, address: str, said: Worker | BaseException) -> _Place:
-        """Raises UserError where a worker would give other numbers than this machine, or none."""
-        from harness.engine import plan
-        from scenes.render import cache
-
-        where = f"the worker at {bare(address)}"
+    def _node_of(self, address: str, said: NodeFacts | BaseException) -> _Node:
+        """Raise UserError where a node would give other numbers than this machine, or none."""
+        where = f"the worker at {_bare(address)}"
         if isinstance(said, BaseException):
             raise UserError(
                 f"{where} cannot run tofpod: {type(said).__name__}: {said}",
@@ -240,90 +330,50 @@ class ClusterEngine:
                 f"{where} runs Python {said.python}, this machine {platform.python_version()}",
                 fix="use the same Python on all",
             )
-        if said.trials != source_digest(plan.BUILT_IN_CODE, plan.PACKAGES):
+        if said.digests.get("trials") != self._digests.get("trials"):
             raise UserError(
-                f"{where} runs another version of tofpod, numpy, scipy, numba or OpenCV than this machine",
+                f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
+                " than this machine",
                 fix="install the same there, and start its workers again: they keep the code that they began with",
             )
-        if said.threads > 1:
-            self._tell_once(f"{where} has {said.threads} threads, of which one is used; start it with --nthreads 1")
-        can_render = said.renders == source_digest(cache.CODE, cache.PACKAGES)
+        can_render = said.digests.get("renders") == self._digests.get("renders")
         shares = said.sees == self._nonce
         if self._probe is not None and not shares:
             # it may have been looked at before there was anything to see
-            shares = self._link.sees([address], str(self._probe)).get(address) == self._nonce
-        return _Place(address, can_render, said.offers_render, shares)
+            shares = self._sees([address]).get(address) == self._nonce
+        return _Node(address, said.processes, can_render, said.offers_render, shares)
 
-    def _left(self, event: Left) -> None:
-        self._refused.pop(event.address, None)
-        place = self._places.pop(event.address, None)
-        if place is None:
+    def _carried(self, one: _Node, bundle: Bundle, said: Carried) -> None:
+        if said.missing:  # the node has let go of views that it was thought to hold
+            for name in said.missing:
+                one.holds.pop(name, None)
+            self._return(bundle.jobs)
             return
-        if event.memory_mb is not None:
-            why = f"its worker was ended by its nanny, as it took {event.memory_mb:.0f} MB (dask worker --memory-limit)"
-        else:
-            why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
-        for parcel in place.parcels:
-            self._link.void(parcel)
-            self._suspect(parcel, place, Ended("crashed", why=why, worker=bare(place.address)))
-
-    def _suspect(self, parcel: Parcel, place: _Place, ended: Ended) -> None:
-        """Alone, a job is to blame for what happened to its worker; among others it runs once more."""
-        if place.is_alone:
-            self._over(parcel.jobs[0], ended)
-        else:
-            self._suspects += parcel.jobs
-
-    def _answered(self, event: Answer) -> None:
-        parcel, said = event.parcel, event.said
-        place = self._places.get(parcel.address)
-        if place is None or parcel not in place.parcels:
-            return
-        place.parcels.remove(parcel)
-        place.since = time.monotonic()
-        was_alone, place.is_alone = place.is_alone, False
-        if isinstance(said, Carried):
-            self._carried(parcel, place, said)
-        else:
-            self._not_carried(parcel, said, was_alone)
-
-    def _carried(self, parcel: Parcel, place: _Place, said: Carried) -> None:
         for name, content in said.rendered.items():
-            write_bytes(Path(parcel.jobs[0].arguments[-1]) / name, content)
-        for job, ended in zip(parcel.jobs, said.ended, strict=False):
+            write_bytes(Path(bundle.jobs[0].arguments[-1]) / name, content)
+            one.holds[name] = None
+        for job, ended in zip(bundle.jobs, said.ended, strict=True):
             if job.stage == "trials":
                 self._mean_s += 0.1 * (ended.seconds - self._mean_s)
             self._over(job, ended)
-        self._return(parcel.jobs[len(said.ended) :])
-        if said.is_hung:
-            place.is_hung = True
-            if not place.parcels:
-                self._link.dismiss(place.address)
 
-    def _not_carried(self, parcel: Parcel, error: BaseException, was_alone: bool) -> None:
-        """No answer: its worker is about to be gone, what it needs was lost, or it could not be sent."""
-        from distributed import KilledWorker
-
-        if isinstance(error, KilledWorker):
-            # the scheduler's allowed-failures is 0; that the worker left is told as well
+    def _gone(self, address: str) -> None:
+        """Give a node up; what it had goes to others."""
+        one = self._nodes.pop(address, None)
+        for bundle in one.bundles.values() if one is not None else ():
             why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
-            if was_alone:
-                self._over(parcel.jobs[0], Ended("crashed", why=why, worker=bare(parcel.address)))
-            else:
-                self._suspects += parcel.jobs
-            return
-        self._look_for_scheduler()
-        self._link.forget(parcel)
-        why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-        for job in parcel.jobs:
+            self._lost(bundle.jobs, why, address)
+
+    def _lost(self, jobs: tuple[Job, ...], why: str, address: str) -> None:
+        """Jobs that were at a node as it died run again; after `TRIES` such deaths they are taken for the cause."""
+        for job in jobs:
             self._tries[job.name] += 1
             if self._tries[job.name] >= TRIES:
-                self._over(job, Ended("failed", why=why, is_bug=True, worker=bare(parcel.address)))
-            else:
-                self._suspects.append(job)
+                self._over(job, Ended("crashed", why=why, worker=_bare(address)))
+        self._return(tuple(job for job in jobs if 0 < self._tries[job.name] < TRIES))
 
     def _return(self, jobs: tuple[Job, ...]) -> None:
-        """To the front of the queue: jobs that were not begun."""
+        """Put jobs to the front of the queue."""
         for job in reversed(jobs):
             self._waiting[job.stage].appendleft(job)
 
@@ -332,26 +382,17 @@ class ClusterEngine:
         self._tries.pop(job.name, None)
         self._done.append((job, ended))
 
-    # ---------------------------------------------------------------- whether all is well
-
-    def _look_for_scheduler(self) -> None:
-        if not self._link.is_alive:
-            raise UserError(
-                f"the scheduler at {self._scheduler} is gone",
-                fix="start it again; finished trials are kept, and the same command goes on",
-            )
-
-    def _look_for_workers(self) -> None:
-        """A batch system's queue is waited for as long as it takes; its jobs are alike, so not for one that renders."""
-        renders_wait = self._waiting["renders"] or any(job.stage == "renders" for job in self._suspects)
+    def _look_for_lack(self) -> None:
+        """Raise UserError where for long no node could do what waits. A batch system's queue is waited for as long as
+        it takes; its jobs are alike, so not for one that renders."""
         lacking, fix = "", ""
-        if not self._places and self._refused and self._link.addresses <= self._refused.keys():
+        if not self._nodes and self._refused and self._asked <= self._refused.keys():
             raise next(iter(self._refused.values()))
-        if not self._places:
-            lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads 1`"
-        elif renders_wait and not any(place.can_render for place in self._places.values()):
+        if not self._nodes:
+            lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads PROCESSES`"
+        elif self._waiting["renders"] and not any(one.can_render for one in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
-            fix = f"install tofpod on the workers just as here; {len(self._places)} that cannot render are there"
+            fix = f"install tofpod on the workers just as here; {len(self._nodes)} that cannot render are there"
         now = time.monotonic()
         if lacking != self._lacking:
             self._lacking, self._lacking_since, self._lack_told = lacking, now, now
@@ -360,44 +401,119 @@ class ClusterEngine:
             self._tell_once(f"waiting for workers of {self._scheduler}, as long as its queue takes")
             if now - self._lack_told >= TELL_AGAIN_S:
                 self._lack_told = now
-                tell(f"no worker of {self._scheduler} after {spent_s / 60:.0f} minutes: look into its queue")
+                _tell(f"no worker of {self._scheduler} after {spent_s / 60:.0f} minutes: look into its queue")
         elif lacking:
-            self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_WORKERS_S:.0f} s")
-            if spent_s > WAIT_FOR_WORKERS_S:
-                raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_WORKERS_S:.0f} s", fix=fix)
-
-    def _look_for_overdue(self) -> None:
-        """A worker whose own clock stands still, as a job keeps its interpreter, is ended by its nanny."""
-        for place in list(self._places.values()):
-            limit_s = self._limits.seconds
-            if limit_s is None or not place.parcels:
-                continue
-            spent_s = time.monotonic() - place.since
-            if spent_s > limit_s * len(place.parcels[0].jobs) + GRACE_S:
-                del self._places[place.address]
-                self._link.kill(place.address)
-                why = f"not done after {spent_s:.0f} s (--time-limit); its worker does not answer"
-                for parcel in place.parcels:
-                    self._link.void(parcel)
-                    self._suspect(parcel, place, Ended("timed out", why=why, worker=bare(place.address)))
+            self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
+            if spent_s > WAIT_FOR_NODES_S:
+                raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
 
     # ---------------------------------------------------------------- the cache
 
     def _place_probe(self, folder: Path) -> None:
-        """A file that tells whether a worker sees the driver's cache of renders; to `scenes.render.store` a leftover,
-        where this process is killed."""
+        """Write a file that tells whether a node sees the driver's cache of renders; to `scenes.render.store` it is a
+        leftover, where this process is killed."""
         self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
         write_text(self._probe, self._nonce)
-        seen = self._link.sees(self._places, str(self._probe))
-        for place in self._places.values():
-            place.shares = seen.get(place.address) == self._nonce
-        apart = sum(not place.shares for place in self._places.values())
+        seen = self._sees(list(self._nodes))
+        for one in self._nodes.values():
+            one.shares = seen.get(one.address) == self._nonce
+        apart = sum(not one.shares for one in self._nodes.values())
         if apart:
             self._tell_once(
-                f"{apart} of {len(self._places)} workers do not see {folder}: renders are sent over the network"
+                f"{apart} of {len(self._nodes)} workers do not see {folder}: renders are sent over the network"
             )
+
+    def _sees(self, addresses: list[str]) -> dict[str, str | None]:
+        """The content of the probe, as each node sees it; a node that does not answer sees nothing."""
+        return dict(self._client.run(node.seen, str(self._probe), workers=addresses, on_error="ignore"))
 
     def _tell_once(self, message: str) -> None:
         if message not in self._told:
             self._told.add(message)
-            tell(message)
+            _tell(message)
+
+
+async def _awaited(doing: Coroutine[Any, Any, Any]) -> Any:
+    return await doing
+
+
+@contextlib.contextmanager
+def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
+    """Connect to a scheduler by its address, or start the user's own dask-jobqueue cluster. Yields dask's client.
+
+    Raises UserError where it is neither, is not installed or configured, or does not answer.
+    """
+    is_address = re.fullmatch(r"(tcp|tls)://.+:\d+", scheduler) is not None
+    kind = scheduler.removeprefix("jobqueue:")
+    if not is_address and (kind == scheduler or kind not in KINDS):
+        raise UserError(f"--scheduler {scheduler}: is neither an address nor a kind of job queue", legal=LEGAL)
+    try:
+        import dask
+        from distributed import Client
+    except ImportError as error:
+        raise UserError("--scheduler needs dask.distributed", fix='pip install "tofpod[cluster]"') from error
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{ANSWERS_S}s"}))
+        stack.enter_context(_quiet())
+        cluster = None if is_address else _cluster_of(kind, workers_wanted)
+        if cluster is not None:
+            stack.callback(_close, cluster)
+        try:
+            client = Client(cluster or scheduler, timeout=ANSWERS_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"the scheduler at {scheduler} does not answer within {ANSWERS_S} s: {error}",
+                fix="start one with `dask scheduler`, and workers with `dask worker`; docs/scale.md says how",
+            ) from error
+        stack.callback(_close, client)
+        yield client
+
+
+def _close(what: Any) -> None:
+    with contextlib.suppress(Exception):
+        what.close(timeout=CLOSES_S)
+
+
+def _cluster_of(kind: str, workers_wanted: int) -> Any:
+    """A cluster of dask-jobqueue as the user's own configuration of dask says, asked for so many jobs."""
+    try:
+        module = importlib.import_module(f"dask_jobqueue.{kind}")
+    except ImportError as error:
+        raise UserError("jobqueue: needs dask-jobqueue", fix='pip install "tofpod[cluster]"') from error
+    try:
+        cluster = getattr(module, KINDS[kind])()
+        cluster.scale(jobs=workers_wanted)
+    except (ValueError, TypeError, OSError, RuntimeError) as error:
+        raise UserError(
+            f"dask-jobqueue could not start a cluster of kind {kind}: {error}",
+            fix=f"describe it in ~/.config/dask/jobqueue.yaml under jobqueue.{kind}: cores, processes: 1, memory",
+        ) from error
+    return cluster
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence dask: how jobs end tells of workers that come and go, and versions are checked here."""
+    import distributed  # noqa: F401 (sets the levels when it is imported)
+
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+
+
+def _tell(message: str) -> None:
+    """Print a line to the user, beside the progress."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def _bare(address: str) -> str:
+    """host:port."""
+    return address.rpartition("://")[2]

@@ -1,4 +1,4 @@
-"""What a run shows while it works: bars on a terminal, a line every few seconds elsewhere. All times are differences of
+"""The progress that a run shows: bars on a terminal, a line every few seconds elsewhere. All times are differences of
 the monotonic clock, so that setting the machine's clock changes nothing."""
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
-from harness.engine.outcome import Progress, StageCounts
+from harness.engine.work import Progress, StageCounts
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -50,7 +50,7 @@ def progress_display(
 
 
 class Pace:
-    """How fast stages go, from snapshots of their progress. ``clock``: seconds, never backwards."""
+    """The pace of both stages, from snapshots of their progress. ``clock``: seconds, never backwards."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -77,7 +77,7 @@ class Pace:
         return _rate(self.now.renders.done - renders, spent), _rate(self.now.trials.done - trials, spent)
 
     def seconds_left(self) -> float | None:
-        """Until all is over; None without a base for it.
+        """Seconds until all is over; None without a base for it.
 
         Renders and trials go on beside each other, so the longer of the two counts; after the last render its own
         trials must follow, as many as a render has on average. Pictures and the report are not in it.
@@ -159,7 +159,7 @@ def _many(count: int, what: str) -> str:
 
 
 def rate_text(per_second: float) -> str:
-    """With two digits, in a unit that leaves a number above 1 where there is one."""
+    """A rate with two digits, in a unit that leaves a number above 1 where there is one."""
     for unit, seconds in (("s", 1.0), ("min", 60.0)):
         if per_second * seconds >= (0.1 if unit == "s" else 1.0):
             return f"{_two_digits(per_second * seconds)}/{unit}"
@@ -189,7 +189,7 @@ class _Bars:
         self._pace.take(now)
 
     def picture(self) -> RenderableType:
-        """What the terminal shows now; it fits into 80 columns with a million trials."""
+        """The terminal's content now; it fits into 80 columns with a million trials."""
         from rich.console import Group
         from rich.progress_bar import ProgressBar
         from rich.table import Table

@@ -1,4 +1,4 @@
-"""What a sweep would do, before it does it: what is there already, and what the rest would take in time and disk."""
+"""The estimate of a sweep before it runs: trials that are there already, and the rest's costs in time and disk."""
 
 from __future__ import annotations
 
@@ -7,21 +7,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.engine.calibration import Calibration
 from harness.engine.console import duration
-from harness.engine.costs import REFERENCE, Cost, render_cost, trial_cost
-from harness.engine.journal import Entry, Journal
-from harness.engine.opening import EngineOptions
-from harness.engine.parts import Part, parts_of
-from harness.engine.plan import Group, Plan, plan_of
+from harness.engine.costs import REFERENCE, CostStage, Rates, WorkCost, read_rates, render_cost, trial_cost
+from harness.engine.journal import Journal
+from harness.engine.options import EngineOptions
+from harness.engine.plan import Group, PlanPart, SweepPlan, parts_of, plan_of
 from harness.engine.processes import MOST_RENDERERS
-from harness.engine.rates import Rates, Stage, read_rates
 from harness.engine.shard import Shard
+from harness.engine.thresholds import Calibration
 from harness.experiment.points import Experiment
 from harness.listing.text import size_text
 
 START_S = 8.0
-"""Until the first render and the first trial are under way: processes start, Mitsuba and numba load."""
+"""Seconds until the first render and the first trial are under way: processes start, Mitsuba and numba load."""
 REPORT_S = 6.0
 """Tables and report of a small experiment."""
 REPORT_TRIAL_S = 2e-3
@@ -30,10 +28,6 @@ RESULTS_BYTES = 1_000_000
 """Report and tables of a small experiment; mostly its pictures."""
 RESULTS_RECORD_SHARE = 0.15
 """More of both, of the records: tables are compressed."""
-FILE_BYTES = 4096
-"""A file takes whole blocks of the disk."""
-READ_AT_MOST = 5000
-"""Records that are read to tell whether they still count; of more, that they are there must do."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +90,7 @@ class Estimate:
         ]
 
     def _basis(self) -> str:
-        """What the times rest on."""
+        """The measurements that the times rest on."""
         needed = {"renders": self.to_render, "trials": self.to_run}
         known = {stage: runs for (stage, count), runs in zip(needed.items(), self.learnt, strict=True) if count}
         told = {stage: f"{_count(runs, 'run')} of this machine" if runs else REFERENCE for stage, runs in known.items()}
@@ -117,31 +111,31 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     return 0
 
 
-def estimate(plan: Plan, points: int, journal: Journal, rates: Rates, options: EngineOptions) -> Estimate:
-    """What is there of a plan (or of the shard of it), and what the rest takes."""
-    work = _missing(plan, options.shard, _Records(journal, options.retry_failed))
+def estimate(plan: SweepPlan, points: int, journal: Journal, rates: Rates, options: EngineOptions) -> Estimate:
+    """Count the finished trials of a plan (or of a shard of it), and estimate the rest."""
+    missing, total, is_known = _missing(plan, options.shard, journal, options.retry_failed)
     jobs = 1 if options.serial else options.jobs
-    needed = {job.path: job for part, _ in work.missing for job in part.renders}
+    needed = {job.path: job for part, _ in missing for job in part.batch.renders}
     to_render = [job for job in needed.values() if not job.path.exists()]
     renders = [render_cost(job) for job in to_render]
-    trials = [trial_cost(plan.groups[p.group], p.batch, jobs).times(count) for p, count in work.missing]
+    trials = [trial_cost(plan.groups[p.group], p.batch, jobs).times(count) for p, count in missing]
     render_s, trial_s = _seconds(rates, "renders", renders), _seconds(rates, "trials", trials)
     found_bytes = sum(one.size_bytes * rates.ratio("records", one.kind) for one in trials)
-    count = sum(count for _, count in work.missing)
+    count = sum(count for _, count in missing)
     return Estimate(
         points=points,
         groups=len(plan.groups),
         renders=len(plan.renders),
         cached=sum(job.path.exists() for job in plan.renders),
         to_render=len(to_render),
-        trials=work.total,
-        found=work.total - count,
-        trials_known=work.known,
+        trials=total,
+        found=total - count,
+        trials_known=is_known,
         render_s=render_s,
         trial_s=trial_s,
-        wall_s=_by_the_clock(render_s, trial_s, work.total, jobs, options),
+        wall_s=_by_the_clock(render_s, trial_s, total, jobs, options),
         render_bytes=sum(one.size_bytes for one in renders),
-        record_bytes=found_bytes + count * FILE_BYTES / 2,
+        record_bytes=found_bytes,
         result_bytes=RESULTS_BYTES + RESULTS_RECORD_SHARE * found_bytes,
         learnt=(
             rates.runs("renders", {one.kind for one in renders}),
@@ -152,7 +146,7 @@ def estimate(plan: Plan, points: int, journal: Journal, rates: Rates, options: E
     )
 
 
-def _seconds(rates: Rates, stage: Stage, costs: Iterable[Cost]) -> float:
+def _seconds(rates: Rates, stage: CostStage, costs: Iterable[WorkCost]) -> float:
     return sum(one.seconds * rates.ratio(stage, one.kind) for one in costs)
 
 
@@ -176,73 +170,36 @@ def _by_the_clock(render_s: float, trial_s: float, trials: int, jobs: int, optio
 # ---------------------------------------------------------------- what is there
 
 
-@dataclass(frozen=True)
-class _Missing:
-    """Parts of a plan with how many of their trials the journal lacks."""
-
-    missing: list[tuple[Part, int]]
-    total: int
-    known: bool
-
-
-class _Records:
-    """What the journal holds, as the engine will take it."""
-
-    def __init__(self, journal: Journal, retry_failed: bool) -> None:
-        self._journal, self._retry_failed = journal, retry_failed
-        self._there = {key for key, _ in journal.entries()}
-
-    def __bool__(self) -> bool:
-        return bool(self._there)
-
-    def entry(self, key: str) -> Entry | None:
-        """How a trial ended, where it is not run again."""
-        entry = self._journal.read(key) if key in self._there else None
-        if entry is None or entry.state == "skipped" or (self._retry_failed and entry.state != "done"):
-            return None
-        return entry
-
-    def is_over(self, key: str) -> bool:
-        """Whether a trial is not run again; of very many, whether it is there."""
-        return key in self._there if len(self._there) > READ_AT_MOST else self.entry(key) is not None
-
-
-def _missing(plan: Plan, shard: Shard, records: _Records) -> _Missing:
+def _missing(
+    plan: SweepPlan, shard: Shard, journal: Journal, retry_failed: bool
+) -> tuple[list[tuple[PlanPart, int]], int, bool]:
+    """Parts with how many of their trials the journal lacks; the number of all trials; and whether judged trials can be
+    looked for: thresholds are known."""
+    over = ("done",) if retry_failed else ("done", "failed", "crashed", "timed out")
     first, then = parts_of(plan, shard)
-    parts = [part for group in (*first, *then) for part in group]
-    total = sum(part.count for part in parts)
-    if not records:
-        return _Missing([(part, part.count) for part in parts], total, True)
-    missing, known = [], True
+    total = sum(part.count for group in (*first, *then) for part in group)
+    missing, is_known = [], True
+
+    def lacks(group: Group, part: PlanPart, sets: list[dict[str, float]]) -> int:
+        keys = zip(*([key for key, _ in group.trials(part.batch, one, part.repeats)] for one in sets), strict=True)
+        return part.count - sum(any(journal.state(key) in over for key in alike) for alike in keys)
+
     for group, own, judged in zip(plan.groups, first, then, strict=True):
-        keys = [(part, _keys(group, part, {})) for part in own]
-        thresholds = _thresholds(group, [key for _, found in keys for key in found], records)
-        if thresholds is None:
-            known &= not judged
-            keys += [(part, []) for part in judged]
+        absent = [(part, lacks(group, part, [{}])) for part in own]
+        if any(count for _, count in absent):
+            is_known &= not judged or not len(journal)
+            absent += [(part, part.count) for part in judged]
         else:
-            keys += [(part, _keys(group, part, thresholds)) for part in judged]
-        for part, wanted in keys:
-            absent = part.count - sum(records.is_over(key) for key in wanted)
-            if absent:
-                missing.append((part, absent))
-    return _Missing(missing, total, known)
-
-
-def _keys(group: Group, part: Part, thresholds: dict[str, float]) -> list[str]:
-    return [key for key, _ in group.trials(part.batch, thresholds, part.repeats)]
-
-
-def _thresholds(group: Group, keys: list[str], records: _Records) -> dict[str, float] | None:
-    """The thresholds that the journal's hole-free trials set; None while any of these is missing."""
-    calibration = Calibration(group)
-    for key in keys:
-        entry = records.entry(key)
-        if entry is None:
-            return None
-        if entry.record is not None:
-            calibration.add(key, entry.record["runs"])
-    return calibration.thresholds()[0]
+            calibration = Calibration(group)
+            for part in own:
+                for key, _ in group.trials(part.batch, {}, part.repeats):
+                    entry = journal.read(key)
+                    if entry is not None and entry.record is not None:
+                        calibration.add(key, entry.record["runs"])
+            sets = calibration.sets(calibration.thresholds()[0], journal)
+            absent += [(part, lacks(group, part, sets)) for part in judged]
+        missing += [(part, count) for part, count in absent if count]
+    return missing, total, is_known
 
 
 def _count(number: int, what: str, plural: str = "s") -> str:

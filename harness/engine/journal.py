@@ -1,33 +1,47 @@
-"""The journal: one file for each trial that ended, however it did, written whole or not at all, so that the same
-command resumes, and journals of several machines merge by copying files."""
+"""The journal of a sweep: how each trial ended, appended to segment files, so that the same command resumes.
+
+Each process that writes has a segment of its own, so shards may share a folder, and journals merge by appending. A
+segment begins with its version; every further line is the entry of one trial with a checksum over the whole line. A
+line that a crash has torn, or that was altered since, counts as not there.
+"""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import re
+import secrets
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.engine.work import STATES, Ended, State
-from harness.vocabulary.files import write_text
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import explained, open_plain
 from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
+from harness.vocabulary.limits import RECORD_BYTES
 from harness.vocabulary.seeds import canonical_json
-from harness.vocabulary.versions import check_version
+from harness.vocabulary.versions import check_version, stamp_of, stamped
 
-JOURNAL_VERSION = 5
-"""Raised by every change to the records' content or to what a trial computes."""
-SUFFIX = ".jsonl"
+JOURNAL_VERSION = 6
+"""Raised by every change to the records' content or to what a trial computes. Segments of older versions are passed
+over, so that their trials run again; so are the files of versions before 6, which held one trial each."""
+SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
+THRESHOLDS = "thresholds-"
+"""Begins the keys of entries that hold no trial, but the thresholds at which trials were judged."""
 NOTHING = "null"
-"""In the place of a record."""
+"""Stands in the place of the record of a trial that is not done."""
+DIGEST_CHARACTERS = 32
 
 
 @dataclass(frozen=True)
 class Entry:
-    """How a trial ended. ``text``: its record as JSON where it is done, None else; the other fields as in `Ended`."""
+    """The end of a trial. ``text``: its record as JSON where it is done, otherwise None; other fields as in `Ended`."""
 
     state: State
     text: str | None = None
@@ -49,72 +63,198 @@ class Entry:
         return None if self.text is None else json.loads(self.text)
 
 
+class _Place(NamedTuple):
+    """The place of an entry: segment, first byte and length of its line; and its state."""
+
+    segment: str
+    start: int
+    length: int
+    state: State
+
+
 class Journal:
-    """Entries in a folder, by key. A file is two lines of JSON: what happened, with the second line's digest; and the
-    record. One that cannot be read, or that is under another name than it was written, counts as not there."""
+    """Entries in a folder, by key. Raises UserError where the folder or a segment is a link, cannot be written, or was
+    written by a newer tofpod."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.damaged: list[str] = []
+        """Lines that are torn or altered, as file and byte, and segments of another version."""
+        self._places: dict[str, _Place] = {}
+        self._thresholds: set[str] = set()
+        self._read_to: dict[str, int] = {}
+        """Bytes of each segment that were read."""
+        self._own: Path | None = None
+        self._is_read = False
+
+    def __len__(self) -> int:
+        return len(self._known()) - len(self._thresholds)
+
+    def trials(self) -> list[str]:
+        """The keys of all trials, sorted."""
+        return sorted(self._known().keys() - self._thresholds)
+
+    @property
+    def thresholds(self) -> frozenset[str]:
+        """The keys of stored thresholds."""
+        self._known()
+        return frozenset(self._thresholds)
+
+    def state(self, key: str) -> State | None:
+        """The end of a trial; None where there is no entry."""
+        place = self._known().get(key)
+        return None if place is None else place.state
+
+    def size(self, key: str) -> int:
+        """Bytes of an entry on the disk; 0 where there is none."""
+        place = self._known().get(key)
+        return 0 if place is None else place.length
 
     def read(self, key: str) -> Entry | None:
-        """The entry of a trial, or None. Raises UserError where a newer tofpod wrote it."""
-        return read_entry(self._path(key), key)
+        """The entry of a trial; None where there is none."""
+        place = self._known().get(key)
+        if place is None:
+            return None
+        try:
+            with open_plain(self.folder / place.segment, os.O_RDONLY) as file:
+                file.seek(place.start)
+                found = _parsed(file.read(place.length))
+        except OSError:
+            return None
+        return found[1] if found is not None and found[0] == key else None
+
+    def entries(self) -> Iterator[tuple[str, Entry]]:
+        """(key, entry) of all trials and thresholds, in the order in which they stand in the segments."""
+        for key, _ in sorted(self._known().items(), key=lambda item: item[1][:2]):
+            if (entry := self.read(key)) is not None:
+                yield key, entry
 
     def write(self, key: str, entry: Entry) -> None:
-        """Store how a trial ended. Raises UserError where the folder cannot be written or the disk is full."""
-        text = NOTHING if entry.text is None else entry.text
-        said = {name: value for name, value in asdict(entry).items() if name != "text"}
-        head = canonical_json({"version": JOURNAL_VERSION, "key": key, "digest": _digest(text), **said})
-        write_text(self._path(key), f"{head}\n{text}\n", durable=False)
+        """Append how a trial ended. Raises UserError where the folder cannot be written or the disk is full."""
+        self._known()
+        line = _line(key, entry)
+        try:
+            if self._own is None:
+                self._own = self._new_segment()
+            with open_plain(self._own, os.O_WRONLY | os.O_APPEND) as file:
+                start = os.fstat(file.fileno()).st_size
+                if os.write(file.fileno(), line) < len(line):
+                    os.ftruncate(file.fileno(), start)
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise explained(error, self.folder) from error
+        self._remember(key, _Place(self._own.name, start, len(line), entry.state))
+        self._read_to[self._own.name] = start + len(line)
 
-    def entries(self) -> Iterator[tuple[str, Path]]:
-        """(key, file) of every entry, in order of keys."""
-        found = self.folder.glob(f"??/[!.]*{SUFFIX}")  # a name with a dot is a file that is being written
-        paths = {path.stem: path for path in found}
-        yield from sorted(paths.items())
+    def sync(self) -> None:
+        """Have what this process wrote on the disk, so that a power failure does not lose it."""
+        if self._own is not None:
+            with suppress(OSError), open_plain(self._own, os.O_RDONLY) as file:
+                os.fsync(file.fileno())
 
-    def _path(self, key: str) -> Path:
-        """In one of 256 folders, by the end of the key's digest: no folder gets too long to list."""
-        return self.folder / key[-2:] / f"{key}{SUFFIX}"
+    def refresh(self) -> None:
+        """Read what other processes have appended since."""
+        if self.folder.is_symlink():
+            raise UserError(f"{self.folder}: is a link, and a journal is not read through one", fix="remove the link")
+        self._is_read = True
+        try:
+            names = sorted(name for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name))
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        for name in names:
+            self._read_segment(name)
 
+    def _known(self) -> dict[str, _Place]:
+        if not self._is_read:
+            self.refresh()
+        return self._places
 
-def read_entry(path: Path, key: str) -> Entry | None:
-    """The entry in a file, or None where it is absent, damaged, older, or another trial's.
+    def _read_segment(self, name: str) -> None:
+        path = self.folder / name
+        try:
+            with open_plain(path, os.O_RDONLY) as file:
+                start = self._read_to.get(name, 0)
+                if os.fstat(file.fileno()).st_size <= start:
+                    return
+                if not start and not self._is_ours(path, file.readline(200)):
+                    self._read_to[name] = 1 << 62  # never looked into again
+                    return
+                file.seek(start := max(start, file.tell()))
+                while (line := file.readline(RECORD_BYTES)).endswith(b"\n"):
+                    found = _parsed(line)
+                    if found is None:
+                        self.damaged.append(f"{path}: byte {start}")
+                    else:
+                        self._remember(found[0], _Place(name, start, len(line), found[1].state))
+                    start += len(line)
+                if line and name not in self._read_to:
+                    self.damaged.append(f"{path}: byte {start}")  # torn, or being written now
+                self._read_to[name] = start
+        except OSError:
+            self.damaged.append(str(path))
 
-    Raises UserError where a newer tofpod wrote it.
-    """
-    try:
-        head, text, rest = bounded_bytes(path, RECORD_BYTES).decode().split("\n")
-        said = strict_json(head)
-        if rest or not isinstance(said, dict):
-            return None
-        version = said.pop("version", None)
+    def _is_ours(self, path: Path, first: bytes) -> bool:
+        """Return whether a segment's first line states this version."""
+        version = stamp_of(first.decode("utf-8", "replace"), "journal") if first.endswith(b"\n") else None
         if type(version) is int and version > JOURNAL_VERSION:
-            check_version(version, JOURNAL_VERSION, path, "a journal's entry")
-        if version != JOURNAL_VERSION or said.pop("key", None) != key or said.pop("digest", None) != _digest(text):
-            return None
-        entry = Entry(text=None if text == NOTHING else text, **said)
-    except (OSError, ValueError, TypeError):
+            check_version(version, JOURNAL_VERSION, path, "a journal's segment")
+        if version != JOURNAL_VERSION:
+            self.damaged.append(str(path))
+        return version == JOURNAL_VERSION
+
+    def _remember(self, key: str, place: _Place) -> None:
+        """A later entry takes the place of an earlier one, unless only the earlier trial is done."""
+        before = self._places.get(key)
+        if before is None or before.state != "done" or place.state == "done":
+            self._places[key] = place
+        if key.startswith(THRESHOLDS):
+            self._thresholds.add(key)
+
+    def _new_segment(self) -> Path:
+        """Names count up, so that they sort by the time at which the segments were begun."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        numbers = [int(name[:6]) for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name)]
+        path = self.folder / f"{max(numbers, default=0) + 1:06d}-{secrets.token_hex(4)}.jsonl"
+        with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file:
+            file.write(stamped("journal", JOURNAL_VERSION).encode())
+        return path
+
+
+def _line(key: str, entry: Entry) -> bytes:
+    said = {name: value for name, value in asdict(entry).items() if name != "text"}
+    text = f"{canonical_json({'key': key, **said})}\t{NOTHING if entry.text is None else entry.text}".encode()
+    return _digest(text) + b" " + text + b"\n"
+
+
+def _parsed(line: bytes) -> tuple[str, Entry] | None:
+    """The key and the entry of a line; None where it is damaged."""
+    digest, _, text = line.rstrip(b"\n").partition(b" ")
+    if digest != _digest(text):
+        return None
+    try:
+        head, _, record = text.decode().partition("\t")
+        said = strict_json(head)
+        key = said.pop("key")
+        entry = Entry(text=None if record == NOTHING else record, **said)
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
     is_whole = entry.state in STATES and (entry.text is not None) == (entry.state == "done")
-    return entry if is_whole else None
+    return (key, entry) if is_whole and isinstance(key, str) else None
 
 
-def _digest(text: str) -> str:
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+def _digest(text: bytes) -> bytes:
+    return hashlib.blake2b(text, digest_size=DIGEST_CHARACTERS // 2).hexdigest().encode()
 
 
 def record_text(record: dict[str, Any]) -> str:
-    """A trial's record as one line of JSON; NaN, which JSON cannot hold, become null."""
+    """A trial's record as one line of JSON; NaN, which JSON cannot hold, becomes null."""
     return canonical_json(without_nan(record))
 
 
 def without_nan(record: Any) -> Any:
-    """The record with NaN as None, which JSON can hold."""
+    """The record with None in the place of NaN."""
     if isinstance(record, dict):
         return {key: without_nan(value) for key, value in record.items()}
     if isinstance(record, list):
         return [without_nan(value) for value in record]
-    if isinstance(record, float) and record != record:
-        return None
-    return record
+    return None if isinstance(record, float) and record != record else record

@@ -13,8 +13,7 @@ from detectors.registration.register import register
 from detectors.registration.registered import Registration, predicted_error_m
 from detectors.registration.settings import PAIRWISE
 from detectors.views import PreparedView, View
-from harness.engine.setup import SetUp
-from harness.engine.sight import Sight, sight_of_map
+from harness.engine.setup import KnownCloud, SetUp, known_map
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import canonical_json
@@ -50,22 +49,22 @@ class MapMaker:
         self.guesses = tuple(guessed_T_reference_view(poses, stands, number, *labels) for number in numbers)
 
     def count(self, mapping: MappingConfig) -> int:
-        """How many views a mapping uses."""
+        """Number of views that a mapping uses."""
         return mapping.views or len(self._set_ups)
 
     def key(self, mapping: MappingConfig, frames: int) -> str:
         """Equal for mappings that make the same map: with one view there is nothing to register."""
         return canonical_json([self._registration_key(mapping, frames), mapping.merge.to_data()])
 
-    def sight(self, mapping: MappingConfig, frames: int) -> Sight:
+    def known(self, mapping: MappingConfig, frames: int) -> KnownCloud:
         """The map with the truth on it."""
 
-        def make() -> Sight:
+        def make() -> KnownCloud:
             merged = self.merged(mapping, frames)
             hole_free = self._hole_free
-            return sight_of_map(self._set_ups[0], merged.cloud, merged.T_reference_cloud, hole_free=hole_free)
+            return known_map(self._set_ups[0], merged.cloud, merged.T_reference_cloud, hole_free=hole_free)
 
-        return self._once(make, "sight", self.key(mapping, frames))
+        return self._once(make, "known", self.key(mapping, frames))
 
     def merged(self, mapping: MappingConfig, frames: int) -> Merged:
         """The map."""
@@ -106,7 +105,7 @@ class MapMaker:
                 yield self._registration_row(number, registration, views[number])
 
     def seconds(self, mapping: MappingConfig, frames: int) -> float:
-        """What registering and merging took, whether for this point or for one that shares it."""
+        """Seconds that registering and merging took, whether for this point or for one that shares it."""
         spent = sum(registration.seconds for registration in self.registrations(mapping, frames))
         return float(spent + self.merged(mapping, frames).seconds)
 

@@ -1,23 +1,69 @@
-"""The options that every program has which runs an experiment: where, how much, and what to do about failures."""
+"""The options of every program that runs an experiment, and the engine that they ask for."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
+from dataclasses import dataclass
 
-from harness.engine.opening import DEFAULT_MEMORY_MB, DEFAULT_TIME_LIMIT_S, EngineOptions
 from harness.engine.shard import WHOLE, Shard
-from harness.engine.work import Limits
+from harness.engine.work import Code, JobEngine, Limits, Stage
 from harness.vocabulary.errors import UserError
 
+DEFAULT_TIME_LIMIT_S = 900.0
+"""A trial takes seconds at most; a hang should not take a night."""
+DEFAULT_MEMORY_MB = 4000
+"""A trial takes some 300 MB, maps of many views up to 2 GB."""
+DEFAULT_LIMITS = Limits(DEFAULT_TIME_LIMIT_S, DEFAULT_MEMORY_MB)
 DEFAULT_CACHE_GB = 20.0
 LEAST_MEMORY_GB = 0.5
 """A process that has loaded what trials need holds 0.2 GB."""
 
 
+@dataclass(frozen=True)
+class EngineOptions:
+    """``jobs``: processes, or workers that a cluster is asked for. ``scheduler``: address of one, or jobqueue:slurm and
+    the like; None: this machine. ``serial``: in this process."""
+
+    jobs: int = 2
+    limits: Limits = DEFAULT_LIMITS
+    scheduler: str | None = None
+    serial: bool = False
+    shard: Shard = WHOLE
+    retry_failed: bool = False
+    cache_limit_gb: float | None = None
+
+
+def engine_of(options: EngineOptions, detectors: Iterable[str] = ()) -> JobEngine:
+    """The engine, not yet begun, for trials of these ``detectors``.
+
+    Raises UserError where it is not installed or does not answer.
+    """
+    from harness.engine.processes import LocalEngine, SerialEngine
+
+    if options.serial:
+        return SerialEngine()
+    code = code_of(detectors)
+    if options.scheduler is not None:
+        from harness.engine.cluster import ClusterEngine
+
+        return ClusterEngine(options.scheduler, options.limits, options.jobs, code)
+    return LocalEngine(options.jobs, options.limits, code)
+
+
+def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
+    """The code that decides the numbers of each stage, for trials of these ``detectors``."""
+    from harness.engine.plan import PACKAGES, trial_code
+    from scenes.render import cache
+
+    modules = {module for detector in detectors for module in trial_code(detector)}
+    return {"trials": (tuple(sorted(modules)), PACKAGES), "renders": (cache.CODE, cache.PACKAGES)}
+
+
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add them, in a group of their own."""
     add = parser.add_argument_group("how it is run").add_argument
-    add("--jobs", type=whole_number, default=2, metavar="N", help="processes, or workers of a cluster (default: 2)")
+    add("--jobs", type=_whole_number, default=2, metavar="N", help="processes, or workers of a cluster (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     add(
         "--scheduler",
@@ -28,21 +74,21 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
     add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
     add(
         "--time-limit",
-        type=positive,
+        type=_positive,
         default=DEFAULT_TIME_LIMIT_S,
         metavar="SECONDS",
         help=f"that one trial or render may take (default: {DEFAULT_TIME_LIMIT_S:g})",
     )
     add(
         "--memory-limit",
-        type=positive,
+        type=_positive,
         default=DEFAULT_MEMORY_MB / 1000,
         metavar="GB",
-        help=f"that a trial's process may take (default: {DEFAULT_MEMORY_MB / 1000:g}); not on a cluster",
+        help=f"that a trial's process may take, on a cluster too (default: {DEFAULT_MEMORY_MB / 1000:g})",
     )
     add(
         "--cache-limit",
-        type=positive,
+        type=_positive,
         default=DEFAULT_CACHE_GB,
         metavar="GB",
         help=f"of stored renders; the longest unused go first (default: {DEFAULT_CACHE_GB:g})",
@@ -50,7 +96,7 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
 
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
-    """What was asked for. Raises UserError where it makes no sense."""
+    """Return the options that were given. Raises UserError where they make no sense."""
     if options.serial and options.scheduler is not None:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
@@ -69,15 +115,15 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
     )
 
 
-def whole_number(text: str) -> int:
-    """For argparse: 1 to 4096."""
+def _whole_number(text: str) -> int:
+    """Parse a whole number from 1 to 4096, for argparse."""
     if not text.isdigit() or not 1 <= int(text) <= 4096:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
     return int(text)
 
 
-def positive(text: str) -> float:
-    """For argparse: a number above 0."""
+def _positive(text: str) -> float:
+    """Parse a number above 0, for argparse."""
     try:
         value = float(text)
     except ValueError:

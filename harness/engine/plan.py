@@ -1,16 +1,18 @@
-"""What an experiment costs before it runs: set-ups to render, trials to run, and which points share their frames."""
+"""The plan of a sweep: views to render, trials to run, points that share their frames, and a shard's parts of it."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from detectors import BUILT_IN, DETECTORS
+from detectors import DETECTORS
 from harness.engine.journal import JOURNAL_VERSION
 from harness.engine.setup import SetUpRef
+from harness.engine.shard import Shard
 from harness.engine.trial import PointTask, Role, TrialTask
 from harness.experiment.points import Experiment, Point
 from harness.experiment.schema import SimulatedSource
@@ -32,10 +34,8 @@ PACKAGES = (
 """A trial's numbers are decided, beside its task, by all sources that this module and the detector's reach, and by the
 versions of these packages: a change of any makes stored trials count as not done. Mitsuba's version is part of the
 names of the rendered views."""
-
-
-BUILT_IN_CODE = (CODE, *(target.partition(":")[0] for target in sorted(BUILT_IN.values())))
-"""The same for all built-in detectors."""
+MOST_REPEATS = 256
+"""Repeats of a part of a plan, which is looked up and queued as one."""
 
 
 def trial_code(detector: str) -> tuple[str, ...]:
@@ -54,38 +54,22 @@ class RenderJob:
 
     @cached_property
     def path(self) -> Path:
-        """Where the cache keeps it."""
+        """The file in the cache."""
         return self.folder / f"{render_key(self.target, camera_of(self.camera).optics, self.config)}.npz"
 
 
 @dataclass(frozen=True)
-class PlannedView:
-    """One pose of a target, with its damage or without: the render, and what names it to a worker."""
-
-    render: RenderJob
-    set_up: SetUpRef
-
-
-@dataclass(frozen=True)
 class Batch:
-    """Trials of one role before one target: what shares its renders. ``views``: one, or those from which maps are made.
+    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: of its one view, or
+    of each of those from which maps are made.
 
     ``board``: its number among a study's boards of this role; None for the one target of any other experiment.
     """
 
     role: Role
-    views: tuple[PlannedView, ...]
+    renders: tuple[RenderJob, ...]
+    set_ups: tuple[SetUpRef, ...]
     board: int | None = None
-
-    @property
-    def renders(self) -> tuple[RenderJob, ...]:
-        """Of all views."""
-        return tuple(view.render for view in self.views)
-
-    @property
-    def set_ups(self) -> tuple[SetUpRef, ...]:
-        """Of each view."""
-        return tuple(view.set_up for view in self.views)
 
 
 @dataclass(frozen=True)
@@ -109,7 +93,7 @@ class Group:
 
     @property
     def is_study(self) -> bool:
-        """Whether its boards are drawn at random."""
+        """Return whether its boards are drawn at random."""
         return self.then[0].board is not None
 
     @property
@@ -118,8 +102,8 @@ class Group:
         return next(batch for batch in self.then if batch.role == "damaged")
 
     def repeats(self, batch: Batch, point: Point) -> int:
-        """How many trials of a batch a point wants: with a given threshold, as many hole-free ones as damaged ones; one
-        of each board that sets a study's threshold."""
+        """Number of trials of a batch that a point wants: with a given threshold, as many hole-free as damaged ones;
+        one of each board that sets a study's threshold."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
@@ -128,7 +112,7 @@ class Group:
         return point.config.repeats
 
     def most_repeats(self, batch: Batch) -> int:
-        """How many trials of a batch there are."""
+        """Number of trials of a batch."""
         return max(self.repeats(batch, point) for point in self.points)
 
     def trials(
@@ -136,24 +120,19 @@ class Group:
     ) -> Iterator[tuple[str, TrialTask]]:
         """(journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest, empty
         while calibrating; a point that got none is not judged. With None in place of thresholds the trials are named
-        as what could not be judged at all."""
+        that cannot be judged at all."""
         unjudged = thresholds is None or batch in self.first
-        thresholds = thresholds or {}
-        points = [one for one in self.points if unjudged or self._threshold(one, thresholds) is not None]
-        asked = {point.digest: _point_task(point, self._threshold(point, thresholds)) for point in points}
+        given = {point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k) for point in self.points}
+        points = [point for point in self.points if unjudged or given[point.digest] is not None]
+        asked = {point.digest: _point_task(point, given[point.digest]) for point in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
-            if not wanted:
-                continue
-            task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
-            yield self._key(batch, task), task
-
-    def _threshold(self, point: Point, thresholds: Mapping[str, float]) -> float | None:
-        return thresholds.get(point.digest, point.config.threshold.k)
+            if wanted:
+                task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
+                yield self._key(batch, task), task
 
     def _key(self, batch: Batch, task: TrialTask) -> str:
-        asked = [[point.digest, point.variant, point.threshold] for point in task.points]
         content = [
             JOURNAL_VERSION,
             *(source_digest(trial_code(name), PACKAGES) for name in sorted({each.detector for each in task.points})),
@@ -162,7 +141,7 @@ class Group:
             task.role,
             task.board,
             task.repeat,
-            asked,
+            [[point.digest, point.variant, point.threshold] for point in task.points],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"
@@ -185,7 +164,7 @@ def _point_task(point: Point, threshold: float | None) -> PointTask:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """All groups of an experiment with a simulated source."""
 
     groups: tuple[Group, ...]
@@ -202,12 +181,12 @@ class Plan:
         return sum(group.most_repeats(batch) for group in self.groups for batch in group.batches)
 
 
-def plan_of(experiment: Experiment, cache: Path) -> Plan:
+def plan_of(experiment: Experiment, cache: Path) -> SweepPlan:
     """Group the points of an experiment by the frames that they share."""
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
-    return Plan(tuple(_group(tuple(points), cache) for points in by_frames.values()))
+    return SweepPlan(tuple(_group(tuple(points), cache) for points in by_frames.values()))
 
 
 def _group(points: tuple[Point, ...], cache: Path) -> Group:
@@ -240,11 +219,60 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
 def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None) -> Batch:
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
-    placed = [target.model_copy(update={"pose": pose}) for pose in poses]
-    return Batch(role, tuple(_view(one, role == "damaged", source, cache) for one in placed), board)
+    renders, set_ups, damaged = [], [], role == "damaged"
+    for pose in poses:
+        placed = target.model_copy(update={"pose": pose})
+        shown = placed if damaged else placed.hole_free()
+        renders.append(RenderJob(shown, source.camera, source.render, cache))
+        set_ups.append(SetUpRef(str(renders[-1].path), source.camera, placed, damaged))
+    return Batch(role, tuple(renders), tuple(set_ups), board)
 
 
-def _view(target: TargetConfig, damaged: bool, source: SimulatedSource, cache: Path) -> PlannedView:
-    shown = target if damaged else target.hole_free()
-    render = RenderJob(shown, source.camera, source.render, cache)
-    return PlannedView(render, SetUpRef(str(render.path), source.camera, target, damaged))
+@dataclass(eq=False)
+class PlanPart:
+    """Some repeats of one batch, and how far they are. ``group``: its number in the plan; ``sets_threshold``: whether
+    the trials set the points' thresholds; ``left``: trials that have not ended; ``absent``: views that the ``trials``
+    wait for."""
+
+    group: int
+    batch: Batch
+    sets_threshold: bool
+    repeats: range
+    left: int = 0
+    absent: set[Path] = field(default_factory=set)
+    trials: list[Any] = field(default_factory=list)
+    is_over: bool = False
+
+    @property
+    def count(self) -> int:
+        """Number of trials, if all points of the group are judged."""
+        return len(self.repeats)
+
+    @cached_property
+    def paths(self) -> tuple[Path, ...]:
+        """The files of the batch's views."""
+        return tuple(job.path for job in self.batch.renders)
+
+
+def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
+    """Cut a plan, by group, into parts that set its thresholds, and judged parts that are the shard's. A group of which
+    the shard judges nothing has neither."""
+
+    def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
+        starts = range(repeats.start, repeats.stop, MOST_REPEATS)
+        ends = (min(start + MOST_REPEATS, repeats.stop) for start in starts)
+        return [PlanPart(number, batch, sets_threshold, range(*ends)) for ends in zip(starts, ends, strict=True)]
+
+    mine, before = shard.part(sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)), 0
+    first: list[list[PlanPart]] = []
+    then: list[list[PlanPart]] = []
+    for number, group in enumerate(plan.groups):
+        judged = []
+        for batch in group.then:
+            count = group.most_repeats(batch)
+            judged += cut(number, batch, range(max(mine.start - before, 0), min(mine.stop - before, count)), False)
+            before += count
+        then.append(judged)
+        calibrating = group.first if judged else ()
+        first.append([part for one in calibrating for part in cut(number, one, range(group.most_repeats(one)), True)])
+    return first, then

@@ -1,7 +1,7 @@
-"""Processes of this machine, one job at a time each: a process that dies, hangs or eats memory costs its own job only.
+"""Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
 
-The executors of the standard library give up all their jobs when one of their processes dies; here every process has a
-pipe of its own, so who held which job is known.
+The executors of the standard library give up all their jobs when one of their processes dies. Here a thread serves each
+process through a pipe of its own, so that it is known which job a process held. A cluster's nodes use the same class.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ import ctypes
 import importlib
 import multiprocessing
 import os
+import pickle
+import queue
 import signal
 import sys
 import tempfile
 import threading
 import time
 import traceback
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,129 +31,182 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.sources import source_digest
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""One thread a process: sums are then in one order on every machine, and processes do not fight for cores."""
+"""One thread a process: sums then have one order on every machine, and processes do not compete for cores."""
 MOST_RENDERERS = 2
 """Processes that render, of 2 GB each."""
 PR_SET_PDEATHSIG = 1
-"""Of Linux' prctl(2)."""
+"""An option of Linux' prctl(2)."""
 LOOKS_S = 1.0
-"""Between looks whether the driver is still there."""
+"""Interval at which a driver's clock and a process' parent are looked at."""
 START_S = 300.0
-"""For a process to load what it needs; seconds, but from a network's disk."""
+"""Time for a process to load what it needs: seconds, but from a network's disk more."""
 DUMP_S = 0.3
-"""What a process that hangs is given to say where; its own signal handler needs a millisecond."""
+"""Time that a hanging process gets to write its traceback; its signal handler needs a millisecond."""
 SHORT_S = 0.5
-"""A process whose jobs are shorter has its next one ready, so that it need not wait while the driver files the last;
-with longer ones the end of a sweep would wait for jobs that are spread unevenly."""
+"""Jobs shorter than this are queued one ahead for each process, so that none waits while the driver stores a result."""
 STOPPED_S = 2.0
-"""A wait of `LOOKS_S` that takes so much longer was not spent waiting: Ctrl-Z, a suspended machine."""
+"""A wait of `LOOKS_S` that takes so much longer was no waiting: Ctrl-Z, or a suspended machine."""
+IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}
+"""Processes without a job for so long end: those that render hold 2 GB."""
 FALSE_STARTS = 3
-"""Processes in a row that died before they could take a job: then none will."""
+"""Processes in a row that died before they could take a job: then none will start."""
+
+
+@dataclass(eq=False)
+class Answers:
+    """The queue in which somebody awaits the ends of jobs, or the error that ends all. ``is_dropped``: nobody does."""
+
+    ended: queue.SimpleQueue[tuple[Job, Ended] | UserError] = field(default_factory=queue.SimpleQueue)
+    is_dropped: bool = False
 
 
 class LocalEngine:
     """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
-    renders have no limit of memory, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
+    renders have no memory limit, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
     a stage; a process that starts after one of their sources was edited is refused, because its results would be stored
-    as those of the code that this process runs."""
+    as those of the code that this process runs. ``sent_views``: as `harness.engine.setup.sent_views`."""
 
-    def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
+    def __init__(
+        self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None, sent_views: Path | None = None
+    ) -> None:
         self._code = code or {}
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._most: dict[Stage, int] = {"trials": jobs, "renders": min(jobs, MOST_RENDERERS)}
-        self._limits: dict[Stage, Limits] = {"trials": limits, "renders": Limits(limits.seconds, None)}
-        self._workers: dict[Stage, list[_Worker]] = {"trials": [], "renders": []}
-        self._false_starts = 0
+        self._limits, self._sent_views = limits, sent_views
+        self._waiting: dict[Stage, deque[tuple[Job, Limits, Answers]]] = {"trials": deque(), "renders": deque()}
+        self._state = threading.Condition()
+        self._idle: Counter[Stage] = Counter()
+        """Threads that wait for a job."""
+        self._processes: dict[threading.Thread, tuple[Stage, _Process | None, Answers | None]] = {}
+        self._answers = Answers()
+        self._out: Counter[Stage] = Counter()
+        self._is_quick: dict[Stage, bool] = {}
+        self._false_starts = self._number = 0
+        self._is_over = False
         self._said: tempfile.TemporaryDirectory[str]
-        self._number = 0
 
     def __enter__(self) -> LocalEngine:
-        self._said = tempfile.TemporaryDirectory(prefix="tofpod-")
+        self._said = tempfile.TemporaryDirectory(prefix="tofpod-", ignore_cleanup_errors=True)
         return self
 
     def __exit__(self, *error: object) -> None:
-        everyone = [worker for workers in self._workers.values() for worker in workers]
-        for worker in everyone:
-            worker.strike()
-        for worker in everyone:
-            worker.kill()
+        with self._state:
+            self._is_over = True
+            processes = [process for _, process, _ in self._processes.values() if process is not None]
+            for process in processes:
+                process.strike()
+            self._state.notify_all()
+        for process in processes:
+            process.wait()
         self._said.cleanup()
 
     def room(self, stage: Stage) -> int:
-        """Free processes, those not yet started among them; and the next jobs of those that are soon free."""
-        workers = self._workers[stage]
-        free = self._most[stage] - sum(worker.job is not None for worker in workers)
-        return free + sum(worker.is_quick and worker.next_job is None for worker in workers if worker.job is not None)
+        """Processes without a job, those not yet started included; with short jobs also a next job for each."""
+        return self._most[stage] * (2 if self._is_quick.get(stage) else 1) - self._out[stage]
 
     def submit(self, job: Job) -> None:
-        """Hand a job to a process. Only as many as there is `room` for."""
-        workers = self._workers[job.stage]
-        for dead in [worker for worker in workers if worker.job is None and not worker.is_alive()]:
-            self._remove(dead)
-        free = next((worker for worker in workers if worker.job is None), None)
-        if free is None and len(workers) == self._most[job.stage]:
-            soon = next(worker for worker in workers if worker.is_quick and worker.next_job is None)
-            soon.next_job = job
-            return
-        if free is None:
-            free = self._started(job.stage)
-            workers.append(free)
-        free.take(job)
-
-    def _started(self, stage: Stage) -> _Worker:
-        self._number += 1
-        name = f"{stage} process {self._number}"
-        said = Path(self._said.name) / str(self._number)
-        return _Worker(name, stage, self._limits[stage], said, self._code.get(stage))
+        """Take a job. Not more than there is `room` for."""
+        self._out[job.stage] += 1
+        self.put(job, self._limits, self._answers)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end, or to reach their time limit."""
-        ended: list[tuple[Job, Ended]] = []
-        while not ended and (busy := self._busy()):
-            pipes = {worker.pipe: worker for worker in busy}
-            asked = time.monotonic()
-            heard = wait(list(pipes), timeout=min(_soonest(busy), LOOKS_S))
-            stopped_s = time.monotonic() - asked - LOOKS_S
-            if stopped_s > STOPPED_S:
-                for worker in busy:
-                    worker.forgive(stopped_s)
-            for pipe in heard:
-                ended += self._heard(pipes[pipe])  # type: ignore[index]
-            for worker in [one for one in self._busy() if one.left_s() <= 0]:
-                ended += self._overdue(worker)
-        self._end_idle_renderers()
-        return ended
+        """Wait for jobs to end. Raises UserError where processes run other code or cannot start."""
+        said = [self._answers.ended.get()]
+        with contextlib.suppress(queue.Empty):
+            while True:
+                said.append(self._answers.ended.get_nowait())
+        found = []
+        for one in said:
+            if isinstance(one, UserError):
+                raise one
+            job, ended = one
+            self._out[job.stage] -= 1
+            self._is_quick[job.stage] = ended.seconds < SHORT_S
+            found.append((job, ended))
+        return found
 
-    def _busy(self) -> list[_Worker]:
-        return [worker for workers in self._workers.values() for worker in workers if worker.job is not None]
+    def put(self, job: Job, limits: Limits, answers: Answers) -> None:
+        """Queue a job whose end goes into ``answers``; from any thread."""
+        stage = job.stage
+        with self._state:
+            self._waiting[stage].append((job, limits if stage == "trials" else Limits(limits.seconds), answers))
+            threads = sum(of == stage for of, _, _ in self._processes.values())
+            if self._idle[stage] < len(self._waiting[stage]) and threads < self._most[stage]:
+                thread = threading.Thread(target=self._serve, args=(stage,), daemon=True)
+                self._processes[thread] = (stage, None, None)
+                thread.start()
+            self._state.notify_all()
 
-    def _heard(self, worker: _Worker) -> Iterator[tuple[Job, Ended]]:
-        """What a process has to say: that it is ready, how its job ended, or nothing more ever."""
-        job = worker.job
-        assert job is not None
-        try:
-            said = worker.hear()
-        except (EOFError, OSError):
-            words = worker.last_words()
-            self._remove(worker)
-            if worker.is_ready:
-                yield job, Ended("crashed", why=words, seconds=worker.spent_s(), worker=worker.name)
-                self._pass_on(worker)
-            else:
-                self._start_again(job, words)
-            return
-        if not isinstance(said, Ended):
-            self._refuse_other_code(worker.stage, said.code)
-            self._false_starts = 0
-            return
-        worker.job = None
-        if worker.next_job is not None:
-            worker.take(worker.next_job)
-            worker.next_job = None
-        yield job, said
+    def drop(self, answers: Answers) -> None:
+        """End the jobs whose end nobody awaits any more."""
+        with self._state:
+            answers.is_dropped = True
+            for _, process, holder in self._processes.values():
+                if holder is answers and process is not None:
+                    process.strike()
+        answers.ended.put(UserError("nobody awaits these jobs any more"))
 
-    def _refuse_other_code(self, stage: Stage, digest: str | None) -> None:
+    # ---------------------------------------------------------------- one thread for each process
+
+    def _serve(self, stage: Stage) -> None:
+        process: _Process | None = None
+        while (taken := self._next(stage, process)) is not None:
+            job, limits, answers = taken
+            if process is not None and (job is None or not process.is_alive()):
+                process.kill()
+                process = None
+            while job is not None and not answers.is_dropped and not self._is_over:
+                try:
+                    process = process or self._started(stage, answers)
+                    if not process.is_ready:
+                        self._check_code(stage, process.wait_until_ready())
+                    answers.ended.put((job, process.carry_out(job, limits)))
+                except _NotStarted as error:
+                    process, mistake = None, self._false_start(str(error))
+                    if mistake is None:
+                        continue  # another process gets the job
+                    answers.ended.put(mistake)
+                except UserError as mistake:
+                    if process is not None:
+                        process.kill()
+                        process = None
+                    answers.ended.put(mistake)
+                except Exception as error:  # a bug here must not leave the driver waiting
+                    why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
+                    answers.ended.put((job, Ended("failed", why=why, is_bug=True)))
+                break
+        if process is not None:
+            process.kill()
+
+    def _next(self, stage: Stage, process: _Process | None) -> tuple[Job | None, Limits, Answers] | None:
+        """The next job; no job in its place when the process has been idle for long; None when all is over."""
+        with self._state:
+            self._processes[threading.current_thread()] = (stage, process, None)
+            self._idle[stage] += 1
+            waits_s = None if process is None else IDLE_S[stage]
+            has_job = self._state.wait_for(lambda: self._waiting[stage] or self._is_over, waits_s)
+            self._idle[stage] -= 1
+            if self._is_over:
+                return None
+            if not has_job:
+                return None, self._limits, self._answers
+            taken = self._waiting[stage].popleft()
+            self._processes[threading.current_thread()] = (stage, process, taken[2])
+            return taken
+
+    def _started(self, stage: Stage, answers: Answers) -> _Process:
+        with self._state:
+            self._number += 1
+            said = Path(self._said.name) / str(self._number)
+            process = _Process(f"{stage} process {self._number}", stage, said, self._code.get(stage), self._sent_views)
+            self._processes[threading.current_thread()] = (stage, process, answers)
+        if self._is_over:
+            process.strike()
+        return process
+
+    def _check_code(self, stage: Stage, digest: str | None) -> None:
         """Raise UserError where a process runs other sources than this one."""
+        self._false_starts = 0
         if digest != self._digests.get(stage):
             raise UserError(
                 f"the code of {stage} was edited while this sweep ran: a new process has loaded other sources",
@@ -158,157 +214,116 @@ class LocalEngine:
                 fix="run the same command again: trials of the old code are kept under its key, the others run anew",
             )
 
-    def _start_again(self, job: Job, words: str) -> None:
-        """A process that died before it could begin: another gets the job, unless none seems to be able to start."""
+    def _false_start(self, words: str) -> UserError | None:
+        """Count a process that died before it could begin; the mistake to tell where none seems to be able to start."""
         self._false_starts += 1
-        if self._false_starts >= FALSE_STARTS:
-            raise UserError(
-                f"{FALSE_STARTS} worker processes in a row died as they started: {words}",
-                legal="trials need about 1 GB of memory a process, renders 2 GB",
-                fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short, or a"
-                " higher --memory-limit",
-            )
-        self.submit(job)
-
-    def _overdue(self, worker: _Worker) -> Iterator[tuple[Job, Ended]]:
-        job, seconds = worker.job, worker.spent_s()
-        assert job is not None
-        where = worker.where_it_hangs()
-        self._remove(worker)
-        if not worker.is_ready:
-            self._start_again(job, f"not ready after {seconds:.0f} s; it was at:\n{where}")
-            return
-        self._pass_on(worker)
-        why = f"not done after {seconds:.3g} s (--time-limit); it was at:\n{where}"
-        yield job, Ended("timed out", why=why, seconds=seconds, worker=worker.name)
-
-    def _pass_on(self, worker: _Worker) -> None:
-        """The next job of a process that is gone, which it never saw."""
-        if worker.next_job is not None:
-            self.submit(worker.next_job)
-
-    def _remove(self, worker: _Worker) -> None:
-        worker.kill()
-        for workers in self._workers.values():
-            if worker in workers:
-                workers.remove(worker)
-
-    def _end_idle_renderers(self) -> None:
-        """Where trials run and nothing is left to render, 2 GB each are of more use elsewhere."""
-        renderers = self._workers["renders"]
-        if all(worker.job is None for worker in renderers):
-            for worker in [one for one in renderers if one.idle_s() > LOOKS_S]:
-                self._remove(worker)
+        if self._false_starts < FALSE_STARTS or self._is_over:
+            return None
+        return UserError(
+            f"{FALSE_STARTS} worker processes in a row died as they started: {words}",
+            legal="trials need about 1 GB of memory a process, renders 2 GB",
+            fix="run the same command again (finished trials are kept), with fewer --jobs if memory is short, or a"
+            " higher --memory-limit",
+        )
 
 
-def _soonest(busy: list[_Worker]) -> float:
-    """Seconds to the next time limit, endless where there is none."""
-    return max(min(worker.left_s() for worker in busy), 0.0)
+class _NotStarted(Exception):
+    """A process died before it could take a job."""
 
 
-@dataclass(frozen=True)
-class _Ready:
-    """A process can take jobs. ``code``: digest of the sources that it has loaded, where it was asked for."""
+class _Process:
+    """A process with its pipe, served by one thread."""
 
-    code: str | None
-
-
-class _Worker:
-    """One process with its pipe; ``job`` is what it is at, ``next_job`` what it gets then. ``is_quick``: whether its
-    last job was."""
-
-    def __init__(self, name: str, stage: Stage, limits: Limits, said: Path, code: Code | None) -> None:
-        self.name = name
-        self.stage = stage
-        self.job: Job | None = None
-        self.next_job: Job | None = None
-        self.is_quick = False
+    def __init__(self, name: str, stage: Stage, said: Path, code: Code | None, sent_views: Path | None) -> None:
         self.is_ready = False
-        self._limits = limits
-        self._said = said
-        self._since = time.monotonic()
+        self._name, self._said = name, said
         context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        with one_thread(), _without_interrupts():
+        self._pipe, theirs = context.Pipe()
+        with _one_thread(), _without_interrupts(), _may_have_children():
             self._process = context.Process(
-                target=_serve, args=(theirs, name, stage, limits.memory_mb, str(said), code), name=name, daemon=True
+                target=serve, args=(theirs, name, stage, str(said), code, sent_views), name=name, daemon=True
             )
             self._process.start()
         theirs.close()
 
     def is_alive(self) -> bool:
-        """Whether its process still runs."""
+        """Return whether the process still runs."""
         return self._process.is_alive()
 
-    def take(self, job: Job) -> None:
-        """Begin a job. A process that is dead by now is noticed when its answer is awaited."""
-        self.job = job
-        self._since = time.monotonic()
-        with contextlib.suppress(OSError):
-            self.pipe.send(job)
+    def wait_until_ready(self) -> str | None:
+        """Wait until the process can take jobs; returns the digest of its code. Raises _NotStarted."""
+        digest = self._answer(START_S)
+        if isinstance(digest, Ended):
+            self.kill()
+            raise _NotStarted(digest.why)
+        self.is_ready = True
+        return digest
 
-    def hear(self) -> Ended | _Ready:
-        """How the job ended, or that the process is ready, from when on time counts."""
-        said: Ended | _Ready = self.pipe.recv()
-        if isinstance(said, _Ready):
-            self.is_ready = True
-        else:
-            self.is_quick = said.seconds < SHORT_S
-        self._since = time.monotonic()
-        return said
+    def carry_out(self, job: Job, limits: Limits) -> Ended:
+        """Run a job. A death of the process is how the job ended, and so is its time limit."""
+        with contextlib.suppress(OSError):  # a process that is dead by now does not answer either
+            self._pipe.send((job, limits.memory_mb))
+        ended: Ended = self._answer(limits.seconds)
+        if ended.state in ("crashed", "timed out"):
+            self.kill()
+        return ended
 
-    def spent_s(self) -> float:
-        """On this job."""
-        return time.monotonic() - self._since
+    def _answer(self, limit_s: float | None) -> Any:
+        """The next message, or how waiting for it ended. Time in which everything stood still does not count."""
+        began, left_s = time.monotonic(), float("inf") if limit_s is None else limit_s
+        while left_s > 0:
+            asked, waits_s = time.monotonic(), min(left_s, LOOKS_S)
+            try:
+                if self._pipe.poll(waits_s):
+                    return self._pipe.recv()
+            except (EOFError, OSError):
+                return Ended("crashed", why=self._last_words(), seconds=time.monotonic() - began, worker=self._name)
+            spent_s = time.monotonic() - asked
+            if spent_s > waits_s + STOPPED_S:
+                began, spent_s = began + spent_s - waits_s, waits_s
+            left_s -= spent_s
+        why = f"not done after {limit_s:.3g} s (--time-limit); it was at:\n{self._where_it_hangs()}"
+        return Ended("timed out", why=why, seconds=time.monotonic() - began, worker=self._name)
 
-    def forgive(self, seconds: float) -> None:
-        """Do not count time in which everything stood still."""
-        self._since += seconds
-
-    def idle_s(self) -> float:
-        """Since the last job ended."""
-        return 0.0 if self.job is not None else self.spent_s()
-
-    def left_s(self) -> float:
-        """To the time limit, endless without one; while the process starts, to the end of what that may take."""
-        if not self.is_ready:
-            return START_S - self.spent_s()
-        return float("inf") if self._limits.seconds is None else self._limits.seconds - self.spent_s()
-
-    def where_it_hangs(self) -> str:
-        """The end of the process' traceback, by its own signal handler."""
+    def _where_it_hangs(self) -> str:
+        """The end of the process' traceback, which its own signal handler writes."""
         if self._process.pid is not None and hasattr(signal, "SIGUSR1"):
             with contextlib.suppress(OSError):
                 os.kill(self._process.pid, signal.SIGUSR1)
                 time.sleep(DUMP_S)
                 return self._said.read_text()[-TRACEBACK_CHARACTERS:]
-        return "a place that it could not tell"
+        return "a place that is not known"
 
-    def last_words(self) -> str:
-        """Why the process died, as far as can be known."""
+    def _last_words(self) -> str:
+        """The cause of the process' death, as far as can be known."""
         self._process.join(timeout=1.0)
         code = self._process.exitcode
         said = self._said.read_text()[-TRACEBACK_CHARACTERS:] if self._said.exists() else ""
+        why = f"its process ended itself with code {code}"
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-            hint = ": by hand, or by the system as memory ran out" if name == "SIGKILL" else ""
-            return f"its process was ended by {name}{hint}" + (f"\n{said}" if said else "")
-        return f"its process ended itself with code {code}" + (f"\n{said}" if said else "")
+            by = ": by hand, or by the system as memory ran out" if name == "SIGKILL" else ""
+            why = f"its process was ended by {name}{by}"
+        return why + (f"\n{said}" if said else "")
 
     def strike(self) -> None:
         """Begin to end the process, without waiting for it."""
         self._process.kill()
 
-    def kill(self) -> None:
-        """End the process, whatever it does."""
-        self._process.kill()
+    def wait(self) -> None:
+        """Wait a second at most for a process that was struck."""
         self._process.join(timeout=1.0)
-        self.pipe.close()
+
+    def kill(self) -> None:
+        """End the process, whatever it does; by its own thread."""
+        self.strike()
+        self.wait()
+        self._pipe.close()
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """The environment that a process of one thread starts in; libraries read it when they are loaded."""
+def _one_thread() -> Iterator[None]:
+    """Hold the environment in which a process starts that computes in one thread; libraries read it as they load."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
@@ -320,7 +335,7 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """A process that is started here does not hear Ctrl-C, not even before it can say so itself."""
+    """Start processes that do not hear Ctrl-C, not even before they can say so themselves."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -331,72 +346,145 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(
-    pipe: Connection[Any, Any], name: str, stage: Stage, memory_mb: int | None, said: str, code: Code | None
-) -> None:
-    """Of a worker: jobs one after another until the driver closes the pipe."""
-    words = _serve_the_driver(said)
+@contextlib.contextmanager
+def _may_have_children() -> Iterator[None]:
+    """Let a dask worker under its nanny start processes, which multiprocessing refuses to daemons: these end themselves
+    when their parent is gone."""
+    config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    before = config.get("daemon")
+    config["daemon"] = False
     try:
-        if memory_mb is not None:
-            limit_memory(memory_mb)
-        if stage == "trials":
-            _load_what_trials_need()
-        # plug-ins are loaded now, so that the digest is that of what will run
-        for module in code[0] if code and stage == "trials" else ():
-            importlib.import_module(module)
-        pipe.send(_Ready(source_digest(*code) if code else None))
+        yield
+    finally:
+        config["daemon"] = before
+
+
+# ---------------------------------------------------------------- in the process
+
+
+def serve(
+    pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None, sent_views: Path | None
+) -> None:
+    """Carry out jobs one after another until the driver closes the pipe."""
+    words = _prepare(said)
+    try:
+        if stage == "trials":  # before time counts
+            import cv2
+
+            import harness.engine.trial  # noqa: F401
+            from harness.engine import setup
+
+            setup.sent_views = sent_views
+            cv2.setNumThreads(1)
+            # plug-ins are loaded now, so that the digest is that of what will run
+            for module in code[0] if code else ():
+                importlib.import_module(module)
+        pipe.send(source_digest(*code) if code else None)
     except BaseException:
         traceback.print_exc(file=words)
         words.flush()
         os._exit(1)
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(attempt(pipe.recv(), name))
+            job, memory_mb = pipe.recv()
+            limit_memory(memory_mb)
+            ended = attempt(job, name)
+            try:
+                pipe.send(ended)
+            except (TypeError, AttributeError, pickle.PicklingError) as error:
+                why = f"its result cannot be sent: {error}"
+                pipe.send(Ended("failed", why=why, is_bug=True, seconds=ended.seconds, worker=name))
 
 
-def _load_what_trials_need() -> None:
-    """Before time counts."""
-    import cv2
-
-    import harness.engine.trial  # noqa: F401
-
-    cv2.setNumThreads(1)
-
-
-def _serve_the_driver(said: str) -> IO[str]:
-    """Ctrl-C is the driver's to hear; without a driver there is nothing to do; crashes and hangs tell where."""
+def _prepare(said: str) -> IO[str]:
+    """Ignore Ctrl-C, end without a driver, and write to the file ``said`` where a crash or a hang happens."""
     import faulthandler
 
-    _die_with_the_driver()
+    if sys.platform.startswith("linux"):  # the system ends this process with its parent, whatever it does
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     words = open(said, "w")  # noqa: SIM115 (open as long as the process lives)
     faulthandler.enable(words)
     if hasattr(faulthandler, "register"):
         faulthandler.register(signal.SIGUSR1, words, all_threads=False)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    driver = os.getppid()
+
+    def end_with_the_driver() -> None:
+        while os.getppid() == driver:
+            time.sleep(LOOKS_S)
+        os._exit(1)
+
+    threading.Thread(target=end_with_the_driver, daemon=True).start()
     return words
 
 
-def _die_with_the_driver() -> None:
-    """Let the system end this process with its parent, even one that never lets Python run (Linux)."""
-    if not sys.platform.startswith("linux"):
-        return
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+def render_into_cache(
+    target_data: dict[str, Any], camera_data: dict[str, Any], render_data: dict[str, Any], folder: str
+) -> tuple[bool, float]:
+    """Render a view unless the cache holds it whole; this alone loads Mitsuba. Returns whether the view was there, and
+    the seconds that it took. Arguments are plain data."""
+    from scenes.render.cache import cached_view
+    from scenes.render.settings import RenderConfig
+    from scenes.sensor.camera import CameraConfig, camera_of
+    from scenes.target.custom import TargetConfig
+
+    target, optics = TargetConfig.from_data(target_data), camera_of(CameraConfig.from_data(camera_data)).optics
+    view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
+    return found, view.seconds
 
 
-def _end_with(driver: int) -> None:
-    """End this process soon after its parent is another than ``driver``: a killed driver cannot tell its workers."""
-    while os.getppid() == driver:
-        time.sleep(LOOKS_S)
-    os._exit(1)
-
-
-def limit_memory(memory_mb: int) -> None:
-    """Let allocations beyond so much private memory of this process fail (Linux; elsewhere nothing happens)."""
+def limit_memory(memory_mb: int | None) -> None:
+    """Let allocations beyond so much private memory of this process fail (Linux; elsewhere nothing happens). None: no
+    limit but the system's."""
     try:
         import resource
 
-        resource.setrlimit(resource.RLIMIT_DATA, (memory_mb * 1_000_000, memory_mb * 1_000_000))
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        soft = hard if memory_mb is None else memory_mb * 1_000_000
+        resource.setrlimit(resource.RLIMIT_DATA, (soft if hard < 0 else min(soft, hard), hard))
     except (ImportError, ValueError, OSError):
         pass
+
+
+class SerialEngine:
+    """One job at a time in this process, for debuggers and tests. No limits hold, and a job that hangs or kills the
+    process is not survived."""
+
+    def __init__(self) -> None:
+        self._jobs: deque[Job] = deque()
+        self._pinned = contextlib.ExitStack()
+
+    def __enter__(self) -> SerialEngine:
+        import cv2
+        from threadpoolctl import threadpool_limits
+
+        # libraries that are loaded later read the environment, those that are loaded by now are asked
+        self._pinned.enter_context(_one_thread())
+        self._pinned.enter_context(threadpool_limits(1))
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        self._pinned.callback(cv2.setNumThreads, threads)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._jobs.clear()
+        self._pinned.close()
+
+    def room(self, stage: Stage) -> int:
+        """Room for one job, whatever its stage."""
+        return 1 - len(self._jobs)
+
+    def submit(self, job: Job) -> None:
+        """Take a job; it runs in `ended`."""
+        self._jobs.append(job)
+
+    def ended(self) -> list[tuple[Job, Ended]]:
+        """Run the next job."""
+        job = self._jobs.popleft()
+        if job.stage == "renders":
+            # Mitsuba must be loaded before Open3D in one process (`scenes.render.variant`)
+            from scenes.render.variant import load_mitsuba
+
+            load_mitsuba()
+        return [(job, attempt(job, "this process"))]

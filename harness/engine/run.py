@@ -1,5 +1,5 @@
-"""Running a plan: renders feed trials, hole-free trials set thresholds, the trials that are judged use them. Whatever
-ends is in the journal; what the journal holds is not run again, nor is what only it needed rendered.
+"""The run of a plan: renders feed trials, hole-free trials set thresholds, and judged trials use these. Every end is in
+the journal; trials that the journal holds are not run again, and views that only they need are not rendered.
 """
 
 from __future__ import annotations
@@ -7,21 +7,18 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from harness.engine.calibration import Calibration
-from harness.engine.examples import examples_of
 from harness.engine.journal import Entry, Journal, record_text
-from harness.engine.map_examples import map_examples_of
-from harness.engine.outcome import Failure, Outcome, Progress
-from harness.engine.parts import Part, parts_of
-from harness.engine.plan import Group, Plan, RenderJob
-from harness.engine.rendering import render_into_cache
+from harness.engine.pictures import pictures_of
+from harness.engine.plan import PlanPart, RenderJob, SweepPlan, parts_of
+from harness.engine.processes import render_into_cache
 from harness.engine.shard import WHOLE, Shard
+from harness.engine.thresholds import Calibration, refiled
 from harness.engine.trial import TrialTask, run_trial
-from harness.engine.work import Ended, Engine, Job
+from harness.engine.work import Ended, Failure, Job, JobEngine, Outcome, Progress
 from harness.vocabulary.errors import DiskFull
 from scenes.render.cache import read_view
 
@@ -31,41 +28,44 @@ RENDER_TRIES = 2
 """A render whose process died is begun once more: two of them may have been too much for the memory. So is a trial that
 sets a threshold, since with another threshold all that was judged by it would be run again."""
 PARTS_AT_ONCE = 200
-"""That are looked up in the journal before the engine is asked again: some 0.1 s."""
+"""Parts that are looked up in the journal before the engine is asked again: some 0.1 s."""
 TOLD_WHOLE = 200
 """Failures whose traceback is kept in memory; of the others the journal has it."""
 
 
 def run_plan(
-    plan: Plan,
+    plan: SweepPlan,
     journal: Journal,
-    engine: Engine,
+    engine: JobEngine,
     report: Callable[[Progress], None],
     *,
     shard: Shard = WHOLE,
     retry_failed: bool = False,
 ) -> Outcome:
-    """Run what the journal does not hold, or of it with ``retry_failed`` what is not done. A job that does not end well
-    becomes a `Failure` and costs what needs it. Raises UserError where nothing can be written or the engine is gone;
-    KeyboardInterrupt passes through: what ended is in the journal."""
+    """Run the trials that the journal lacks, with ``retry_failed`` also those that are not done. A job that does not
+    end well becomes a `Failure` and costs the trials that need it. Raises UserError where nothing can be written or the
+    engine is gone; KeyboardInterrupt passes through: trials that ended are in the journal."""
     began = time.monotonic()
     state = _Run(plan, journal, engine, report, shard, retry_failed)
-    state.start()
-    while state.feed():
-        for job, ended in engine.ended() if state.waits else ():
-            state.take(job, ended)
-    if state.outcome.trials.over != state.outcome.trials.total:
-        raise RuntimeError(f"trials were lost: {state.outcome.trials}")
-    state.outcome.seconds = time.monotonic() - began
-    state.outcome.finished.sort()
-    state.outcome.examples = [one for number in sorted(state.examples) for one in state.examples[number]]
-    state.outcome.failures.sort(key=lambda failure: failure.what)
-    return state.outcome
+    try:
+        while state.feed():
+            for job, ended in engine.ended() if state.under_way else ():
+                state.take(job, ended)
+    finally:
+        journal.sync()
+    outcome = state.outcome
+    if outcome.trials.over != outcome.trials.total:
+        raise RuntimeError(f"trials were lost: {outcome.trials}")
+    outcome.seconds = time.monotonic() - began
+    outcome.finished.sort()
+    outcome.examples = [one for number in sorted(state.examples) for one in state.examples[number]]
+    outcome.failures.sort(key=lambda failure: failure.what)
+    return outcome
 
 
-def render_missing(jobs: Iterable[RenderJob], engine: Engine) -> list[Failure]:
-    """Have views rendered that the cache lacks or holds damaged, for pictures of trials that are done. Returns what
-    could not be."""
+def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
+    """Have views rendered that the cache lacks or holds damaged, for pictures of trials that are done. Returns a
+    failure for each that could not be."""
     distinct = {job.path: job for job in jobs}
     waiting = deque(_render_job(job) for job in distinct.values() if read_view(job.path) is None)
     under_way, failures = 0, []
@@ -87,146 +87,131 @@ def _render_job(job: RenderJob) -> Job:
 
 @dataclass(frozen=True)
 class _Trial:
-    part: Part
+    part: PlanPart
     key: str
     task: TrialTask
 
 
-@dataclass
-class _Views:
-    """Which renders are wanted, there, or lost."""
-
-    jobs: dict[Path, RenderJob] = field(default_factory=dict)
-    there: set[Path] = field(default_factory=set)
-    lost: dict[Path, str] = field(default_factory=dict)
-    users: Counter[Path] = field(default_factory=Counter)
-    """Parts that are not over, and pictures: a view without any is not rendered."""
-    wanted: deque[Path] = field(default_factory=deque)
-    later: deque[Path] = field(default_factory=deque)
-    """Will be wanted once thresholds are set; rendered when nothing is wanted now."""
-    asked: set[Path] = field(default_factory=set)
-    tries: dict[Path, int] = field(default_factory=dict)
-
-    def want(self, renders: Iterable[RenderJob]) -> set[Path]:
-        """Ask for renders; returns those that are still missing."""
-        paths = [job.path for job in renders]
-        for path in paths:
-            if path not in self.asked:
-                self.asked.add(path)
-                self.wanted.append(path)
-        return {path for path in paths if path not in self.there}
-
-    def next(self) -> Path | None:
-        """The next to render."""
-        if self.wanted:
-            return self.wanted.popleft()
-        while self.later:
-            path = self.later.popleft()
-            if path not in self.asked and self.users[path]:
-                self.asked.add(path)
-                return path
-        return None
-
-
 class _Run:
-    """The state of one run: what may be begun, what waits for what, and what came of it."""
+    """The state of a run: the trials and renders that may begin, what they wait for, and how they ended."""
 
     def __init__(
         self,
-        plan: Plan,
+        plan: SweepPlan,
         journal: Journal,
-        engine: Engine,
+        engine: JobEngine,
         report: Callable[[Progress], None],
         shard: Shard,
         retry_failed: bool,
     ) -> None:
         self.outcome = Outcome()
+        self.examples: dict[int, list[Any]] = {}
+        """Pictures by group."""
+        self.under_way: dict[str, _Trial | RenderJob | int] = {}
+        """Jobs by name; a number is that of a group whose pictures are made."""
         self._groups = plan.groups
         self._journal, self._engine, self._report = journal, engine, report
         self._shard, self._retry_failed = shard, retry_failed
         self._first, self._then = parts_of(plan, shard)
         self._calibrations = [Calibration(group) for group in plan.groups]
-        self._views = _Views(
-            {job.path: job for parts in (*self._first, *self._then) for p in parts for job in p.renders}
-        )
-        self._views.users.update(path for parts in (*self._first, *self._then) for p in parts for path in p.paths)
-        self._to_open: deque[Part] = deque()
+        self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
+        """Thresholds, by group, that agree with those in use, at which other shards have judged."""
+        self._tried: Counter[str] = Counter()
+        """Number of times that the process of a render or of a calibrating trial died."""
+        self._to_open: deque[PlanPart] = deque()
         self._queue: deque[_Trial] = deque()
-        self._waiting: dict[Path, list[Part]] = {}
-        self._pictures: deque[int] = deque()
-        """Groups whose trials are over and whose pictures are not begun."""
-        self._prefetched: set[int] = set()
-        """Groups whose judged views are asked for."""
-        self._tried: set[str] = set()
-        """Calibrations whose process died once."""
         self._ahead = 0
         """Trials that are open and not begun."""
-        self.examples: dict[int, list[Any]] = {}
-        """By group."""
-        self._under_way: dict[str, _Trial | RenderJob | int] = {}
-        """By name of the job; a number is that of a group whose pictures are made."""
-        self.outcome.renders.total = len(self._views.jobs)
-        self.outcome.trials.total = sum(part.count for parts in (*self._first, *self._then) for part in parts)
+        self._waiting: dict[Path, list[PlanPart]] = {}
+        """Parts by the views that they wait for."""
+        self._pictures: deque[int] = deque()
+        """Groups whose trials are over and whose pictures are not begun."""
+        parts = [part for found in (*self._first, *self._then) for part in found]
+        self._renders = {job.path: job for part in parts for job in part.batch.renders}
+        self._users: Counter[Path] = Counter(path for part in parts for path in part.paths)
+        """Parts that are not over, and pictures, by view: a view without any is not rendered."""
+        self._there: set[Path] = set()
+        self._lost: dict[Path, str] = {}
+        self._asked: set[Path] = set()
+        """Views that were wanted so far; those still to be rendered are ``_wanted``."""
+        self._wanted: deque[Path] = deque()
+        self._later: deque[Path] = deque()
+        """Views that will be wanted once thresholds are set; rendered when nothing is wanted now."""
+        self._prefetched: set[int] = set()
+        """Groups whose judged views are among ``_later``."""
+        self.outcome.renders.total = len(self._renders)
+        self.outcome.trials.total = sum(part.count for part in parts)
+        for number, first in enumerate(self._first):
+            if first:
+                self._to_open += shard.rotated(first)
+            elif self._then[number]:  # needs no calibration
+                self._calibrated(number)
 
     # ---------------------------------------------------------------- what begins
 
-    def start(self) -> None:
-        """All calibrations may begin; groups that need none are judged at once."""
-        for number, parts in enumerate(self._first):
-            if parts:
-                self._to_open += self._shard.rotated(parts)
-            elif self._then[number]:
-                self._calibrated(number)
-
-    @property
-    def waits(self) -> bool:
-        """Whether the engine has something to do."""
-        return bool(self._under_way)
-
     def feed(self) -> bool:
-        """Hand the engine what it has room for, and look a few more parts up. False where nothing is left to do."""
+        """Hand the engine jobs while it has room, and look a few more parts up. False where nothing is left to do."""
         for _ in range(PARTS_AT_ONCE):
             if not self._to_open or self._ahead >= AHEAD:
                 break
             self._open(self._to_open.popleft())
-        while self._engine.room("renders") > 0 and (path := self._views.next()) is not None:
-            job = self._views.jobs[path]
-            self._submit(_render_job(job), job)
+        while self._engine.room("renders") > 0 and (path := self._next_render()) is not None:
+            self._submit(_render_job(self._renders[path]), self._renders[path])
         while self._engine.room("trials") > 0 and (self._queue or self._pictures_ready()):
             self._submit_trial() if self._queue else self._submit_pictures()
         self._report(Progress(self.outcome.renders, self.outcome.trials))
-        return bool(self._under_way or self._to_open or self._queue)
+        return bool(self.under_way or self._to_open or self._queue)
 
     def _submit(self, job: Job, work: _Trial | RenderJob | int) -> None:
-        self._under_way[job.name] = work
+        self.under_way[job.name] = work
         self._engine.submit(job)
 
     def _submit_trial(self) -> None:
         trial = self._queue.popleft()
         self._ahead -= 1
-        # another shard with the same folder may have run a calibration meanwhile
-        if not self._shard.is_whole and trial.part.sets_threshold and self._found(trial.part, trial.key):
-            self._trial_over(trial)
-            return
+        if not self._shard.is_whole and trial.part.sets_threshold:
+            # another shard with the same folder may have run it meanwhile
+            self._journal.refresh()
+            if self._found(trial.part, trial.key):
+                self._trial_over(trial)
+                return
         self._submit(Job(trial.key, "trials", trial_as_text, (trial.task,), trial.part.paths), trial)
 
+    def _next_render(self) -> Path | None:
+        if self._wanted:
+            return self._wanted.popleft()
+        while self._later:
+            path = self._later.popleft()
+            if path not in self._asked and self._users[path]:
+                self._asked.add(path)
+                return path
+        return None
+
+    def _want(self, paths: Iterable[Path]) -> set[Path]:
+        """Ask for renders; returns those that are still missing."""
+        for path in paths:
+            if path not in self._asked:
+                self._asked.add(path)
+                self._wanted.append(path)
+        return {path for path in paths if path not in self._there}
+
     def _pictures_ready(self) -> bool:
-        """Whether the views of the first group that waits for its pictures are there; lost ones are given up."""
+        """Return whether the views of the first group that waits for its pictures are there; lost ones are given up."""
         while self._pictures:
             paths = [job.path for job in self._groups[self._pictures[0]].damaged.renders]
-            if not any(path in self._views.lost for path in paths):
-                return all(path in self._views.there for path in paths)
+            if not any(path in self._lost for path in paths):
+                return all(path in self._there for path in paths)
             self._pictures.popleft()
         return False
 
     def _submit_pictures(self) -> None:
         number = self._pictures.popleft()
         group = self._groups[number]
-        arguments = (group, self.outcome.thresholds)
         needs = tuple(job.path for job in group.damaged.renders)
+        arguments = (group, self.outcome.thresholds)
         self._submit(Job(f"pictures of set-up {number}", "trials", pictures_of, arguments, needs), number)
 
-    def _open(self, part: Part) -> None:
+    def _open(self, part: PlanPart) -> None:
         """Take from the journal what it holds of a part, and queue the rest once its views are there."""
         missing = [trial for trial in self._trials(part) if not self._found(part, trial.key)]
         part.left = len(missing)
@@ -235,30 +220,39 @@ class _Run:
             return
         if part.sets_threshold and part.group not in self._prefetched:
             self._prefetched.add(part.group)
-            self._views.later += [path for later in self._then[part.group] for path in later.paths]
-        absent = self._views.want(part.renders)
-        lost = [self._views.lost[path] for path in absent if path in self._views.lost]
+            self._later += [path for later in self._then[part.group] for path in later.paths]
+        absent = self._want(part.paths)
+        lost = [self._lost[path] for path in absent if path in self._lost]
         if lost:
             self._skip(missing, lost[0])
-        elif absent:
+            return
+        self._ahead += len(missing)
+        if absent:
             part.absent, part.trials = absent, missing
-            self._ahead += len(missing)
             for path in absent:
                 self._waiting.setdefault(path, []).append(part)
         else:
             self._queue += missing
-            self._ahead += len(missing)
 
-    def _trials(self, part: Part) -> Iterator[_Trial]:
+    def _trials(self, part: PlanPart) -> list[_Trial]:
+        """The trials of a part; judged ones that others judged at agreeing thresholds are filed under their keys."""
         group = self._groups[part.group]
-        found = [
-            _Trial(part, key, task) for key, task in group.trials(part.batch, self.outcome.thresholds, part.repeats)
-        ]
+        made = group.trials(part.batch, self.outcome.thresholds, part.repeats)
+        found = [_Trial(part, key, task) for key, task in made]
         self.outcome.trials.total += len(found) - part.count
-        yield from self._shard.rotated(found) if part.sets_threshold else found
+        if part.sets_threshold:
+            return self._shard.rotated(found)
+        for thresholds in self._others[part.group]:
+            elsewhere = group.trials(part.batch, thresholds, part.repeats)
+            for trial, (key, judged) in zip(found, elsewhere, strict=True):
+                if self._journal.state(trial.key) != "done" and self._journal.state(key) == "done":
+                    entry = self._journal.read(key)
+                    if entry is not None:
+                        self._journal.write(trial.key, refiled(entry, judged, trial.task))
+        return found
 
-    def _found(self, part: Part, key: str) -> bool:
-        """Whether the journal says how a trial ended, and nothing asks for another try."""
+    def _found(self, part: PlanPart, key: str) -> bool:
+        """Return whether the journal says how a trial ended, and nothing asks for another try."""
         entry = self._journal.read(key)
         if entry is None or entry.state == "skipped" or (self._retry_failed and entry.state != "done"):
             return False
@@ -272,8 +266,8 @@ class _Run:
     # ---------------------------------------------------------------- what ended
 
     def take(self, job: Job, ended: Ended) -> None:
-        """A job has ended, one way or another."""
-        work = self._under_way.pop(job.name)
+        """Take in how a job ended."""
+        work = self.under_way.pop(job.name)
         if ended.ends_all:
             raise DiskFull(ended.why)
         if isinstance(work, RenderJob):
@@ -283,8 +277,7 @@ class _Run:
                 self.examples[work] = ended.value
             else:
                 self.outcome.failures.append(Failure(job.name, ended.why, ended.is_bug, ended.state))
-        elif ended.state == "crashed" and work.part.sets_threshold and work.key not in self._tried:
-            self._tried.add(work.key)
+        elif work.part.sets_threshold and self._may_try_again(work.key, ended):
             self._queue.append(work)
             self._ahead += 1
         else:
@@ -299,7 +292,11 @@ class _Run:
                 self._failed(work.key, entry)
             self._trial_over(work)
 
-    def _done(self, part: Part, key: str, entry: Entry) -> None:
+    def _may_try_again(self, name: str, ended: Ended) -> bool:
+        self._tried[name] += ended.state == "crashed"
+        return ended.state == "crashed" and self._tried[name] < RENDER_TRIES
+
+    def _done(self, part: PlanPart, key: str, entry: Entry) -> None:
         self.outcome.finished.append(key)
         if part.sets_threshold and entry.record is not None:
             self._calibrations[part.group].add(key, entry.record["runs"])
@@ -317,30 +314,25 @@ class _Run:
             counts.found += was_there
             counts.done += not was_there
             counts.seconds += 0.0 if was_there else seconds
-            self._views.there.add(path)
+            self._there.add(path)
             for part in self._waiting.pop(path, ()):
-                self._view_there(part, path)
-            return
-        self._views.tries[path] = self._views.tries.get(path, 0) + 1
-        if ended.state == "crashed" and self._views.tries[path] < RENDER_TRIES:
-            self._views.wanted.appendleft(path)
-            return
-        counts.failed += 1
-        self.outcome.failures.append(Failure(f"render {path.stem}", ended.why, ended.is_bug, ended.state))
-        self._views.lost[path] = self.outcome.failures[-1].in_short
-        for part in self._waiting.pop(path, ()):
-            trials, part.trials = part.trials, []
-            self._ahead -= len(trials)
-            self._skip(trials, self._views.lost[path])
-
-    def _view_there(self, part: Part, path: Path) -> None:
-        part.absent.discard(path)
-        if not part.absent:
-            self._queue += part.trials
-            part.trials = []
+                part.absent.discard(path)
+                if not part.absent:
+                    self._queue += part.trials
+                    part.trials = []
+        elif self._may_try_again(path.name, ended):
+            self._wanted.appendleft(path)
+        else:
+            counts.failed += 1
+            self.outcome.failures.append(Failure(f"render {path.stem}", ended.why, ended.is_bug, ended.state))
+            self._lost[path] = self.outcome.failures[-1].in_short
+            for part in self._waiting.pop(path, ()):
+                trials, part.trials = part.trials, []
+                self._ahead -= len(trials)
+                self._skip(trials, self._lost[path])
 
     def _skip(self, trials: list[Any], why: str) -> None:
-        """Trials that cannot be begun; they are tried again by the next run."""
+        """Give up trials that cannot be begun; the next run tries them again."""
         for trial in trials:
             entry = Entry("skipped", why=why)
             self._journal.write(trial.key, entry)
@@ -352,49 +344,48 @@ class _Run:
         if trial.part.left == 0:
             self._part_over(trial.part)
 
-    def _part_over(self, part: Part) -> None:
-        """After the parts that set thresholds the judged ones may begin; after those there are pictures to make."""
+    def _part_over(self, part: PlanPart) -> None:
+        """Begin what waited for a part: judged parts for those that set thresholds, pictures for the judged ones."""
         for path in part.paths:
-            self._views.users[path] -= 1
-            if not self._views.users[path] and path not in self._views.asked:
+            self._users[path] -= 1
+            if not self._users[path] and path not in self._asked:
                 self.outcome.renders.total -= 1  # nobody needs it
         part.is_over = True
         group = self._groups[part.group]
         if part.sets_threshold:
             if all(one.is_over for one in self._first[part.group]):
                 self._calibrated(part.group)
-        elif self._shard.is_whole and not group.is_study and all(one.is_over for one in self._then[part.group]):
-            self._want_pictures(part.group)
+            return
+        is_over = all(one.is_over for one in self._then[part.group])
+        is_judged = any(point.digest in self.outcome.thresholds for point in group.points)
+        if self._shard.is_whole and not group.is_study and is_over and is_judged:
+            paths = [job.path for job in group.damaged.renders]
+            for path in paths:
+                self.outcome.renders.total += not self._users[path] and path not in self._asked
+                self._users[path] += 1
+            self._want(paths)
+            self._pictures.append(part.group)
 
     def _calibrated(self, number: int) -> None:
-        """Each point's threshold; then what is judged by it may begin."""
-        thresholds, failures = self._calibrations[number].thresholds()
+        """Set each point's threshold; then the trials that are judged by it may begin."""
+        calibration = self._calibrations[number]
+        thresholds, failures = calibration.thresholds()
+        if not self._shard.is_whole:
+            self._journal.refresh()
+        thresholds, *self._others[number] = calibration.sets(thresholds, self._journal)
+        calibration.store(thresholds, self._journal)
         self.outcome.thresholds |= thresholds
         self.outcome.failures += failures
         if thresholds:
             self._to_open += self._then[number]
             return
-        group = self._groups[number]
         for part in self._then[number]:
-            unjudged = [_Trial(part, *one) for one in group.trials(part.batch, None, part.repeats)]
+            trials: Iterator[tuple[str, TrialTask]] = self._groups[number].trials(part.batch, None, part.repeats)
+            unjudged = [_Trial(part, *one) for one in trials]
             part.left = len(unjudged)
             self._skip(unjudged, f"no threshold: {failures[0].in_short}")
-
-    def _want_pictures(self, number: int) -> None:
-        group = self._groups[number]
-        if any(point.digest in self.outcome.thresholds for point in group.points):
-            for job in group.damaged.renders:
-                self.outcome.renders.total += not self._views.users[job.path] and job.path not in self._views.asked
-                self._views.users[job.path] += 1
-            self._views.want(group.damaged.renders)
-            self._pictures.append(number)
 
 
 def trial_as_text(task: TrialTask) -> str:
     """A trial's record as the journal keeps it; made where the trial runs, as it takes a millisecond."""
     return record_text(run_trial(task))
-
-
-def pictures_of(group: Group, thresholds: dict[str, float]) -> list[Any]:
-    """The example clouds of a group, or of its maps."""
-    return list(examples_of(group, thresholds) if group.poses is None else map_examples_of(group, thresholds))

@@ -1,17 +1,21 @@
-"""A simulated set-up as a trial needs it: the view, the camera's unit, and which pixels see which part of the truth.
+"""A simulated set-up as a trial needs it, and a cloud with the truth on its own grid: one view's average, or a map.
 
 The truth stays on this side: a detector is handed clouds only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numba
 import numpy as np
 
+from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
 from harness.vocabulary.units import MM
@@ -104,7 +108,7 @@ class SetUp:
 
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
-        """By damage how far behind the face the central rays through it end, along the optical axis: the median of
+        """Depth by damage at which the central rays through it end behind the face, along the optical axis: median of
         those that come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the
         backing."""
         depth_m = (self.seen_z_m - self.face_z_m).ravel()
@@ -186,7 +190,7 @@ def load_set_up(ref: SetUpRef) -> SetUp:
 
 
 sent_views: Path | None = None
-"""Of a process that does not see the driver's cache: the folder where views that were sent lie under their names."""
+"""The folder, in a process that does not see the driver's cache, where views that were sent lie under their names."""
 
 
 def _stored_view(path: str) -> NoiseFreeView:
@@ -195,3 +199,188 @@ def _stored_view(path: str) -> NoiseFreeView:
     if view is None:
         raise UserError(f"{path}: the stored render is missing or damaged", fix="run the same command again")
     return view
+
+
+@dataclass(frozen=True)
+class KnownCloud:
+    """A cloud and where the truth lies in it.
+
+    ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true. ``outlines``: by damage the flat indices of the
+    pixels (cells, points) that see into it, at least one. ``places_m`` (h, w, 2): where each lies on the face in plan,
+    NaN off the board. ``undamaged`` (h, w) bool: face well away from damage and rim. ``seen_depth_m``: by damage, how
+    far behind the face a view of it ends.
+    """
+
+    cloud: Cloud
+    T_board_cloud: np.ndarray
+    target: TargetConfig
+    truth: tuple[Damage, ...]
+    outlines: Mapping[int, np.ndarray]
+    places_m: np.ndarray
+    undamaged: np.ndarray
+    seen_depth_m: Mapping[int, float]
+
+    def on_board(self, centres_m: np.ndarray) -> np.ndarray:
+        """(m, 2) places on the face of findings whose centres (m, 3) are given in the cloud's frame: where the line of
+        known through a centre meets the face.
+
+        The centre itself lies at depth, up to a centimetre aside of where a viewer would point on the face. On a
+        map the line of sight is its z axis.
+        """
+        board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
+        if self.cloud.projection == "parallel":
+            direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
+        else:
+            direction = board - self.T_board_cloud[:3, 3]
+        return met_on_face(board, direction, face_of(self.target.board))[:, :2]
+
+    def centre_in_cloud_m(self, damage: Damage) -> np.ndarray:
+        """(3,) true centre of a damage on the face, in the cloud's frame."""
+        return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
+
+    def area_m2(self, pixels: np.ndarray) -> float:
+        """The face's area in plan that the pixels (h, w) bool cover, tilt and perspective included; of a cloud without
+        a grid the whole face's, in the share of its points."""
+        there = pixels & np.isfinite(self.places_m[..., 0])
+        if not self.cloud.organised:
+            size = self.target.board
+            return size.width_mm * size.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
+        areas = pixel_areas(self.places_m)
+        each = areas[there]
+        known = np.isfinite(each)
+        if not known.all():
+            # at the outline a neighbour is off the board: such a pixel is taken for one like the others
+            every = areas[np.isfinite(areas)]
+            each = np.where(known, each, np.median(every) if every.size else 0.0)
+        return float(each.sum())
+
+
+def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
+    """One view's average with the truth along each pixel's central ray."""
+    # where the camera is so far that nothing undamaged is left beside the damage, a hole-free board but for its rim
+    undamaged = set_up.bare if hole_free and not set_up.intact.any() else set_up.intact
+    return KnownCloud(
+        cloud=cloud,
+        T_board_cloud=invert(set_up.T_camera_board),
+        target=set_up.target,
+        truth=set_up.truth,
+        outlines=set_up.outlines,
+        places_m=set_up.board_xy_m,
+        undamaged=undamaged,
+        seen_depth_m=set_up.seen_depth_m,
+    )
+
+
+def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> KnownCloud:
+    """A map of several views, ``first`` being the reference view's set-up: the truth by each point's own place.
+
+    A point deep in a hole that was seen at an angle lies beside the place on the face where it was looked for; on the
+    target's scale that is within the margin round the damage.
+    """
+    T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
+    place = board_places_m(cloud, T_board_cloud)
+    margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
+    size = first.target.board
+    half = np.array([size.width_mm, size.height_mm]) / 2 * MM - margin_m
+    with np.errstate(invalid="ignore"):
+        bare = (np.abs(place) < half).all(axis=-1)
+    outlines, intact = {}, bare.copy()
+    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+    for damage in first.truth:
+        apart_m2 = (x - damage.centre_board_m[0]) ** 2 + (y - damage.centre_board_m[1]) ** 2
+        with np.errstate(invalid="ignore"):
+            intact &= apart_m2 > (damage.diameter_m / 2 + margin_m) ** 2
+            within = np.flatnonzero(apart_m2.ravel() < (damage.diameter_m / 2) ** 2)
+        outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(apart_m2))])
+    return KnownCloud(
+        cloud=cloud,
+        T_board_cloud=T_board_cloud,
+        target=first.target,
+        truth=first.truth,
+        outlines=outlines,
+        places_m=place,
+        undamaged=bare if hole_free and not intact.any() else intact,
+        seen_depth_m=first.seen_depth_m,
+    )
+
+
+def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
+    """(h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid knows."""
+    points = cloud.points_m
+    if cloud.projection == "parallel":
+        x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
+        z = float(np.nanmedian(points[..., 2]))
+        grid = np.stack([*np.meshgrid(x, y), np.full(cloud.valid.shape, z)], axis=-1)
+        points = np.where(cloud.valid[..., None], points, grid)
+    return np.asarray(transform_points(T_board_cloud, points)[..., :2])
+
+
+def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
+    """(p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along the
+    board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
+    from scipy.spatial import cKDTree
+
+    points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
+    # the undamaged face only: what lies behind a rim is nearest to no place on the face
+    points = points[np.abs(points[:, 2]) < 50 * MM]
+    if not len(points):
+        return np.full(len(places_m), np.nan)
+    tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
+    distance, nearest = tree.query(places_m)
+    spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
+    face = face_of(known.target.board)
+    error = face.height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
+    return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
+
+
+def _ticks(places: np.ndarray) -> np.ndarray:
+    """(w,) equally spaced co-ordinates of the columns of (h, w) places, those of empty columns filled in."""
+    known = np.flatnonzero(np.isfinite(places).any(axis=0))
+    ticks = np.nanmedian(places[:, known], axis=0)
+    step, first = np.polyfit(known, ticks, 1) if len(known) > 1 else (0.0, float(ticks[0]))
+    filled = first + step * np.arange(places.shape[1])
+    filled[known] = ticks
+    return np.asarray(filled)
+
+
+PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
+
+
+@numba.njit(**PLAIN)
+def highest_within(places_m: np.ndarray, score: np.ndarray, centres_m: np.ndarray, radius_m: float) -> np.ndarray:
+    """(n,) the highest of the finite scores (h, w) within a radius of each centre (n, 2); NaN where there is none.
+
+    ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere.
+    """
+    highest = np.full(len(centres_m), np.nan)
+    for r in range(score.shape[0]):
+        for c in range(score.shape[1]):
+            if not np.isfinite(score[r, c]):
+                continue
+            for n in range(len(centres_m)):
+                dx = places_m[r, c, 0] - centres_m[n, 0]
+                if not abs(dx) <= radius_m:
+                    continue
+                dy = places_m[r, c, 1] - centres_m[n, 1]
+                if np.sqrt(dx * dx + dy * dy) <= radius_m and not score[r, c] <= highest[n]:
+                    highest[n] = score[r, c]
+    return highest
+
+
+@numba.njit(**PLAIN)
+def pixel_areas(places_m: np.ndarray) -> np.ndarray:
+    """(h, w) area that each pixel covers of the plane on which the pixels lie at ``places_m`` (h, w, 2): of the
+    parallelogram of the central differences, at the grid's edge of the one-sided ones. NaN beside a pixel that lies
+    nowhere; h and w are 2 at least."""
+    h, w = places_m.shape[:2]
+    areas = np.empty((h, w))
+    for r in range(h):
+        up, down = max(r - 1, 0), min(r + 1, h - 1)
+        for c in range(w):
+            left, right = max(c - 1, 0), min(c + 1, w - 1)
+            ax = (places_m[r, right, 0] - places_m[r, left, 0]) / (right - left)
+            ay = (places_m[r, right, 1] - places_m[r, left, 1]) / (right - left)
+            bx = (places_m[down, c, 0] - places_m[up, c, 0]) / (down - up)
+            by = (places_m[down, c, 1] - places_m[up, c, 1]) / (down - up)
+            areas[r, c] = abs(ax * by - ay * bx)
+    return areas

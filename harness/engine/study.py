@@ -13,15 +13,14 @@ from typing import Any, cast
 import numpy as np
 
 from harness.engine.console import progress_display
+from harness.engine.costs import learn
 from harness.engine.journal import Journal
-from harness.engine.lock import locked
-from harness.engine.opening import EngineOptions, engine_of
-from harness.engine.outcome import Outcome
-from harness.engine.plan import Plan, plan_of
-from harness.engine.rates import learn
+from harness.engine.options import EngineOptions, engine_of
+from harness.engine.plan import SweepPlan, plan_of
 from harness.engine.run import render_missing, run_plan
+from harness.engine.shard import locked
 from harness.engine.tables import origin_of, summaries, tables_of, write_tables
-from harness.engine.work import STATES, Engine
+from harness.engine.work import STATES, JobEngine, Outcome
 from harness.experiment.load import resolved_yaml
 from harness.experiment.points import Experiment
 from harness.experiment.schema import SimulatedSource
@@ -44,9 +43,9 @@ from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView
 
 MOST_FAILURES = 200
-"""That are told one by one; the journal has all."""
+"""Failures that are listed; the journal has all."""
 MOST_VIEWS = 64
-"""Of which the render's own noise is told: evenly taken from all, 4 MB each."""
+"""Views whose render noise is measured: evenly taken from all, 4 MB each."""
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
@@ -103,7 +102,7 @@ def _refuse_newer(folder: Path) -> None:
 
 
 def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
-    """Of all finished trials, in order of their keys; read again, so that a large study need not fit into memory."""
+    """Records of all finished trials, in order of their keys; read as they are needed, to save memory."""
     for key in outcome.finished:
         entry = journal.read(key)
         if entry is None or entry.record is None:
@@ -117,14 +116,14 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
 def _write_study(
     folder: Path,
     experiment: Experiment,
-    plan: Plan,
+    plan: SweepPlan,
     outcome: Outcome,
     tables: ResultTables,
     provenance: dict[str, Any],
-    engine: Engine,
+    engine: JobEngine,
 ) -> list[str | Grid]:
     """Write a study's record, tables and report. Returns what a terminal shows of it."""
-    from harness.engine.study_examples import shown_in, study_examples
+    from harness.engine.pictures import shown_in, study_example
     from harness.engine.study_record import failed_by_point, record_of
     from harness.evaluation.study.record import record_text
     from harness.evaluation.study.result import evaluate_study
@@ -137,11 +136,11 @@ def _write_study(
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     write_text(folder / STUDY.name, record_text(study))
     result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
-    shown = shown_in(plan, result.limits)
+    shown = list(shown_in(plan, result.limits))
     # of trials that were run on other machines the views may not be here
     lost = render_missing((job for one in shown for job in one.batch.renders), engine)
     outcome.failures += lost
-    examples = study_examples([] if lost else shown, outcome.thresholds)
+    examples = [study_example(one, outcome.thresholds) for one in shown if not lost]
     title = experiment.config.title or experiment.config.name
     for table, rows in study_tables(result).items():
         write_table(folder, table, table.frame(rows), origin_of(provenance))
@@ -161,7 +160,7 @@ def _cache(out: Path) -> Path:
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
-    """Where every trial was refused that is the user's to mend; a bug keeps its traceback (once) and gives 1."""
+    """Conclude a run without any result: the user's mistake is raised; a bug keeps its traceback (once) and gives 1."""
     name, detector = experiment.config.name, experiment.config.detector.name
     bug = next((failure for failure in outcome.failures if failure.is_bug), None)
     if bug is None:
@@ -179,24 +178,29 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
 
 
 def _reasons(outcome: Outcome) -> str:
-    """What went wrong, without what was skipped because of it."""
+    """The causes of failures, without the trials that were skipped because of them."""
     own = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
     return "; ".join(sorted(own)[:3]) or "nothing was planned"
 
 
 def _counted(outcome: Outcome) -> str:
-    """How many did not end well, by state; empty where all did."""
+    """The number of failures by state, as text; empty where all ended well."""
     return ", ".join(f"{count} {state}" for state, count in _counts(outcome).items())
 
 
 def _counts(outcome: Outcome) -> dict[str, int]:
-    """Of failures by state, those that there are."""
+    """The number of failures by state."""
     found = {state: sum(failure.state == state for failure in outcome.failures) for state in STATES}
     return {state: count for state, count in found.items() if count}
 
 
 def _provenance(
-    experiment: Experiment, plan: Plan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any], started: str
+    experiment: Experiment,
+    plan: SweepPlan,
+    outcome: Outcome,
+    tables: ResultTables,
+    origin: dict[str, Any],
+    started: str,
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
     views = _views_of_set_ups(plan)
@@ -226,7 +230,7 @@ def _provenance(
     }
 
 
-def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
+def _views_of_set_ups(plan: SweepPlan) -> list[NoiseFreeView]:
     """The damaged views of all set-ups, variations left out."""
     set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
     jobs = [job for group in set_ups or plan.groups[:1] for job in group.damaged.renders]
@@ -235,7 +239,7 @@ def _views_of_set_ups(plan: Plan) -> list[NoiseFreeView]:
 
 
 def _indirect_noise_mm(views: list[NoiseFreeView]) -> dict[str, float]:
-    """What the render leaves of Monte Carlo noise: the median over each surface's pixels, the worst over set-ups."""
+    """Monte Carlo noise of the renders: the median over each surface's pixels, the worst over set-ups."""
     noise: dict[str, float] = {}
     for view in views:
         for index, name in enumerate(view.surface_names):
@@ -275,7 +279,7 @@ def _tell_failures(outcome: Outcome) -> None:
 
 
 def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> int:
-    """What a shard did, and what comes next."""
+    """Print the work of a shard, and the next step."""
     trials = outcome.trials
     print(f"shard {options.shard}: {trials.done} trials done, {trials.found} found, {trials.failed} not ended well")
     _tell_failures(outcome)

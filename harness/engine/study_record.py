@@ -1,4 +1,4 @@
-"""From a study's tables to its record: every inspection of every set-up, and what names targets and frames."""
+"""A study's record, made from its tables: every inspection of every set-up, and what names targets and frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from harness.engine.plan import PACKAGES, Batch, Group, Plan
+from harness.engine.plan import PACKAGES, Batch, Group, SweepPlan
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.points import Experiment, Point, detector_version
 from harness.tables.trials import ResultTables
@@ -19,7 +19,11 @@ SIMULATION = ("scenes.sensor.source",)
 
 
 def record_of(
-    experiment: Experiment, plan: Plan, tables: ResultTables, failed: Mapping[str, int], provenance: Mapping[str, Any]
+    experiment: Experiment,
+    plan: SweepPlan,
+    tables: ResultTables,
+    failed: Mapping[str, int],
+    provenance: Mapping[str, Any],
 ) -> StudyRecord:
     """The record of a study. ``failed``: trials that raised, by point digest. Set-ups no trial of which ended are left
     out, as nothing can be said of them."""
@@ -107,7 +111,7 @@ def _inspected(holes: pd.DataFrame) -> Inspected:
 
 def _targets_digest(batches: Sequence[Batch]) -> str:
     """Names the damage and the size of every damaged board, wherever and before whichever camera it stands."""
-    boards = [batch.views[0].set_up.target for batch in batches if batch.role == "damaged"]
+    boards = [batch.set_ups[0].target for batch in batches if batch.role == "damaged"]
     return digest([[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards])
 
 
@@ -119,8 +123,8 @@ def _frames_digest(point: Point, group: Group) -> str:
     return digest([code, *renders, point.frames_key, config.capture.to_data(), config.repeats])
 
 
-def failed_by_point(plan: Plan, whats: Iterable[str], thresholds: Mapping[str, float]) -> dict[str, int]:
-    """How many trials of each point raised, from the journal keys of failures."""
+def failed_by_point(plan: SweepPlan, whats: Iterable[str], thresholds: Mapping[str, float]) -> dict[str, int]:
+    """Count the trials of each point that raised, from the journal keys of failures."""
     keys = set(whats)
     counts: dict[str, int] = {}
     if not keys:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,11 @@ RECORDED = {"holes": TRIALS, "runs": RUNS, "noise": NOISE, "registrations": REGI
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
 OF_STUDY = {table.name: table for table in STUDY_ONLY}
 
-ROWS_AT_ONCE = 20_000
-"""Rows that are held as mappings, some 30 MB, before they become a frame."""
+ROWS_AT_ONCE = 2000
+"""Rows that are held as mappings, some 3 MB, before they become a frame."""
+UNKNOWN = np.iinfo(np.int32).min
+"""Stands among whole numbers for a value that is not known."""
+PIXELS_AT_ONCE = 64
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> ResultTables:
@@ -54,7 +58,9 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> R
     collected = {name: _Rows() for name in (*RECORDED, *OF_STUDY)}
     probes: list[dict[str, Any]] = []
     for record in records:
-        probes.extend(record.get("probes", ()))
+        for row in record.get("probes", ()):
+            errors = np.array([UNKNOWN if value is None else value for value in row["error_tenth_um"]], np.int32)
+            probes.append({**row, "error_tenth_um": errors})
         for name, rows in collected.items():
             rows.add(record.get(name, ()))
     paths = list(experiment.points[0].axes)
@@ -91,13 +97,18 @@ class _Rows:
             self._flush()
 
     def table(self) -> pd.DataFrame:
-        """All rows."""
+        """All rows; nothing is left here."""
         self._flush()
-        return pd.concat(self._frames, ignore_index=True) if len(self._frames) > 1 else self._frames[0]
+        frames, self._frames = self._frames, []
+        return pd.concat(frames, ignore_index=True) if len(frames) > 1 else frames[0]
 
     def _flush(self) -> None:
         if self._rows or not self._frames:
-            self._frames.append(pd.DataFrame(_one_a_threshold(self._rows)))
+            frame = pd.DataFrame(_one_a_threshold(self._rows))
+            for column in [name for name in frame.columns if frame[name].dtype == object]:
+                # each word once: every record brings its own copy
+                frame[column] = [sys.intern(value) if type(value) is str else value for value in frame[column]]
+            self._frames.append(frame)
         self._rows = []
 
 
@@ -130,21 +141,24 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
         grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])
     tables = []
     for (variant, frames), errors in grouped.items():
-        mm = np.array(errors, dtype=float) * 1e-7 / MM
-        displacement = _displacements(mm)
-        mm = mm - displacement[:, None]
-        with np.errstate(invalid="ignore"):
-            std = mm.std(axis=0, ddof=1) if len(mm) > 1 else np.full(mm.shape[1], np.nan)
+        tenth_um = np.array(errors)
+        displacement = _displacements(tenth_um)
+        mean, std = np.empty((2, tenth_um.shape[1]))
+        for pixels in np.array_split(np.arange(tenth_um.shape[1]), -(-tenth_um.shape[1] // PIXELS_AT_ONCE) or 1):
+            mm = _in_mm(tenth_um[:, pixels]) - displacement[:, None]
+            mean[pixels] = mm.mean(axis=0)
+            with np.errstate(invalid="ignore"):
+                std[pixels] = mm.std(axis=0, ddof=1) if len(mm) > 1 else np.nan
         tables.append(
             pd.DataFrame(
                 {
                     "variant": variant,
                     "frames": frames,
-                    "pixel": np.arange(mm.shape[1]),
-                    "mean_error_mm": mm.mean(axis=0),
+                    "pixel": np.arange(tenth_um.shape[1]),
+                    "mean_error_mm": mean,
                     "temporal_std_mm": std,
-                    "displacement_std_mm": displacement.std(ddof=1) if len(mm) > 1 else np.nan,
-                    "repeats": len(mm),
+                    "displacement_std_mm": displacement.std(ddof=1) if len(displacement) > 1 else np.nan,
+                    "repeats": len(displacement),
                 }
             )
         )
@@ -152,18 +166,24 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
 
 
-def _displacements(errors_mm: np.ndarray) -> np.ndarray:
-    """(repeats,): each repeat's median error over the probes, less the median repeat's; 0 where none is known."""
-    known = np.isfinite(errors_mm).any(axis=1)
-    medians = np.zeros(len(errors_mm))
+def _in_mm(tenth_um: np.ndarray) -> np.ndarray:
+    """Errors in mm; NaN where they are not known."""
+    return np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
+
+
+def _displacements(tenth_um: np.ndarray) -> np.ndarray:
+    """(repeats,) mm: each repeat's median error over the probes, less the median repeat's; 0 where none is known."""
+    known = (tenth_um != UNKNOWN).any(axis=1)
+    medians = np.zeros(len(tenth_um))
+    for repeat in np.flatnonzero(known):
+        medians[repeat] = np.nanmedian(_in_mm(tenth_um[repeat]))
     if known.any():
-        medians[known] = np.nanmedian(errors_mm[known], axis=1)
         medians[known] -= np.median(medians[known])
     return medians
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """Changes of each set-up and variation, the reasons for them, and places on the axes."""
+    """The changes of each set-up and variation, their reasons, and their places on the axes."""
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:

@@ -4,8 +4,9 @@ against the truth."""
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
@@ -13,19 +14,17 @@ import numpy as np
 from detectors.average import AverageConfig
 from detectors.mapping.settings import MappingConfig
 from harness.engine.averages import averages_of
-from harness.engine.board_noise import board_noise_rows
-from harness.engine.boards import STUDY_TABLES, Judged, study_rows
-from harness.engine.judge import judge
+from harness.engine.judge import STUDY_TABLES, PointRows, judge, study_rows
 from harness.engine.maps import MapMaker
-from harness.engine.setup import SetUp, SetUpRef, load_set_up
-from harness.engine.sight import Sight, face_errors_m, sight_of_view
+from harness.engine.setup import KnownCloud, SetUp, SetUpRef, face_errors_m, known_view, load_set_up
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.seeds import canonical_json
+from harness.vocabulary.units import MM
 from scenes.perspectives import AnyViews
 from scenes.sensor.source import SimulatedCapture
 
 Role = Literal["calibration", "hole_free", "damaged"]
-"""What a trial's target is for. Only in a study do boards that set a threshold ("calibration") differ from those on
+"""The purpose of a trial's target. Only in a study do boards that set a threshold ("calibration") differ from those on
 which false calls are counted at it ("hole_free")."""
 Record = dict[str, list[dict[str, Any]]]
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
@@ -33,7 +32,7 @@ TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 
 @dataclass(frozen=True)
 class PointTask:
-    """What one point of the experiment asks of a trial. ``threshold`` is None while it is being calibrated."""
+    """The demands of a point on a trial. ``threshold`` is None while it is being calibrated."""
 
     digest: str
     variant: str
@@ -74,7 +73,7 @@ def run_trial(task: TrialTask) -> Record:
             record["probes"] += list(_probe_rows(set_ups[0], clouds[0], task.repeat, variants))
             pair = capture_of(set_ups[0], 0, task, 2)
             record["noise"] += list(board_noise_rows(set_ups[0], clouds[0], pair, task.repeat, variants))
-        judged = _Judged(task, set_ups, clouds)
+        judged = _PointJudge(task, set_ups, clouds)
         for point in points:
             for name, rows in judged.rows(point, seconds_frames).items():
                 record[name] += rows
@@ -99,19 +98,19 @@ def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> Simu
 
 
 def board_labels(task: TrialTask) -> tuple[str | int, ...]:
-    """What tells the random streams of a study's boards apart."""
+    """Labels that separate the random streams of a study's boards."""
     return () if task.board is None else ("board", task.board)
 
 
-class _Judged:
-    """What the points of a trial make of its clouds; points that come to the same share the work."""
+class _PointJudge:
+    """The rows of a trial's points, from its clouds; points that come to the same share the work."""
 
     def __init__(self, task: TrialTask, set_ups: Sequence[SetUp], clouds: Sequence[dict[int, Cloud]]) -> None:
         self._task = task
         self._hole_free = task.role != "damaged"
         self._set_ups = set_ups
         self._clouds = clouds
-        self._done: dict[str, Judged] = {}
+        self._done: dict[str, PointRows] = {}
         self._maps = None
         if task.poses is not None:
             labels = (task.role, task.repeat, *board_labels(task))
@@ -146,28 +145,28 @@ class _Judged:
             "probes": [] if judged.errors is None else [{**common, "error_tenth_um": judged.errors}],
         }
 
-    def _judged(self, point: PointTask) -> Judged:
+    def _judged(self, point: PointTask) -> PointRows:
         if self._maps is None or point.mapping is None:
-            sight = sight_of_view(self._set_ups[0], self._clouds[0][point.frames], hole_free=self._hole_free)
-            return self._judge(sight, point)
+            known = known_view(self._set_ups[0], self._clouds[0][point.frames], hole_free=self._hole_free)
+            return self._judge(known, point)
         asked = [point.detector, point.settings_json, point.threshold, point.radius_m]
         key = canonical_json([self._maps.key(point.mapping, point.frames), *asked])
         if key not in self._done:
-            sight = self._maps.sight(point.mapping, point.frames)
-            errors = self._map_errors(sight) if self._hole_free and self._task.board is None else None
-            self._done[key] = replace(self._judge(sight, point), errors=errors)
+            known = self._maps.known(point.mapping, point.frames)
+            errors = self._map_errors(known) if self._hole_free and self._task.board is None else None
+            self._done[key] = replace(self._judge(known, point), errors=errors)
         return self._done[key]
 
-    def _judge(self, sight: Sight, point: PointTask) -> Judged:
+    def _judge(self, known: KnownCloud, point: PointTask) -> PointRows:
         settings, limit = point.settings_json, point.threshold
-        judgement = judge(sight, point.detector, settings, limit, point.radius_m, hole_free=self._hole_free)
+        judged_cloud = judge(known, point.detector, settings, limit, point.radius_m, hole_free=self._hole_free)
         if self._task.board is None:
-            return Judged(judgement.run, judgement.holes)
-        return study_rows(sight, judgement, point.radius_m, hole_free=self._hole_free)
+            return PointRows(judged_cloud.run, judged_cloud.holes)
+        return study_rows(known, judged_cloud, point.radius_m, hole_free=self._hole_free)
 
-    def _map_errors(self, sight: Sight) -> list[int | None]:
+    def _map_errors(self, known: KnownCloud) -> list[int | None]:
         first = self._set_ups[0]
-        return _tenth_um(face_errors_m(sight, first.board_xy_m.reshape(-1, 2)[first.probes]))
+        return _tenth_um(face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes]))
 
 
 def _by_average(points: Sequence[PointTask]) -> Iterator[tuple[AverageConfig, list[PointTask]]]:
@@ -190,3 +189,62 @@ def _probe_rows(
 def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
     """Errors as whole tenths of a micrometre, for records that stay small."""
     return [round(float(error) * 1e7) if np.isfinite(error) else None for error in errors_m]
+
+
+LAGS = (1, 2, 3)
+"""Distances in pixels at which the noise's correlation is taken."""
+FEWEST_PAIRS = 50
+"""Pairs of pixels below which a correlation is not told: its standard error would exceed 0.14."""
+
+
+def board_noise_rows(
+    set_up: SetUp, clouds: Mapping[int, Cloud], capture: SimulatedCapture, repeat: int, variants: set[tuple[str, int]]
+) -> Iterator[dict[str, Any]]:
+    """Rows, one for each (variant, number of frames), of what one camera makes of an undamaged board: pitch of its
+    pixels, share that is valid, temporal noise and its grain.
+
+    Temporal noise comes from the difference of a capture's first two frames, from which everything that frames share
+    is gone: scene, multipath, fixed pattern, rounding that does not change. A displacement of a whole frame is taken
+    out with the difference's median.
+
+    ``valid_share``: of the board's pixels, after averaging so many frames. ``single_frame_mm``: standard deviation over
+    pixels of one frame's temporal noise of z. ``correlation_u<k>``, ``correlation_v<k>``: of that noise with itself k
+    columns or rows on. ``pitch_u_mm``, ``pitch_v_mm``: median distance on the board between neighbouring pixels.
+    """
+    pair = [frame.z_m for frame in islice(capture.frames(), 2)]
+    noise = pair_noise(pair[0], pair[1], set_up.bare) if len(pair) == 2 else pair_noise(pair[0], pair[0], set_up.bare)
+    pitch = set_up.pitch_mm
+    for variant, frames in sorted(variants):
+        yield {
+            "variant": variant,
+            "frames": frames,
+            "repeat": repeat,
+            "valid_share": float(clouds[frames].valid[set_up.on_board].mean()),
+            "pitch_u_mm": pitch[0],
+            "pitch_v_mm": pitch[1],
+            **noise,
+        }
+
+
+def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray) -> dict[str, float]:
+    """Standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w), metres.
+
+    Pixels count that are in ``where`` (h, w) and valid in both frames; NaN where there are too few.
+    """
+    difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
+    there = where & np.isfinite(difference)
+    if there.sum() < FEWEST_PAIRS:
+        return {"single_frame_mm": np.nan} | {f"correlation_{way}{lag}": np.nan for way in "uv" for lag in LAGS}
+    noise = np.where(there, difference - np.median(difference[there]), 0.0)
+    found = {"single_frame_mm": float(np.sqrt((noise[there] ** 2).mean())) / MM}
+    for way, turned, mask in (("u", noise, there), ("v", noise.T, there.T)):
+        found |= {f"correlation_{way}{lag}": _correlation(turned, mask, lag) for lag in LAGS}
+    return found
+
+
+def _correlation(noise: np.ndarray, there: np.ndarray, lag: int) -> float:
+    """Correlation of pixels with those ``lag`` columns on, over pairs that are both there."""
+    both = there[:, :-lag] & there[:, lag:]
+    a, b = noise[:, :-lag][both], noise[:, lag:][both]
+    power = np.sqrt((a @ a) * (b @ b))
+    return float(a @ b / power) if len(a) >= FEWEST_PAIRS and power > 0 else float("nan")

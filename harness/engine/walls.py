@@ -1,4 +1,4 @@
-"""What of each hole's wall no view sees in light: from the poses of an experiment's views alone."""
+"""The shares of each hole's wall that no view sees in light, from the poses of an experiment's views alone."""
 
 from __future__ import annotations
 

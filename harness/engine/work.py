@@ -10,15 +10,18 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 from harness.vocabulary.errors import DiskFull, UserError
 
+if TYPE_CHECKING:
+    from harness.report.examples import ExampleCloud, MappedExample
+
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
-"""How a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by the time limit;
-skipped: it was never begun, because what it needs is not there."""
+"""The ways in which a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by
+the time limit; skipped: it was never begun, because what it needs is not there."""
 STATES: tuple[State, ...] = get_args(State)
 Stage = Literal["renders", "trials"]
 """Renders load Mitsuba and some 2 GB; everything else runs where trials run."""
@@ -27,7 +30,7 @@ Code = tuple[tuple[str, ...], tuple[str, ...]]
 """Modules and packages that decide the numbers of a stage: the arguments of `source_digest`."""
 
 TRACEBACK_CHARACTERS = 4000
-"""Of a traceback, its end."""
+"""The end of a traceback that is kept."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a job ended. ``why``: of a user's mistake its message, of a bug (``is_bug``) the end of its traceback.
+    """The end of a job. ``why``: of a user's mistake its message, of a bug (``is_bug``) the end of its traceback.
     ``seconds``: of the work itself; ``peak_mb``: resident memory at most, 0 where unknown; ``worker``: who did it.
     ``ends_all``: the disk is full, so that no other job can end better."""
 
@@ -64,10 +67,10 @@ class Ended:
         raise RuntimeError(f"{self.state}: {self.why}") if self.is_bug else UserError(f"{self.state}: {self.why}")
 
 
-class Engine(Protocol):
-    """What runs jobs. Used as a context: left by an exception it drops what is under way, within two seconds."""
+class JobEngine(Protocol):
+    """An engine that runs jobs. Used as a context: left by an exception it drops its jobs within two seconds."""
 
-    def __enter__(self) -> Engine:
+    def __enter__(self) -> JobEngine:
         """Start."""
         ...
 
@@ -76,7 +79,7 @@ class Engine(Protocol):
         ...
 
     def room(self, stage: Stage) -> int:
-        """How many more jobs of a stage can be of use to it now: its queue stays short, whatever the plan's size."""
+        """Number of further jobs of a stage that it can use now: its queue stays short, whatever the plan's size."""
         ...
 
     def submit(self, job: Job) -> None:
@@ -89,8 +92,64 @@ class Engine(Protocol):
 
 
 @dataclass(frozen=True)
+class Failure:
+    """A trial, a render or a threshold that did not end well. ``state`` as in `State`; ``why``: a message, or of a bug
+    the end of its traceback."""
+
+    what: str
+    why: str
+    is_bug: bool = False
+    state: State = "failed"
+
+    @property
+    def in_short(self) -> str:
+        """One line: of a bug the last of its traceback, otherwise the first of the message."""
+        lines = self.why.strip().splitlines() or [self.state]
+        return lines[-1] if self.is_bug else lines[0]
+
+
+@dataclass
+class StageCounts:
+    """Counts of renders or trials: ``done`` in this run, ``found`` finished before it, ``failed`` in any way (also
+    in an earlier run), of ``total`` wanted. ``seconds``: work of all workers on those done now."""
+
+    done: int = 0
+    found: int = 0
+    failed: int = 0
+    total: int = 0
+    seconds: float = 0.0
+
+    @property
+    def over(self) -> int:
+        """All that need no more work."""
+        return self.done + self.found + self.failed
+
+
+@dataclass
+class Outcome:
+    """The result of a run. ``finished``: journal keys of the trials that are done; ``failures``: the rest, by name."""
+
+    finished: list[str] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    thresholds: dict[str, float] = field(default_factory=dict)
+    examples: list[ExampleCloud | MappedExample] = field(default_factory=list)
+    renders: StageCounts = field(default_factory=StageCounts)
+    trials: StageCounts = field(default_factory=StageCounts)
+    peak_mb: float = 0.0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A snapshot of how far a run is."""
+
+    renders: StageCounts
+    trials: StageCounts
+
+
+@dataclass(frozen=True)
 class Limits:
-    """What a job may take: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: as much as it likes."""
+    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: as much as it likes."""
 
     seconds: float | None = None
     memory_mb: int | None = None

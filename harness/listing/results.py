@@ -8,7 +8,6 @@ import csv
 import io
 import os
 import re
-import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,8 +26,8 @@ from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.versions import RESULTS_VERSION
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?")
-"""Name of a journal's record; those of version 3 and before end in .json."""
+ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?|[0-9]{6}-[0-9a-f]{8}\.jsonl")
+"""Files of a journal: `harness.engine.journal.SEGMENT_NAME`, and those of version 5 and before, of one trial each."""
 
 POINT_NAME = re.compile(r"point-[0-9]{3,6}")
 """Name of a folder with the findings in a real capture."""
@@ -147,12 +146,17 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 def described(path: Path) -> ResultFolder:
     """Describe what a folder of results holds; a broken folder is described as such."""
-    size = records = 0
+    from harness.engine.journal import Journal
+
+    size = 0
     for entry in files_below(path):
         with contextlib.suppress(OSError):
             file = entry.stat(follow_symlinks=False)
             size += getattr(file, "st_blocks", -(-file.st_size // 512)) * 512
-            records += ENTRY_NAME.fullmatch(entry.name) is not None and stat.S_ISREG(file.st_mode)
+    try:
+        records = len(Journal(path / "journal"))
+    except UserError:  # of a newer tofpod, or reached through a link
+        records = 0
     has_report = (path / REPORT.name).is_file()
     found = ResultFolder(path, path.parent.name, path.name, "broken", "", size, records, has_report)
     try:
@@ -201,7 +205,7 @@ def described(path: Path) -> ResultFolder:
 
 def in_use(path: Path) -> bool:
     """Return whether a sweep is at work in this folder; False where the system has no locks."""
-    from harness.engine.lock import LOCK
+    from harness.engine.shard import LOCK
 
     if not (path / LOCK).is_file():
         return False

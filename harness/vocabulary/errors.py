@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import select
 import signal
@@ -11,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 CLOSED_PIPE = 141
-"""What a shell reports of a program that SIGPIPE ended: 128 + 13."""
+"""Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13."""
 
 
 class UserError(Exception):
@@ -51,6 +52,9 @@ def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
     that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C while it ends are not heard."""
     before = _hear_interrupts_once()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")  # a terminal without the sign for "plus or minus" shows "?"
     try:
         code = program()
         sys.stdout.flush()
@@ -87,8 +91,8 @@ def _hear_interrupts_once() -> Any:
 
 
 def _nobody_reads() -> bool:
-    """Whether it is the standard output whose pipe is closed; if so, what is still to be written goes nowhere, so that
-    the interpreter does not complain when it ends."""
+    """Return whether it is the standard output whose pipe is closed; if so, what is still to be written goes nowhere,
+    so that the interpreter does not complain when it ends."""
     try:
         output = sys.stdout.fileno()
     except (OSError, ValueError):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from harness.vocabulary.errors import DiskFull, UserError
 
@@ -16,7 +18,7 @@ NOT_WRITABLE = {
     getattr(errno, name)
     for name in ("EACCES", "EPERM", "EROFS", "ENOTDIR", "EEXIST", "EISDIR", "ENOENT", "ENAMETOOLONG", "EINVAL")
 }
-"""What the system says of a place where no file can be made (ENOENT for one inside /proc)."""
+"""Errors of a place where no file can be made (ENOENT for one inside /proc)."""
 
 
 @contextmanager
@@ -33,7 +35,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
         os.close(handle)
     except OSError as error:
-        raise _explained(error, path) from error
+        raise explained(error, path) from error
     temporary = Path(name)
     try:
         yield temporary
@@ -42,7 +44,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
                 os.fsync(written.fileno())
         _move_shared(temporary, path, 0o666)
     except OSError as error:
-        raise _explained(error, path) from error
+        raise explained(error, path) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -62,12 +64,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
     except OSError as error:
-        raise _explained(error, path) from error
+        raise explained(error, path) from error
     try:
         yield temporary
         _move_shared(temporary, path, 0o777)
     except OSError as error:
-        raise _explained(error, path) from error
+        raise explained(error, path) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -109,8 +111,25 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
     write_bytes(path, content.encode(), durable=durable)
 
 
-def _explained(error: OSError, path: Path) -> Exception:
-    """The user's mistake behind an OSError of writing, or the error itself where it is none of the known ones."""
+def open_plain(path: Path, flags: int) -> IO[bytes]:
+    """Open a regular file, unbuffered where it is written: never through a link, and without waiting for a pipe.
+
+    ``flags`` as of `os.open`. Raises UserError where the path is a link, a pipe or a folder; OSError as `os.open` does.
+    """
+    odd = UserError(f"{path}: is not a regular file, so nothing is read from it or written to it", fix="remove it")
+    if path.is_symlink() or path.is_dir():
+        raise odd
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    descriptor = os.open(path, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise odd
+    writes = flags & (os.O_WRONLY | os.O_RDWR)
+    return os.fdopen(descriptor, "r+b" if writes else "rb", buffering=0 if writes else -1)
+
+
+def explained(error: OSError, path: Path) -> Exception:
+    """Return the user's mistake behind an OSError of writing, or the error itself where it is not a known one."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFull(
             f"{path}: the disk is full", fix="free some space and run the same command again; finished work is kept"

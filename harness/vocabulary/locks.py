@@ -7,30 +7,22 @@ file of somebody else's and waits for no pipe.
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Literal
 
-from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import open_plain
 
 Answer = Literal["held", "busy", "no locks"]
 """``busy``: another process holds it. ``no locks``: the system (Windows) or the file system knows none."""
 
 
 def opened_lock(path: Path) -> IO[str]:
-    """A lock file, made where there is none. Raises OSError where it cannot be opened, UserError where the path is a
-    link, a pipe or a folder."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    odd = UserError(f"{path}: is no plain file, so it cannot be a lock", fix="remove it by hand")
-    if path.is_symlink() or path.is_dir():
-        raise odd
-    descriptor = os.open(path, flags, 0o666)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise odd
-    return os.fdopen(descriptor, "a+", encoding="utf-8")
+    """Open a lock file, made where there is none. Raises OSError where it cannot be opened, UserError where the path is
+    a link, a pipe or a folder."""
+    with open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND) as file:
+        return os.fdopen(os.dup(file.fileno()), "a+", encoding="utf-8")
 
 
 def lock(file: IO[str], *, shared: bool, wait: bool) -> Answer:

@@ -1,4 +1,4 @@
-"""What can be had by name: tofpod's own, and what installed packages offer through an entry point group.
+"""Detectors, cameras and others by name: tofpod's own, and those of installed packages' entry points.
 
 Names are looked up without importing anything; only what is asked for is imported.
 """
@@ -32,7 +32,7 @@ class Offer:
 
     @property
     def built_in(self) -> bool:
-        """Whether it comes with tofpod."""
+        """Return whether it comes with tofpod."""
         return self.package == OWN
 
     @property
@@ -63,7 +63,7 @@ class PlugIns:
         return tuple(sorted({offer.name for offer in self.offers()}))
 
     def offer(self, name: str) -> Offer:
-        """What stands behind a name.
+        """Find the offer of a name.
 
         Raises UserError on an unknown name, with the nearest one, and on a name that is taken twice, with both.
         """
@@ -123,7 +123,7 @@ def _own_version() -> str:
 
 
 def _search_path() -> tuple[tuple[str, int], ...]:
-    """Where packages are looked for, and when each folder last changed: installing or removing one changes it."""
+    """The folders in which packages are looked for, with the times of their last changes: installing changes them."""
     return tuple((folder, _changed_ns(folder or os.curdir)) for folder in sys.path)
 
 

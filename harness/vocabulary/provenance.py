@@ -1,4 +1,4 @@
-"""Where a result comes from: code, versions, machine."""
+"""The origin of a result: code, versions, machine."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """What the run's times depend on; no host or user name."""
+    """Facts that a run's times depend on; no host or user name."""
     return {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
 
 
 def record(command: str) -> dict[str, Any]:
-    """What every stored result says of its origin: command, commit, dirty flag, versions, machine."""
+    """The origin that every stored result states: command, commit, dirty flag, versions, machine."""
     commit, dirty = commit_and_dirty()
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine()}

@@ -15,7 +15,7 @@ from harness.vocabulary.errors import UserError
 RESULTS_VERSION = 1
 """Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
 GENERATOR = f"tofpod results {RESULTS_VERSION}"
-"""In pages."""
+"""Stands in pages."""
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 

@@ -128,10 +128,10 @@ def stored_view(path: Path) -> NoiseFreeView | None:
             length = archive.getinfo(FACTS).file_size
             facts = json.loads(_part(archive, file, FACTS, min(length, MOST_FACTS_BYTES)))
             arrays = {name: _array(archive, file, name, facts) for name in ARRAYS}
-            told = facts.pop("checksum")
+            told, version = facts.pop("checksum"), facts["version"]
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, struct.error, zipfile.BadZipFile):
         return None  # RuntimeError: what zipfile cannot do, and JSON that is nested too deeply
-    if facts["version"] != VIEW_VERSION or told != _checksum(facts, arrays):
+    if version != VIEW_VERSION or told != _checksum(facts, arrays):
         return None
     return NoiseFreeView(
         region=_region(facts),

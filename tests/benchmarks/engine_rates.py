@@ -18,12 +18,11 @@ from clocks import Stage, StageClock, spent
 from whole_trials import OVERRIDES, STUDY, render
 
 from harness.engine.journal import Journal
-from harness.engine.outcome import Progress
-from harness.engine.plan import Plan, plan_of
+from harness.engine.plan import SweepPlan, plan_of
 from harness.engine.processes import LocalEngine
 from harness.engine.run import run_plan
 from harness.engine.trial import TrialTask, run_trial
-from harness.engine.work import Limits
+from harness.engine.work import Limits, Progress
 from harness.experiment.load import load_experiment
 
 FIRST = 8
@@ -75,7 +74,7 @@ class Rates:
     trials: int
 
 
-def run(plan: Plan, folder: Path, jobs: int) -> Rates:
+def run(plan: SweepPlan, folder: Path, jobs: int) -> Rates:
     """Run a plan whose renders are there, with a journal of its own. Raises RuntimeError where a trial failed."""
     watch = Watch()
     with LocalEngine(jobs, Limits()) as engine:
@@ -85,7 +84,7 @@ def run(plan: Plan, folder: Path, jobs: int) -> Rates:
     return watch.rates()
 
 
-def _plan(cache: Path, *overrides: str) -> Plan:
+def _plan(cache: Path, *overrides: str) -> SweepPlan:
     plan = plan_of(load_experiment(STUDY, [*OVERRIDES, *overrides]), cache)
     render(list(plan.renders))
     return plan
@@ -101,14 +100,14 @@ def overhead(folder: Path, trials: int) -> dict[str, Any]:
     clock = StageClock(time.perf_counter)
     with clock.on([Stage("journal", Journal, "write")]):
         rates = run(plan, journal, 1)
-    files = [path for _, path in Journal(journal).entries()]
-    resumed, _ = spent(lambda: [Journal(journal).read(path.stem) for path in files])
-    size = sum(path.stat().st_size for path in files)
+    stored = Journal(journal)
+    resumed, keys = spent(lambda: [key for key in stored.trials() if stored.read(key) is not None])
+    size = sum(stored.size(key) for key in keys)
     return asdict(rates) | {
         "overhead_ms": rates.wall_ms - rates.own_ms,
-        "journal_ms": 1e3 * clock.seconds["journal"] / len(files),
-        "record_bytes": size / len(files),
-        "read_ms": 1e3 * resumed / len(files),
+        "journal_ms": 1e3 * clock.seconds["journal"] / len(keys),
+        "record_bytes": size / len(keys),
+        "read_ms": 1e3 * resumed / len(keys),
     }
 
 

@@ -25,11 +25,11 @@ from cluster_processes import Processes, processes, square, until
 
 from harness.engine.cluster import ClusterEngine
 from harness.engine.journal import Entry, Journal
-from harness.engine.outcome import Outcome, Progress
-from harness.engine.plan import Plan, plan_of
+from harness.engine.options import code_of
+from harness.engine.plan import SweepPlan, plan_of
 from harness.engine.run import run_plan
 from harness.engine.tables import tables_of
-from harness.engine.work import Job, Limits
+from harness.engine.work import Job, Limits, Outcome, Progress
 from harness.experiment.load import load_experiment
 
 CHEAP = """\
@@ -83,7 +83,7 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     experiment = load_experiment(home / "cheap.yaml")
     plan = plan_of(experiment, home / "cache")
     journal = Journal(home / "journal")
-    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers) as engine:
+    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"])) as engine:
         until(lambda: engine.worker_count == workers)
         bare = bare_rate(engine)
         scheduler = psutil.Process(cluster.scheduler.pid)
@@ -144,19 +144,18 @@ def processor_s(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def sizes(plan: Plan, journal: Journal, outcome: Outcome) -> dict[str, float]:
+def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, float]:
     """Bytes of what is sent for a trial, alone and in a bundle of 32, of its answer, and of what is stored."""
     group = plan.groups[0]
     tasks = [task for _, task in group.trials(group.batches[0], {}, range(32))]
-    paths = [path for _, path in journal.entries()]
     entries = [journal.read(key) for key in outcome.finished[:100]]
     records = [entry.record for entry in entries if entry is not None]
     return {
         "bytes_of_a_task": len(pickle.dumps(tasks[0])),
         "bytes_of_a_task_in_a_bundle": round(len(pickle.dumps(tasks)) / len(tasks)),
         "bytes_of_a_record_sent": round(sum(len(pickle.dumps(record)) for record in records) / len(records)),
-        "bytes_of_a_journal_file": round(sum(path.stat().st_size for path in paths) / len(paths)),
-        "blocks_of_a_journal_file": round(sum(path.stat().st_blocks * 512 for path in paths) / len(paths)),
+        "bytes_of_a_journal_entry": round(sum(map(journal.size, outcome.finished)) / len(outcome.finished)),
+        "files_of_the_journal": len(list(journal.folder.iterdir())),
         "bytes_of_a_view": max(job.path.stat().st_size for job in plan.renders),
     }
 
@@ -169,8 +168,9 @@ def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[
     read = (time.monotonic() - began) / len(entries)
     with tempfile.TemporaryDirectory(dir=journal.folder.parent) as other:
         began = time.monotonic()
+        copied = Journal(Path(other))
         for key, entry in zip(keys, entries, strict=False):
-            Journal(Path(other)).write(key, Entry(**vars(entry)))
+            copied.write(key, Entry(**vars(entry)))
         write = (time.monotonic() - began) / len(entries)
     process = psutil.Process()
     before, began = process.memory_info().rss, time.monotonic()

@@ -21,10 +21,13 @@ from scenes.render.variant import load_mitsuba  # noqa: E402
 
 load_mitsuba()  # before anything loads Open3D
 
-from harness.engine.costs import render_cost, trial_cost  # noqa: E402
+from harness.engine.costs import (  # noqa: E402
+    Taken,
+    render_cost,
+    trial_cost,
+)
 from harness.engine.journal import record_text  # noqa: E402
 from harness.engine.plan import Batch, Group, plan_of  # noqa: E402
-from harness.engine.rates import Taken  # noqa: E402
 from harness.engine.trial import run_trial  # noqa: E402
 from harness.experiment.load import load_experiment  # noqa: E402
 from scenes.render.cache import cached_view  # noqa: E402
