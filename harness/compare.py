@@ -74,7 +74,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _refuse_where_nothing_is_paired(first: StudyRecord, second: StudyRecord) -> None:
-    from harness.evaluation.study.paired_set_ups import paired_set_ups
+    from harness.evaluation.study.verdict import paired_set_ups
 
     if any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
         return

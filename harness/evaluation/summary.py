@@ -1,4 +1,4 @@
-"""From rows per trial to rates, means and intervals: the numbers of summary.csv, the report and the final table."""
+"""Rates, means and intervals of rows per trial: the numbers of summary.csv, the report and the final table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Measure = Literal["extent", "model"]
 MAIN = "main"
 """The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
 STATES = ("found", "wrong depth", "invalid", "invisible")
-"""What the pixels of a hole tell, whatever the detector says."""
+"""States of a hole by its pixels alone, whatever the detector says."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, else as undecided."
@@ -43,7 +43,7 @@ COLUMNS = [
 
 
 class ResultTables(Protocol):
-    """What an experiment leaves: one row per trial and hole, per run, per probe pixel, per variant.
+    """Tables of an experiment: one row per trial and hole, per run, per probe pixel, per variant.
 
     ``holes``: variant, frames, repeat, hole, kind, true_*_mm, detected, extent_*_mm, model_*_mm, state (of `STATES`).
     ``runs``: variant, frames, repeat, role ("damaged" or "hole_free"), false_calls, detections, threshold,
@@ -185,7 +185,7 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """What only the model gives: depth, and the standard errors that each fit states, held against the truth."""
+    """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
     import pandas as pd
 
     fits = holes[[*GROUP, "true_diameter_mm", "model_diameter_mm", *FITTED]].copy()

@@ -9,9 +9,8 @@ import numpy as np
 
 from harness.evaluation.intervals import Interval
 from harness.evaluation.study.axes import AxisLine, Difference
-from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.limit import SetUpLimit, SizeRow
 from harness.evaluation.study.surface import PodSurface
-from harness.evaluation.study.table_one import SizeRow
 from harness.report.measures import inches
 from harness.report.study_axes_figure import AxisGroup, axis_value
 from harness.report.study_rows import (
