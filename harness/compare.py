@@ -59,9 +59,8 @@ def _level(text: str) -> float:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
-    from harness.evaluation.study.paired_set_ups import paired_set_ups
     from harness.evaluation.study.record import read_record
-    from harness.evaluation.study.verdict import compare_studies
+    from harness.evaluation.study.verdict import compare_studies, paired_set_ups
 
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):

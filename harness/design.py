@@ -12,7 +12,6 @@ from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
-    from harness.evaluation.pod.planning import HoleFree
     from harness.evaluation.study.record import SetUpRecord, StudyRecord
     from harness.report.design_rows import StudyDesign
 
@@ -28,7 +27,7 @@ MOST = 10_000
 FURTHEST = 2.0
 """Times the largest size inspected: a90 beyond it is no plan's guess."""
 LEAST_SHARE = 0.1
-"""Of a50, for the smallest size: a curve against the size itself may begin to rise below 0."""
+"""Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0."""
 REPEATED = 8
 """Targets of the repeats check: a single board of holes."""
 
@@ -68,13 +67,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--confidence", type=float, default=0.95, help="the 95 of a90/95 (default: 0.95)")
     add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
     add("--seed", type=int, default=1, help="of the simulated studies (default: 1)")
-    _add_further_questions(parser)
-    add("--json", action="store_true", help="print JSON instead of the table")
-    add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
-    return parser
-
-
-def _add_further_questions(parser: argparse.ArgumentParser) -> None:
     frames = parser.add_argument_group("how many frames to average")
     put = frames.add_argument
     put("--frames", type=int, nargs="+", metavar="N", help="carry the guess to these numbers of averaged frames")
@@ -89,9 +81,12 @@ def _add_further_questions(parser: argparse.ArgumentParser) -> None:
     put = calls.add_argument
     put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: how much has to be inspected for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
+    add("--json", action="store_true", help="print JSON instead of the table")
+    add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
+    return parser
 
 
-class _Guess(NamedTuple):
+class _GuessedCurve(NamedTuple):
     curve: PodCurve
     origin: str
     range_of_sizes: tuple[float, float]
@@ -99,21 +94,31 @@ class _Guess(NamedTuple):
     board_m2: float | None
 
 
-class _Noise(NamedTuple):
-    frames: int
-    fixed_share: float
-
-
 def _run(options: argparse.Namespace, command: str) -> int:
+    import json
+
+    from harness.report.design_rows import design_data, design_text
+    from harness.vocabulary.versions import RESULTS_VERSION
+
     _refuse_what_does_not_belong(options)
     guess = _told(options) if options.study is None else _from_study(options)
     _check(options, guess)
     design = _designed(options, guess)
-    from harness.report.design_rows import design_text
-
-    print(_json(design, command) if options.json else design_text(design))
+    told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
+    data_text = json.dumps(told, indent=2, allow_nan=False)
+    print(data_text if options.json else design_text(design))
     if options.out is not None:
-        _write(design, options.out, command)
+        from harness.report.design_figure import save_design_png
+        from harness.report.design_page import design_html
+        from harness.vocabulary.files import write_text
+
+        data, picture, page = (options.out / name for name in FILES)
+        html = design_html(design, command)
+        write_text(data, data_text + "\n")
+        save_design_png(picture, design)
+        write_text(page, html)
+        # On stdout it would be no JSON any more.
+        print(f"wrote {data}, {picture.name}, {page.name}", file=sys.stderr)
     return 0
 
 
@@ -145,14 +150,14 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
             raise UserError(f"{_flag(name)} belongs to {_flag(owner)}", fix=f"add {_flag(owner)}, or leave it out")
 
 
-def _told(options: argparse.Namespace) -> _Guess:
-    from harness.evaluation.pod.planning import curve_through
+def _told(options: argparse.Namespace) -> _GuessedCurve:
+    from harness.evaluation.pod.design import curve_through
 
     curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=options.log)
-    return _Guess(curve, "as told", tuple(options.sizes), None, None)
+    return _GuessedCurve(curve, "as told", tuple(options.sizes), None, None)
 
 
-def _from_study(options: argparse.Namespace) -> _Guess:
+def _from_study(options: argparse.Namespace) -> _GuessedCurve:
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record
 
@@ -171,13 +176,13 @@ def _from_study(options: argparse.Namespace) -> _Guess:
     if sizes != inspected and options.sizes is None:
         origin += f"; sizes beyond the {inspected[0]:.4g} to {inspected[1]:.4g} mm that it inspected"
     area = float(boards.mean()) if len(boards) else None
-    return _Guess(curve, origin, sizes, record.frames, area)
+    return _GuessedCurve(curve, origin, sizes, record.frames, area)
 
 
 def _holding_the_rise(curve: PodCurve, inspected: tuple[float, float], origin: str) -> tuple[float, float]:
     """The sizes that a study inspected, widened to the curve's whole rise where they do not hold its a50 or its a90.
 
-    Raises UserError where that is further than `FURTHEST` times the largest: there the curve is a guess of nobody's.
+    Raises UserError where that is further than `FURTHEST` times the largest: the study says nothing about it there.
     """
     from harness.evaluation.pod.design import RISE
 
@@ -185,7 +190,7 @@ def _holding_the_rise(curve: PodCurve, inspected: tuple[float, float], origin: s
     if not a50 > 0 or a90 > FURTHEST * high:
         raise UserError(
             f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm, and the study inspected {low:.4g} to "
-            f"{high:.4g} mm: it says too little about its rise",
+            f"{high:.4g} mm: it says too little about the rise of the curve",
             fix="run the study with damage of other sizes, or tell a guess: --a50 SIZE --a90 SIZE --sizes FROM TO",
         )
     if not low < a50:
@@ -211,8 +216,8 @@ def _set_up(study: StudyRecord, name: str | None) -> SetUpRecord:
     raise UserError(f"{study.name} has no set-up {name!r}" + (f"; did you mean {near!r}?" if near else ""), legal=known)
 
 
-def _check(options: argparse.Namespace, guess: _Guess) -> None:
-    """What would go wrong after minutes, or give nonsense."""
+def _check(options: argparse.Namespace, guess: _GuessedCurve) -> None:
+    """Refuse what would fail after minutes, or give nonsense."""
     low, high = guess.range_of_sizes
     a50 = guess.curve.size_at(0.5)
     # NaN compares false with everything, so every rule is written as what has to hold.
@@ -241,10 +246,6 @@ def _check(options: argparse.Namespace, guess: _Guess) -> None:
             legal=f"more than {a_pod:.4g}",
             fix="no study can be sure to demonstrate less than the truth: improve the detector, or want less",
         )
-    _check_further_questions(options, guess)
-
-
-def _check_further_questions(options: argparse.Namespace, guess: _Guess) -> None:
     if options.frames is not None:
         needed = ["white_mm", "fixed_mm", *(["guessed_with"] if guess.frames is None else [])]
         missing = [_flag(name) for name in needed if getattr(options, name) is None]
@@ -258,21 +259,31 @@ def _check_further_questions(options: argparse.Namespace, guess: _Guess) -> None
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
 
 
-def _designed(options: argparse.Namespace, guess: _Guess) -> StudyDesign:
-    from harness.evaluation.pod.design import design
-    from harness.evaluation.pod.planning import plans_by_frames, recommend
-    from harness.evaluation.pod.repeats import repeated_studies
+def _designed(options: argparse.Namespace, guess: _GuessedCurve) -> StudyDesign:
+    from harness.evaluation.pod.design import (
+        design,
+        fixed_share,
+        hole_free,
+        plans_by_frames,
+        recommend,
+        repeated_studies,
+    )
     from harness.report.design_rows import StudyDesign
 
-    noise, hole_free = _noise(options, guess), _hole_free(options, guess)  # Mistakes before the simulation's minute.
     asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
+    guessed_with = guess.frames if options.guessed_with is None else options.guessed_with
+    area = guess.board_m2 if options.board_m2 is None else options.board_m2
+    wanted = options.false_calls_per_m2
+    # Mistakes in these two come before the simulation's minute; `_check` has asked for frames and area.
+    share = fixed_share(options.white_mm, options.fixed_mm, guessed_with or 0) if options.frames else 0.0
+    free = hole_free(wanted, area or 0.0, options.confidence) if wanted is not None else None
     plans = design(guess.curve, sorted(set(options.targets)), guess.range_of_sizes, **asked)
     recommended = recommend(plans, options.goal)
-    frames = noise and plans_by_frames(
+    frames = options.frames and plans_by_frames(
         guess.curve,
         sorted(set(options.frames)),
-        guessed_with=noise.frames,
-        fixed_share=noise.fixed_share,
+        guessed_with=guessed_with or 0,
+        fixed_share=share,
         targets=recommended.plan.targets,
         range_of_sizes=guess.range_of_sizes,
         **asked,
@@ -288,59 +299,15 @@ def _designed(options: argparse.Namespace, guess: _Guess) -> StudyDesign:
         plans=plans,
         recommended=recommended,
         goal=options.goal,
-        guessed_with=noise and noise.frames,
+        guessed_with=guessed_with if options.frames else None,
         frames=frames or (),
         repeats=repeats or (),
-        hole_free=hole_free,
+        hole_free=free,
     )
-
-
-def _noise(options: argparse.Namespace, guess: _Guess) -> _Noise | None:
-    if options.frames is None:
-        return None
-    from harness.evaluation.pod.planning import fixed_share
-
-    frames = guess.frames if options.guessed_with is None else options.guessed_with
-    assert frames is not None  # `_check` has asked for it.
-    return _Noise(frames, fixed_share(options.white_mm, options.fixed_mm, frames))
-
-
-def _hole_free(options: argparse.Namespace, guess: _Guess) -> HoleFree | None:
-    if options.false_calls_per_m2 is None:
-        return None
-    from harness.evaluation.pod.planning import hole_free
-
-    area = guess.board_m2 if options.board_m2 is None else options.board_m2
-    assert area is not None  # `_check` has asked for one.
-    return hole_free(options.false_calls_per_m2, area, options.confidence)
 
 
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
-
-
-def _json(design: StudyDesign, command: str) -> str:
-    import json
-
-    from harness.report.design_rows import design_data
-    from harness.vocabulary.versions import RESULTS_VERSION
-
-    told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
-    return json.dumps(told, indent=2, allow_nan=False)
-
-
-def _write(design: StudyDesign, out: Path, command: str) -> None:
-    from harness.report.design_figure import save_design_png
-    from harness.report.design_page import design_html
-    from harness.vocabulary.files import write_text
-
-    data, picture, page = (out / name for name in FILES)
-    html = design_html(design, command)
-    write_text(data, _json(design, command) + "\n")
-    save_design_png(picture, design)
-    write_text(page, html)
-    # On stdout it would be no JSON any more.
-    print(f"wrote {data}, {picture.name}, {page.name}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -65,12 +65,22 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
+    import json
+
     _refuse_what_does_not_belong(options)
-    statement = _hits(options) if options.hit is not None else _signals(options)
-    from harness.report.pod_page import pod_text
+    statement = _stated(options)
+    from harness.report.pod_figure import save_pod_png
+    from harness.report.pod_page import pod_html, pod_text
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.versions import RESULTS_VERSION
 
     print(pod_text(statement))
-    _write(statement, options.out, command)
+    data, picture, page = (options.out / name for name in FILES)
+    told = {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
+    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
+    save_pod_png(picture, statement)
+    write_text(page, pod_html(statement, command))
+    print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
 
@@ -95,32 +105,25 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         )
 
 
-def _hits(options: argparse.Namespace) -> PodStatement:
+def _stated(options: argparse.Namespace) -> PodStatement:
     from harness.evaluation.pod.inspection_file import read_inspections, require_hits, require_positive
-    from harness.evaluation.pod.state_hits import state_hits
+    from harness.evaluation.pod.statement import state_hits, state_signals
 
-    read = read_inspections(options.file, options.size, options.hit, options.target)
-    require_hits(read)
+    of_hits = options.hit is not None
+    read = read_inspections(options.file, options.size, options.hit if of_hits else options.ahat, options.target)
+    if of_hits:
+        require_hits(read)
     if options.log:
         require_positive(read, response=False, why="--log")
-    method = (options.bound or BOUNDS[0]).replace("-", " ")
-    return state_hits(
-        read,
-        link=options.link,
-        log_size=options.log,
-        bounded=options.bounded or "none",
-        method=method,
-        unit=options.unit,
-    )
-
-
-def _signals(options: argparse.Namespace) -> PodStatement:
-    from harness.evaluation.pod.inspection_file import read_inspections, require_positive
-    from harness.evaluation.pod.state_signals import state_signals
-
-    read = read_inspections(options.file, options.size, options.ahat, options.target)
-    if options.log:
-        require_positive(read, response=False, why="--log")
+    if of_hits:
+        return state_hits(
+            read,
+            link=options.link,
+            log_size=options.log,
+            bounded=options.bounded or "none",
+            method=(options.bound or BOUNDS[0]).replace("-", " "),
+            unit=options.unit,
+        )
     if options.log_signal and options.left is None:
         require_positive(read, response=True, why="--log-signal")
     return state_signals(
@@ -132,22 +135,6 @@ def _signals(options: argparse.Namespace) -> PodStatement:
         log_signal=options.log_signal,
         unit=options.unit,
     )
-
-
-def _write(statement: PodStatement, out: Path, command: str) -> None:
-    import json
-
-    from harness.report.pod_figure import save_pod_png
-    from harness.report.pod_page import pod_html
-    from harness.vocabulary.files import write_text
-    from harness.vocabulary.versions import RESULTS_VERSION
-
-    data, picture, page = (out / name for name in FILES)
-    told = {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
-    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
-    save_pod_png(picture, statement)
-    write_text(page, pod_html(statement, command))
-    print(f"wrote {data}, {picture.name}, {page.name}")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_perspectives import MapWorld, name_of, perspectives, with_variation
 
-from harness.evaluation.map_case import LARGE_MM, map_cases
+from harness.evaluation.maps import LARGE_MM, map_cases
 from harness.evaluation.summary import summarise_holes
 from harness.thesis.views import VIEW_CLAIMS, rms_gap, score_views
 

@@ -15,11 +15,17 @@ from scipy import stats
 from harness import compare
 from harness.evaluation.pod.false_calls import threshold_for_rate
 from harness.evaluation.study.limit import limit_of
-from harness.evaluation.study.paired import hits_change, limit_change, mcnemar, shared_rows, sign_flip
-from harness.evaluation.study.paired_calls import calls_change
-from harness.evaluation.study.paired_set_ups import not_comparable, paired_set_ups
+from harness.evaluation.study.paired import calls_change, hits_change, limit_change, mcnemar, shared_rows, sign_flip
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
-from harness.evaluation.study.verdict import ALPHA, Comparison, compare_studies, fewest_boards, holm
+from harness.evaluation.study.verdict import (
+    ALPHA,
+    Comparison,
+    compare_studies,
+    fewest_boards,
+    holm,
+    not_comparable,
+    paired_set_ups,
+)
 from harness.report.compare_page import compare_html
 from harness.report.compare_rows import HEADS, cells, comparison_grid, comparison_parts
 from harness.tables.grid import text_of

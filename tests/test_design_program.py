@@ -15,12 +15,21 @@ from scipy import stats
 
 from harness.design import FILES, main
 from harness.evaluation.pod.curve import LINKS
-from harness.evaluation.pod.design import Plan, design, repeats_are_not_targets
+from harness.evaluation.pod.design import (
+    CALLS,
+    StudyPlan,
+    curve_through,
+    design,
+    fixed_share,
+    hole_free,
+    plans_by_frames,
+    recommend,
+    repeated_studies,
+    repeats_are_not_targets,
+)
 from harness.evaluation.pod.false_calls import false_call_rate, threshold_for_rate
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.evaluation.pod.likelihood_bounds import bound
-from harness.evaluation.pod.planning import CALLS, curve_through, fixed_share, hole_free, plans_by_frames, recommend
-from harness.evaluation.pod.repeats import repeated_studies
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.vocabulary.errors import UserError
@@ -86,9 +95,9 @@ def test_frames_are_studied_with_the_same_targets_and_luck() -> None:
 # ---- what is recommended ---------------------------------------------------------------------------------------------
 
 
-def plans(*told: tuple[int, str, float]) -> list[Plan]:
+def plans(*told: tuple[int, str, float]) -> list[StudyPlan]:
     """(targets, placement, 90 % quantile)."""
-    first = Plan(60, "uniform", 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0), ())
+    first = StudyPlan(60, "uniform", 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0), ())
     return [replace(first, targets=n, placement=placed, high=high) for n, placed, high in told]  # type: ignore[arg-type]
 
 

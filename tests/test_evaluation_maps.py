@@ -11,9 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_perspectives import MERGE, REGISTRATION, VIEWS, MapWorld, name_of, perspectives, with_variation
 
-from harness.evaluation.map_case import against_one, map_cases
-from harness.evaluation.maps import compare_maps, maps_of
-from harness.evaluation.paired import change_of, crossing_of, run_ratio, size_errors
+from harness.evaluation.maps import (
+    against_one,
+    change_of,
+    compare_maps,
+    crossing_of,
+    map_cases,
+    maps_of,
+    run_ratio,
+    size_errors,
+)
 from harness.evaluation.registration import by_views, of_map, paired_ratio, summarise_registrations
 from harness.evaluation.summary import summarise_holes
 

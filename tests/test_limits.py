@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import isotonic_regression
 from synthetic_tables import World, joined, tables
 
-from harness.evaluation.effects import effect_costs
-from harness.evaluation.limits import Ladder, found_limit_mm, half_size, isotonic, ladder_of
+from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, isotonic, ladder_of
 from harness.evaluation.summary import summarise_holes
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.evaluation.study.paired import hits_change
-from harness.evaluation.study.paired_swap import TIE, exchange, swap_change
+from harness.evaluation.study.paired import TIE, exchange, hits_change, swap_change
 from harness.evaluation.study.record import Inspected
 from tests.synthetic_study import SetUp, Study, study_record
 

@@ -10,9 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, stats
 
-from harness.evaluation.pod.ahat import AhatFit, ahat_band, ahat_bound, choose_axes, fit_ahat
-from harness.evaluation.pod.censored import fit_censored
-from harness.evaluation.pod.diagnostics import diagnose, residual_scores
+from harness.evaluation.pod.ahat import (
+    AhatFit,
+    ahat_band,
+    ahat_bound,
+    choose_axes,
+    diagnose,
+    fit_ahat,
+    fit_censored,
+    residual_scores,
+)
 from harness.vocabulary.errors import UserError
 
 TRUE_MU, TRUE_SIGMA = 1.8, 0.3

@@ -4,64 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.design import design, guess_with_frames, place_sizes, repeats_are_not_targets
 from harness.evaluation.pod.false_calls import (
-    false_call_probability,
-    false_call_probability_of_noise,
     false_call_rate,
     threshold_for_rate,
 )
 from harness.vocabulary.errors import UserError
 
 GUESS = PodCurve("logit", False, 10.0, 2.0, np.zeros((2, 2)))
-
-
-def test_no_false_call_on_59_sites() -> None:
-    """By hand: (1 - p)^59 = 0.05."""
-    none = false_call_probability(0, 59)
-    assert none.probability == 0
-    assert none.upper == pytest.approx(1 - 0.05 ** (1 / 59), rel=1e-12)
-    assert false_call_probability(4, 4).upper == 1.0
-
-
-@settings(max_examples=30, deadline=None)
-@given(sites=st.integers(1, 400), share=st.floats(0, 0.99), confidence=st.floats(0.6, 0.99))
-def test_upper_bound_of_the_probability_inverts_the_binomial(sites: int, share: float, confidence: float) -> None:
-    calls = int(share * sites)
-    found = false_call_probability(calls, sites, confidence)
-    assert stats.binom.cdf(calls, sites, found.upper) == pytest.approx(1 - confidence, rel=1e-8)
-
-
-def test_bound_of_the_noise_covers_by_simulation() -> None:
-    """400 samples of 25 normal values, decision at 2 deviations (PFP 2.3 %): the non-central t bound is exact, so the
-    count is binomial with 0.95; limits at alpha = 0.001, seed fixed."""
-    noise = np.random.default_rng(1).normal(3.0, 0.5, (400, 25))
-    covered = sum(false_call_probability_of_noise(one, 4.0).upper >= stats.norm.sf(2.0) for one in noise)
-    low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
-    assert low <= covered <= high
-
-
-def test_bound_of_the_noise_is_the_one_sided_tolerance_factor() -> None:
-    """Printed factor of 10 normal values, 95 % content at 95 % confidence: 2.911 (Natrella 1963, table A-7)."""
-    values = np.random.default_rng(6).normal(size=10)
-    values = (values - values.mean()) / values.std(ddof=1)
-    assert false_call_probability_of_noise(values, 2.911).upper == pytest.approx(0.05, rel=1e-3)
-
-
-def test_noise_of_a_logarithmic_signal_and_of_a_censored_one() -> None:
-    noise = np.exp(np.random.default_rng(2).normal(0.0, 0.4, 300))
-    plain = false_call_probability_of_noise(noise, 2.0, log_signal=True)
-    logs = np.log(noise)
-    assert plain.probability == pytest.approx(stats.norm.sf((np.log(2.0) - logs.mean()) / logs.std()), rel=1e-9)
-    floor = float(np.median(noise))
-    censored = false_call_probability_of_noise(np.maximum(noise, floor), 2.0, left=floor, log_signal=True)
-    assert censored.probability == pytest.approx(plain.probability, rel=0.4)
-    assert censored.upper > plain.upper, "half of the signals hold less"
 
 
 def test_rate_per_area_by_poisson() -> None:
@@ -165,10 +118,6 @@ def test_fifty_repeats_of_eight_holes_are_eight_targets() -> None:
 
 
 def test_mistakes_of_the_user() -> None:
-    with pytest.raises(UserError, match="5 false calls on 4"):
-        false_call_probability(5, 4)
-    with pytest.raises(UserError, match="three finite"):
-        false_call_probability_of_noise([1.0, np.nan, 2.0, 3.0], 2.0)
     with pytest.raises(UserError, match="area above 0"):
         false_call_rate(1, 0.0)
     with pytest.raises(UserError, match="no numbers"):

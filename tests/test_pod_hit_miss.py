@@ -13,8 +13,13 @@ from scipy import optimize, stats
 from validation.pod_coverage import coverage
 
 from harness.evaluation.pod.curve import LINKS, link_cdf, link_ppf
-from harness.evaluation.pod.floor_ceiling import Bounded, bounded_profile, bounded_value
-from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss, floor_ceiling_test
+from harness.evaluation.pod.hit_miss import (
+    bounded_profile,
+    choose_model,
+    fit_hit_miss,
+    floor_ceiling_test,
+    value_and_gradient,
+)
 from harness.evaluation.pod.likelihood import HitsAndMisses, profile
 from harness.evaluation.pod.likelihood_bounds import METHODS, band, bound, criterion
 from harness.vocabulary.errors import UserError
@@ -42,6 +47,11 @@ def simulated(targets: int, seed: int, floor: float = 0.0, ceiling: float = 1.0)
     sizes = np.linspace(0.5, 10.0, targets)
     chance = floor + (ceiling - floor) * link_cdf("logit", (sizes - 4.0) / 0.8)
     return sizes, np.random.default_rng(seed).random(targets) < chance
+
+
+def standardised(sizes: np.ndarray, hits: np.ndarray, link: str) -> HitsAndMisses:
+    design = np.column_stack([np.ones_like(sizes), (sizes - sizes.mean()) / sizes.std()])
+    return HitsAndMisses(design, hits.astype(float), 1.0 - hits, link)
 
 
 # the handbook's worked examples
@@ -257,8 +267,8 @@ def test_of_several_penalised_maxima_the_highest_is_taken(link: str, seed: int, 
     b0, b1 = fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread
     below, above = fit.data.z[~fit.hit].max(), fit.data.z[fit.hit].min()
     slopes, places = np.geomspace(0.2, 3000, 240)[:, None], np.linspace(below - 1, above + 1, 800)
-    values = fit.data.value(-slopes * places, slopes + 0 * places)
-    assert float(fit.data.value(b0, b1)) >= values.max()
+    values = fit.data.value(np.stack([-slopes * places, slopes + 0 * places], axis=-1))
+    assert float(fit.data.value(np.array([b0, b1]))) >= values.max()
 
 
 def test_quasi_complete_separation_is_separation() -> None:
@@ -285,12 +295,12 @@ def test_floor_and_ceiling_are_found_where_they_are() -> None:
 @pytest.mark.parametrize("seed", [5, 9, 13])
 def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
     sizes, hits = simulated(60, seed, floor=0.1, ceiling=0.9)
-    data = HitsAndMisses((sizes - sizes.mean()) / sizes.std(), hits, "logit")
+    data = standardised(sizes, hits, "logit")
     random = np.random.default_rng(0)
     starts = random.uniform([-5.0, 0.5, 0.0, 0.6], [5.0, 30.0, 0.4, 1.0], (60, 4))
     losses = [
         optimize.minimize(
-            lambda place: tuple(-part for part in bounded_value(data, place)),
+            lambda place: tuple(-part for part in value_and_gradient(data, place)),
             start,
             jac=True,
             method="L-BFGS-B",
@@ -320,12 +330,21 @@ def test_ceiling_of_one_adds_nothing_and_the_boundary_has_half_the_probability()
 
 def test_gradient_and_profile_of_the_bounded_likelihood() -> None:
     sizes, hits = simulated(60, seed=1, floor=0.1, ceiling=0.9)
-    data = HitsAndMisses((sizes - sizes.mean()) / sizes.std(), hits, "probit")
+    data = standardised(sizes, hits, "probit")
     place = np.array([0.3, 1.7, 0.12, 0.93])
-    numeric = optimize.approx_fprime(place, lambda at: bounded_value(data, at)[0], 1e-7)
-    assert bounded_value(data, place)[1] == pytest.approx(numeric, rel=1e-4)
-    fixed = bounded_profile(data, Bounded(0.3, 1.7, 0.0, 1.0, 0.0), "none", 0.4, 0.8)
-    assert fixed == pytest.approx(profile(data, 0.4, float(link_ppf("probit", np.array(0.8)))), abs=1e-6)
+    numeric = optimize.approx_fprime(place, lambda at: value_and_gradient(data, at)[0], 1e-7)
+    assert value_and_gradient(data, place)[1] == pytest.approx(numeric, rel=1e-4)
+    fixed = bounded_profile(data, np.array([0.3, 1.7, 0.0, 1.0]), "none", 0.4, 0.8)
+    assert fixed == pytest.approx(profile(data, 0.4, float(link_ppf("probit", np.array(0.8))))[0], abs=1e-6)
+
+
+def test_a_step_has_a_band_though_its_covariance_is_singular() -> None:
+    sizes, hits = simulated(60, seed=0, floor=0.1, ceiling=0.9)
+    fit = fit_hit_miss(sizes, hits, bounded="both")
+    assert "it is a step" in fit.notes[0]
+    at = np.linspace(1.0, 9.0, 17)
+    lower, upper = band(fit, at)
+    assert (lower <= fit.curve.pod(at)).all() and (fit.curve.pod(at) <= upper).all()
 
 
 # coverage

@@ -12,9 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.evaluation.pod.inspection_file import read_inspections
-from harness.evaluation.pod.state_hits import state_hits
-from harness.evaluation.pod.state_signals import state_signals
-from harness.evaluation.pod.statement import drawn_sizes
+from harness.evaluation.pod.statement import drawn_sizes, state_hits, state_signals
 from harness.pod import FILES, main
 from harness.vocabulary.versions import RESULTS_VERSION
 

@@ -15,10 +15,9 @@ from harness.evaluation.pod.false_calls import false_call_rate
 from harness.evaluation.study.axes import FRAMES, axis_lines, difference
 from harness.evaluation.study.chance import chance_hits
 from harness.evaluation.study.curves import free_response, pixel_curves, roc_curves
-from harness.evaluation.study.limit import SetUpLimit, limit_of
+from harness.evaluation.study.limit import SetUpLimit, limit_of, pod_at
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.surface import surface_of
-from harness.evaluation.study.table_one import pod_at
 
 LOUD = 20.0
 """False calls per square metre of a study in which chance hits are frequent enough to be counted."""

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_study import SetUp, Study, study_record
 
+from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.curve import LINKS, PodCurve
 from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss
 from harness.evaluation.pod.likelihood_bounds import bound
@@ -17,7 +18,6 @@ from harness.evaluation.study.limit import ALL_FOUND, limit_of
 from harness.evaluation.study.over_boards import (
     board_weights,
     design_effect,
-    percentiles,
     refitted_sizes,
     row_weights,
     targets_of,

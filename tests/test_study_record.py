@@ -101,7 +101,7 @@ def test_written_and_read_it_is_the_same(tmp_path):
         ((*SECOND, "frames"), 0, "`frames` should be greater than or equal to 1, not 0"),
         ((*SECOND, "frames"), 1, "set-up 'main' with frames 1 stands there twice"),
         ((*SECOND, "threshold"), None, "`threshold` should be a number, not null"),
-        ((*SECOND, "axes"), [1], "`axes` should be a mapping, not [1]"),
+        ((*SECOND, "axes"), [1], "`axes` should be a mapping, not a list"),
         (SECOND, 7, "set-up 2 should be a mapping, not 7"),
         (("set_ups",), [], "`set_ups` is empty"),
         (("set_ups",), {"a": 1}, "`set_ups` should be a list, not a mapping"),

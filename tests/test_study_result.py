@@ -11,11 +11,10 @@ import pytest
 from synthetic_study import THRESHOLD, SetUp, Study, Tables, study_record, study_tables
 
 from harness.evaluation.study.axes import difference
-from harness.evaluation.study.held import held_sentences, number, swept_sentences, varied_sentences
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.result import StudyResult, evaluate_study
-from harness.evaluation.study.validity import validity_of
+from harness.evaluation.study.validity import held_sentences, number, swept_sentences, validity_of, varied_sentences
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
 FACTS: dict[str, Any] = {

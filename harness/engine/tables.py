@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 
 from harness.engine.walls import wall_rows
-from harness.evaluation.map_case import map_cases
-from harness.evaluation.maps import compare_maps, maps_of
+from harness.evaluation.maps import compare_maps, map_cases, maps_of
 from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.registration import by_views
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of

@@ -1,1 +1,1 @@
-"""From result tables to statistics: rates with intervals, noise against frames, comparisons of set-ups."""
+"""Statistics of result tables: rates with intervals, noise against frames, comparisons of set-ups."""

@@ -28,19 +28,19 @@ class Interval:
 
     @property
     def known(self) -> bool:
-        """Whether both ends are numbers (infinity counts)."""
+        """Return whether both ends are numbers (infinity counts)."""
         return not (np.isnan(self.low) or np.isnan(self.high))
 
     def above(self, value: float) -> bool:
-        """Whether the whole interval lies above ``value``; False where unknown."""
+        """Return whether the whole interval lies above ``value``; False where unknown."""
         return bool(self.low > value)
 
     def below(self, value: float) -> bool:
-        """Whether the whole interval lies below ``value``; False where unknown."""
+        """Return whether the whole interval lies below ``value``; False where unknown."""
         return bool(self.high < value)
 
     def within(self, low: float, high: float) -> bool:
-        """Whether the whole interval lies in [low, high]; False where unknown."""
+        """Return whether the whole interval lies in [low, high]; False where unknown."""
         return bool(self.low >= low and self.high <= high)
 
 
@@ -155,9 +155,14 @@ def bootstrap(
     if n < 2:
         return UNKNOWN
     indices = np.random.default_rng(seed).integers(0, n, size=(resamples, n))
-    values = np.asarray(statistic(indices), float)
-    values = values[~np.isnan(values)]
-    if len(values) < resamples / 2:
+    return percentiles(np.asarray(statistic(indices), float), confidence)
+
+
+def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
+    """Central interval of bootstrap draws (B,); infinite ends stay. NaN draws (such as differences of two infinities)
+    are left out, and where they are more than half the interval is unknown."""
+    known = draws[~np.isnan(draws)]
+    if len(known) < 2 or len(known) < 0.5 * len(draws):
         return UNKNOWN
-    low, high = np.quantile(values, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
+    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
     return Interval(float(low), float(high))

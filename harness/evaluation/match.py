@@ -1,4 +1,4 @@
-"""Which detection is which damage: nearest centre within a stated radius, one to one; the rest are false calls."""
+"""Match detections to damage: nearest centre within a stated radius, one to one; the rest are false calls."""
 
 from __future__ import annotations
 

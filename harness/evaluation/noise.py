@@ -1,4 +1,4 @@
-"""How the error of an averaged range splits into noise, offset and pattern, and how each goes with more frames."""
+"""The error of an averaged range split into noise, offset and pattern, and each against the number of frames."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ BLOCKS = 40
 are not exchangeable; contiguous blocks far larger than the filter nearly are. 40 of them carry a quantile."""
 
 
+COLUMNS = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
+COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
+
+
 @dataclass(frozen=True)
 class FloorFit:
     """``total^2 = white^2 / N + floor^2``: one frame's white noise and what no averaging removes, in mm."""
@@ -32,7 +36,7 @@ class FloorFit:
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """What averaging does to each part of the error.
+    """Effect of averaging on each part of the error.
 
     ``slope``: exponent of the temporal noise against the number of frames (white noise: -0.5), with its interval.
     ``systematic_ratio``: systematic error (offset and pattern) of the longest over the shortest average, interval.
@@ -48,7 +52,7 @@ class NoiseLaw:
 
 
 def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
-    """One row per (variant, frames): the parts of the error over the probe pixels, in mm.
+    """Make one row per (variant, frames): the parts of the error over the probe pixels, in mm.
 
     ``temporal_rms_mm``: root mean square over pixels of the standard deviation over repeats. ``offset_mm``: mean over
     pixels of the mean error. ``pattern_mm``: standard deviation over pixels of the mean error, less the temporal
@@ -63,27 +67,24 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)
-        if not len(moments):
-            continue
-        mean = moments.mean(axis=0)
-        offset, pattern2 = mean[1], _pattern_variance(mean, len(moments))
-        systematic2 = _systematic_variance(mean, len(moments))
-        rows.append(
-            {
-                "variant": variant,
-                "frames": frames,
-                "pixels": len(moments),
-                "repeats": int(part["repeats"].median()),
-                "temporal_rms_mm": np.sqrt(mean[0]),
-                "offset_mm": offset,
-                "pattern_mm": np.sqrt(pattern2),
-                "systematic_mm": np.sqrt(systematic2),
-                "displacement_mm": float(part["displacement_std_mm"].median()),
-                "total_rms_mm": np.sqrt(mean[0] + systematic2),
-            }
-        )
-    columns = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
-    table = pd.DataFrame(rows, columns=[*columns, "systematic_mm", "displacement_mm", "total_rms_mm"])
+        if len(moments):
+            mean = moments.mean(axis=0)
+            systematic2 = _systematic_variance(mean, len(moments))
+            rows.append(
+                {
+                    "variant": variant,
+                    "frames": frames,
+                    "pixels": len(moments),
+                    "repeats": int(part["repeats"].median()),
+                    "temporal_rms_mm": np.sqrt(mean[0]),
+                    "offset_mm": mean[1],
+                    "pattern_mm": np.sqrt(_pattern_variance(mean, len(moments))),
+                    "systematic_mm": np.sqrt(systematic2),
+                    "displacement_mm": float(part["displacement_std_mm"].median()),
+                    "total_rms_mm": np.sqrt(mean[0] + systematic2),
+                }
+            )
+    table = pd.DataFrame(rows, columns=COLUMNS)
     table = table.sort_values("frames", kind="stable").sort_values("variant", kind="stable", ignore_index=True)
     first = table.groupby("variant")[["frames", "temporal_rms_mm"]].transform("first")
     table["guide_mm"] = first["temporal_rms_mm"] * np.sqrt(first["frames"] / table["frames"])
@@ -91,7 +92,7 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> FloorFit | None:
-    """Least squares of total^2 on 1/N with both parts non-negative, weighted to equal relative error.
+    """Fit least squares of total^2 on 1/N with both parts non-negative, weighted to equal relative error.
 
     None below two different numbers of frames (the two parts cannot be told apart).
     """
@@ -108,7 +109,7 @@ def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] 
 
 
 def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
-    """The exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals.
+    """Fit the exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals.
 
     Uses the pixels that have a value at every number of frames. None where fewer than two numbers of frames or pixels
     are left, or where the temporal noise is zero.
@@ -117,7 +118,11 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     frames = np.array(sorted(rows["frames"].unique()), float)
     if len(frames) < 2:
         return None
-    stacked = _common_moments(rows, frames)
+    usable = rows[np.isfinite(rows["mean_error_mm"]) & np.isfinite(rows["temporal_std_mm"])]
+    present = usable.groupby("pixel")["frames"].nunique()
+    common = present.index[present == len(frames)].sort_values()
+    parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
+    stacked = np.stack([_moments(part) for part in parts], axis=1)  # (pixels, frames, 4), pixels that have all
     if stacked.shape[0] < 2 or not (stacked[..., 0].mean(axis=0) > 0).all():
         return None
     blocks = min(BLOCKS, stacked.shape[0])
@@ -145,15 +150,6 @@ def _moments(part: pd.DataFrame) -> np.ndarray:
     error, variance = part["mean_error_mm"].to_numpy(float), part["temporal_std_mm"].to_numpy(float) ** 2
     moments = np.stack([variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1)
     return moments[np.isfinite(moments).all(axis=1)]
-
-
-def _common_moments(rows: pd.DataFrame, frames: np.ndarray) -> np.ndarray:
-    """(pixels, frames, 4): `_moments` of the pixels that have all of them, in the table's order of pixels."""
-    usable = rows[np.isfinite(rows["mean_error_mm"]) & np.isfinite(rows["temporal_std_mm"])]
-    present = usable.groupby("pixel")["frames"].nunique()
-    common = present.index[present == len(frames)].sort_values()
-    parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
-    return np.stack([_moments(part) for part in parts], axis=1)
 
 
 def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:

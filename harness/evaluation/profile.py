@@ -35,7 +35,7 @@ class HoleInView:
 
 
 class AveragedCloud(Protocol):
-    """What the shape needs of an example: residual and truth on one pixel grid (h, w)."""
+    """The part of an example that the shape needs: residual and truth on one pixel grid (h, w)."""
 
     @property
     def residual_mm(self) -> np.ndarray: ...

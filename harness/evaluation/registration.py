@@ -1,4 +1,4 @@
-"""How well views were registered: errors by method against the truth and against what the method itself predicts.
+"""Errors of registrations of views by method against the truth and against what the method itself predicts.
 
 The target registration error (Fitzpatrick, West and Maurer 1998) is that of places on the board, not of the marks.
 Repeats vary the noise and the error of the nominal pose; the poses, the board and the camera stay the same.
@@ -24,21 +24,24 @@ MOST_REASONS = 3
 
 
 def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
-    """The registrations that a map of so many views rests on.
+    """Select the registrations that a map of so many views rests on.
 
     A method that registers each view by itself gives the same for any number of views, so that a row may stand under
     another number: those of exactly ``views`` come first, else those of the nearest.
     """
+    import pandas as pd
+
     rows = registrations[(registrations["method"] == method) & (registrations["view"] < views)]
     if VIEWS not in rows:
         return rows
-    apart = _numbers(rows[VIEWS]).sub(views).abs()
+    # "all views" counts as more than any number.
+    apart = pd.to_numeric(rows[VIEWS], errors="coerce").fillna(np.inf).sub(views).abs()
     order = rows.assign(_apart=apart).sort_values("_apart", kind="stable")
     return order.drop_duplicates([*UNIT, "view"]).drop(columns="_apart").sort_index()
 
 
 def summarise_registrations(registrations: pd.DataFrame, by: Sequence[str] = ("method", "frames")) -> pd.DataFrame:
-    """One row per group, in order of appearance: how many, how many failed, and the errors of those that did not.
+    """Make one row per group, in order of appearance: numbers, failures, and the errors of those that did not fail.
 
     ``n``, ``failed`` with ``failed_share`` and Wilson's ``failed_low``/``failed_high``, ``reasons`` (the commonest);
     for both `PARTS`: ``<part>_median_mm``, ``_q90_mm``, ``_rms_mm``, ``_predicted_mm`` (root mean square of what the
@@ -50,14 +53,12 @@ def summarise_registrations(registrations: pd.DataFrame, by: Sequence[str] = ("m
 
     if registrations.empty:
         return pd.DataFrame(columns=[*by, "n", "failed"])
-    rows = []
-    for key, part in registrations.groupby(list(by), sort=False):
-        rows.append(dict(zip(by, key, strict=True)) | _summary(part))
-    return pd.DataFrame(rows)
+    groups = registrations.groupby(list(by), sort=False)
+    return pd.DataFrame([dict(zip(by, key, strict=True)) | _summary(part) for key, part in groups])
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
-    """`summarise_registrations` by method and frames for each number of views, which the column ``views`` tells."""
+    """Summarise registrations by method and frames for each number of views, which the column ``views`` tells."""
     import pandas as pd
 
     parts = []
@@ -70,7 +71,7 @@ def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame
 
 
 def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
-    """Those that did not fail."""
+    """Select those that did not fail."""
     return registrations[registrations["failure"] == ""]
 
 
@@ -112,27 +113,21 @@ def _summary(part: pd.DataFrame) -> dict[str, Any]:
     for name in ("seconds", "iterations", "overlap", "pairs", "marks"):
         row[name] = float(part[name].astype(float).median())
     for name in PARTS:
-        row |= {f"{name}_{key}": value for key, value in _errors(good, name).items()}
+        actual, predicted = (good[f"{kind}_{name}_mm"].astype(float) for kind in ("tre", "predicted"))
+        actual, predicted = (errors.where(np.isfinite(errors)) for errors in (actual, predicted))
+        known = actual.notna() & predicted.notna()
+        both = _rms(actual[known]), _rms(predicted[known])
+        ends = bootstrap_ratio(good[known], name)
+        row |= {
+            f"{name}_median_mm": float(actual.median()),
+            f"{name}_q90_mm": float(actual.quantile(0.9)),
+            f"{name}_rms_mm": _rms(actual.dropna()),
+            f"{name}_predicted_mm": both[1],
+            f"{name}_ratio": both[0] / both[1] if both[1] > 0 else np.nan,
+            f"{name}_ratio_low": ends[0],
+            f"{name}_ratio_high": ends[1],
+        }
     return row
-
-
-def _errors(good: pd.DataFrame, part: str) -> dict[str, float]:
-    """Spread of one part of the error, and how it compares with its prediction where there is one."""
-    actual = good[f"tre_{part}_mm"].to_numpy(float)
-    predicted = good[f"predicted_{part}_mm"].to_numpy(float)
-    known = np.isfinite(predicted) & np.isfinite(actual)
-    interval, ratio = bootstrap_ratio(good[known], part), np.nan
-    if known.any() and (predicted[known] > 0).any():
-        ratio = _rms(actual[known]) / _rms(predicted[known])
-    return {
-        "median_mm": float(np.nanmedian(actual)) if np.isfinite(actual).any() else np.nan,
-        "q90_mm": float(np.nanquantile(actual, 0.9)) if np.isfinite(actual).any() else np.nan,
-        "rms_mm": _rms(actual[np.isfinite(actual)]),
-        "predicted_mm": _rms(predicted[known]),
-        "ratio": ratio,
-        "ratio_low": interval[0],
-        "ratio_high": interval[1],
-    }
 
 
 def bootstrap_ratio(rows: pd.DataFrame, part: str) -> tuple[float, float]:
@@ -151,12 +146,5 @@ def bootstrap_ratio(rows: pd.DataFrame, part: str) -> tuple[float, float]:
     return interval.low, interval.high
 
 
-def _rms(values: np.ndarray) -> float:
+def _rms(values: pd.Series) -> float:
     return float(np.sqrt((values**2).mean())) if len(values) else np.nan
-
-
-def _numbers(column: pd.Series) -> pd.Series:
-    """An axis' values as numbers; "all views" counts as more than any."""
-    import pandas as pd
-
-    return pd.to_numeric(column, errors="coerce").fillna(np.inf)

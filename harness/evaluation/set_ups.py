@@ -1,12 +1,22 @@
-"""Set-ups of one experiment side by side: what each finds, how well it measures, and what its camera gives it."""
+"""Set-ups of one experiment side by side: each one's smallest hole and measures, its camera, and each switch's cost.
+
+The smallest hole that a set-up finds is told twice: as a step on its ladder of sizes, and as the size found in half of
+the trials. The second is a point on a curve drawn through the rates, monotone and otherwise free. It is no probability
+of detection in the handbooks' sense: that needs a model, its goodness of fit and a bound for the 90 % point over many
+targets.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.limits import Ladder, found_limit_mm, ladder_of
+from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.noise import noise_against_frames
 from harness.evaluation.summary import false_calls
 from harness.tables.trials import ResultTables
@@ -15,52 +25,165 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MEASURES = ("extent", "model")
+KEYS = ["variant", "frames"]
+RESAMPLES = 1000
+"""Draws of the bootstrap: its 2.5 % quantile is the 25th smallest, stable to about 5 % of the interval's width."""
+HALF = 0.5
+LIMIT_RULE = (
+    "The detection limit is the smallest true diameter from which on every hole as large or larger counts as found. "
+    "The 50 % size is where the detection rate, made monotone in the diameter by isotonic regression and interpolated "
+    "linearly between sizes, reaches one half; its 95 % interval is a bootstrap over the holes of each size (where "
+    "there are several) and over the repeats."
+)
+
+
+# the smallest hole
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Detections of one set-up at one number of frames.
+
+    ``diameters_mm`` (h,) of the holes, ascending; ``detected`` (repeats, h) bool.
+    """
+
+    diameters_mm: np.ndarray
+    detected: np.ndarray
+
+    @cached_property
+    def sizes_mm(self) -> np.ndarray:
+        """(s,) the distinct diameters, ascending."""
+        return np.unique(self.diameters_mm)
+
+    @cached_property
+    def half_mm(self) -> float:
+        """The 50 % size; the ladder's least size where that is found more often than not, infinity where none is."""
+        repeats, holes = self.detected.shape
+        return float(half_size(self.sizes_mm, self._rates(np.ones((1, repeats)), np.ones((1, holes))))[0])
+
+    @property
+    def at_the_end(self) -> bool:
+        """Return whether the 50 % size lies off the ladder, so that only a bound is known."""
+        return not self.sizes_mm[0] < self.half_mm < np.inf
+
+    @cached_property
+    def half_draws_mm(self) -> np.ndarray:
+        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap.
+
+        Ladders of the same holes and repeats are resampled alike, so that differences of draws are paired.
+        """
+        rng = np.random.default_rng(0)
+        repeats, holes = self.detected.shape
+        of_repeats = rng.multinomial(repeats, np.full(repeats, 1 / repeats), RESAMPLES)
+        of_holes = np.empty((RESAMPLES, holes))
+        for size in self.sizes_mm:
+            alike = self.diameters_mm == size
+            of_holes[:, alike] = rng.multinomial(alike.sum(), np.full(alike.sum(), 1 / alike.sum()), RESAMPLES)
+        return half_size(self.sizes_mm, self._rates(of_repeats, of_holes))
+
+    @property
+    def half_interval(self) -> Interval:
+        """95 % percentile interval of the 50 % size."""
+        return percentiles(self.half_draws_mm)
+
+    def _rates(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
+        """(n, s) detection rate of each size, repeats (n, repeats) and holes (n, h) weighted by how often drawn."""
+        by_hole = of_repeats @ self.detected / of_repeats.sum(axis=1, keepdims=True) * of_holes
+        starts = np.searchsorted(self.diameters_mm, self.sizes_mm)
+        return np.asarray(np.add.reduceat(by_hole, starts, axis=1) / np.add.reduceat(of_holes, starts, axis=1))
+
+
+def ladder_of(holes: pd.DataFrame) -> Ladder:
+    """Make the ladder of the table of holes' rows of one set-up and one number of frames."""
+    table = holes.pivot(index="repeat", columns="hole", values="detected").astype(bool)
+    sizes = holes.groupby("hole")["true_diameter_mm"].first()
+    order = sorted(table.columns, key=lambda hole: (sizes[hole], str(hole)))
+    return Ladder(sizes[order].to_numpy(float), table[order].to_numpy(bool))
+
+
+def found_limit_mm(summary: pd.DataFrame) -> float:
+    """Find the detection limit by `LIMIT_RULE` in summary rows of one set-up and one number of frames; NaN where even
+    the largest hole is not found."""
+    limit = float("nan")
+    for diameter in sorted(summary["true_diameter_mm"].unique(), reverse=True):
+        if not (summary["status"][summary["true_diameter_mm"] == diameter] == "found").all():
+            break
+        limit = float(diameter)
+    return limit
+
+
+def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Find (n,) where rates (n, s), made monotone, first reach one half: by linear interpolation between sizes, in mm.
+
+    The least size where its rate does already, infinity where none does.
+    """
+    monotone = isotonic(np.asarray(rates, float))
+    reached = monotone >= HALF - 1e-12
+    last = np.argmax(reached, axis=1)
+    before, rows = np.maximum(last - 1, 0), np.arange(len(monotone))
+    low, high = monotone[rows, before], monotone[rows, last]
+    share = np.where(last > 0, (HALF - low) / np.where(high > low, high - low, 1.0), 0.0)
+    found = sizes_mm[before] + share * (sizes_mm[last] - sizes_mm[before])
+    return np.where(reached.any(axis=1), found, np.inf)
+
+
+def isotonic(rates: np.ndarray) -> np.ndarray:
+    """Isotonic regression with equal weights of each row of (n, s), all rows at once.
+
+    By the max-min formula (Robertson, Wright and Dykstra 1988): at i the largest over a <= i of the least over b >= i
+    of the mean from a to b.
+    """
+    n, s = rates.shape
+    sums = np.concatenate([np.zeros((n, 1)), np.cumsum(rates, axis=1)], axis=1)
+    a, b = np.indices((s, s))
+    means = np.where(b >= a, (sums[:, None, 1:] - sums[:, :-1, None]) / np.maximum(b - a + 1, 1), np.inf)
+    least = np.minimum.accumulate(means[..., ::-1], axis=2)[..., ::-1]
+    return np.asarray(np.where(a <= b, least, -np.inf).max(axis=1))
+
+
+# side by side
 
 
 def set_ups_of(tables: ResultTables) -> list[str]:
-    """The labels of the experiment's set-ups, variations left out, in their order."""
+    """List the labels of the experiment's set-ups, variations left out, in their order."""
     return [str(name) for name in tables.variants["variant"][~tables.variants["is_variation"].astype(bool)]]
 
 
 def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
-    """One row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
+    """Make one row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
 
     ``holes``; ``found`` and ``undecided`` (lists of names); ``limit_mm`` and ``half_mm`` with ``half_low_mm``,
-    ``half_high_mm`` (`harness.evaluation.limits`; without ``half_sizes`` left out, which saves a bootstrap); for each
-    measure ``<measure>_bias_mm``, ``_std_mm``, ``_n`` of all single diameters of found holes against the truth, and
-    ``<measure>_place_*`` likewise of the distances from the largest hole (none where several are the largest);
-    ``threshold``, ``threshold_mm``, ``false_calls``, ``runs``; ``temporal_mm``, ``offset_mm``, ``pattern_mm`` of the
-    averaged z on probe pixels; ``surface_mm``: robust deviation from the fitted surface on undamaged face; and means
-    over hole-free runs of the columns of ``tables.noise``, where it has any.
+    ``half_high_mm`` (without ``half_sizes`` left out, which saves a bootstrap); for each measure ``<measure>_bias_mm``,
+    ``_std_mm``, ``_n`` of all single diameters of found holes against the truth, and ``<measure>_place_*`` likewise of
+    the distances from the largest hole (none where several are the largest); ``threshold``, ``threshold_mm``,
+    ``false_calls``, ``runs``; ``temporal_mm``, ``offset_mm``, ``pattern_mm`` of the averaged z on probe pixels;
+    ``surface_mm``: robust deviation from the fitted surface on undamaged face; and means over hole-free runs of the
+    columns of ``tables.noise``, where it has any.
     """
     import pandas as pd
 
     summary = summary[summary["variant"].isin(variants)]
-    rows = [_row(tables, part, half_sizes) for _, part in summary.groupby(["variant", "frames"], sort=False)]
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame([_row(tables, part, half_sizes) for _, part in summary.groupby(KEYS, sort=False)])
     if table.empty:
         return table
-    table = table.merge(_noise(tables), "left", ["variant", "frames"]).merge(_calls(tables), "left", KEYS)
+    noise = noise_against_frames(tables.probes)[[*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]]
+    calls = false_calls(tables.runs)
+    calls = calls[calls["role"] == "damaged"]
+    calls = calls[[*KEYS, "runs", "false_calls", "threshold", "threshold_mm", "surface_noise_mm"]]
+    for part in (noise, calls):
+        table = table.merge(part, "left", KEYS)
+    table = table.rename(columns={"temporal_rms_mm": "temporal_mm", "surface_noise_mm": "surface_mm"})
     if len(tables.noise):  # empty for maps, whose pixels are no camera's
-        table = table.merge(_boards(tables), "left", KEYS)
+        columns = [name for name in tables.noise.columns if name not in ("repeat", *tables.axes["path"])]
+        table = table.merge(tables.noise[columns].groupby(KEYS, as_index=False).mean(), "left", KEYS)
     order = {variant: place for place, variant in enumerate(variants)}
     return table.sort_values(KEYS, key=lambda c: c.map(order) if c.name == "variant" else c, ignore_index=True)
 
 
-KEYS = ["variant", "frames"]
-
-
-def ladders(tables: ResultTables, variants: list[str]) -> dict[tuple[str, int], Ladder]:
-    """The ladder of each (variant, frames)."""
-    holes = tables.holes[tables.holes["variant"].isin(variants)]
-    groups = holes.groupby(KEYS, sort=False)
-    return {(str(part["variant"].iloc[0]), int(part["frames"].iloc[0])): ladder_of(part) for _, part in groups}
-
-
 def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
-    """What the holes of one set-up at one number of frames say; ``part``: their summary rows."""
+    """Describe the holes of one set-up at one number of frames; ``part``: their summary rows."""
     first = part.iloc[0]
     trials = tables.holes[(tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])]
     found = list(part["hole"][part["status"] == "found"])
@@ -75,47 +198,105 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
         "limit_mm": found_limit_mm(part),
     }
     if half_sizes:
-        row |= _half(ladder_of(trials))
+        ladder = ladder_of(trials)
+        interval = ladder.half_interval
+        row |= {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())
+    # The largest hole is where distances count from; of several as large, any may be the largest cluster.
+    away = of_found[(of_found["true_offset_mm"] > 0) & (largest == 1)]
     for measure in MEASURES:
         size = of_found[f"{measure}_diameter_mm"] - of_found["true_diameter_mm"]
-        # the largest hole is where distances count from; of several as large, any may be the largest cluster
-        away = of_found[(of_found["true_offset_mm"] > 0) & (largest == 1)]
         place = away[f"{measure}_offset_mm"] - away["true_offset_mm"]
-        row |= _spread(f"{measure}", size) | _spread(f"{measure}_place", place)
+        for name, errors in ((measure, size.dropna()), (f"{measure}_place", place.dropna())):
+            row[f"{name}_bias_mm"] = float(errors.mean()) if len(errors) else np.nan
+            row[f"{name}_std_mm"] = float(errors.std()) if len(errors) > 1 else np.nan
+            row[f"{name}_n"] = len(errors)
     return row
 
 
-def _half(ladder: Ladder) -> dict[str, float]:
-    interval = ladder.half_interval
-    return {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
+# the costs of switches
 
 
-def _spread(name: str, errors: pd.Series) -> dict[str, float]:
-    known = errors.dropna()
-    return {
-        f"{name}_bias_mm": float(known.mean()) if len(known) else np.nan,
-        f"{name}_std_mm": float(known.std()) if len(known) > 1 else np.nan,
-        f"{name}_n": len(known),
-    }
+@dataclass(frozen=True)
+class SwitchCost:
+    """Change of the 50 % size in mm when a switch goes on (positive: only larger holes are found then).
+
+    ``certain``: whether both sizes lie on the ladder, so that the number is no mere bound.
+    """
+
+    mm: float
+    interval: Interval
+    certain: bool
 
 
-def _noise(tables: ResultTables) -> pd.DataFrame:
-    noise = noise_against_frames(tables.probes)
-    return noise[[*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]].rename(
-        columns={"temporal_rms_mm": "temporal_mm"}
-    )
+@dataclass(frozen=True)
+class EffectCost:
+    """One switch: ``alone`` against nothing on, ``last`` against all others on.
+
+    The two differ where effects add as squares or mask each other.
+    """
+
+    effect: str
+    alone: SwitchCost
+    last: SwitchCost
 
 
-def _calls(tables: ResultTables) -> pd.DataFrame:
-    calls = false_calls(tables.runs)
-    calls = calls[calls["role"] == "damaged"]
-    calls = calls[[*KEYS, "runs", "false_calls", "threshold", "threshold_mm", "surface_noise_mm"]]
-    return calls.rename(columns={"surface_noise_mm": "surface_mm"})
+@dataclass(frozen=True)
+class EffectCosts:
+    """All switches at one place (values of the experiment's other axes, as text) and number of frames, and everything
+    together against nothing."""
+
+    place: str
+    frames: int
+    effects: tuple[EffectCost, ...]
+    together: SwitchCost
 
 
-def _boards(tables: ResultTables) -> pd.DataFrame:
-    left_out = {"repeat", *tables.axes["path"]}
-    columns = [column for column in tables.noise.columns if column not in left_out]
-    return tables.noise[columns].groupby(KEYS, as_index=False).mean()
+def effect_costs(tables: ResultTables) -> list[EffectCosts]:
+    """State the costs of every switch, for each place on the other axes and each number of frames; [] without
+    switches."""
+    set_ups = tables.variants[tables.variants["switches"] != ""]
+    if set_ups.empty:
+        return []
+    names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
+    others = list(tables.axes["path"])[1:]
+    groups = set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]
+    found = []
+    for values, part in groups:
+        place = ", ".join(f"{names[path]}={value}" for path, value in zip(others, values, strict=True))
+        switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
+        on = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
+        found += list(_costs(place, on, list(switches[on[max(on, key=len)]]), tables))
+    return found
+
+
+def _costs(
+    place: str, by_switches: Mapping[frozenset[str], str], names: list[str], tables: ResultTables
+) -> Iterator[EffectCosts]:
+    """Costs at one place; ``by_switches``: the set-up for each set of switches that are on."""
+    everything = max(by_switches, key=len)
+    holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
+    for frames in sorted(int(n) for n in holes["frames"].unique()):
+        there = {str(name): ladder_of(rows) for name, rows in holes[holes["frames"] == frames].groupby("variant")}
+        ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
+        found = [
+            EffectCost(name.replace("_", " "), alone, last)
+            for name in names
+            if (alone := _cost(ladders, frozenset(), frozenset([name])))
+            and (last := _cost(ladders, everything - {name}, everything))
+        ]
+        together = _cost(ladders, frozenset(), everything)
+        if together is not None:
+            yield EffectCosts(place, frames, tuple(found), together)
+
+
+def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> SwitchCost | None:
+    """The paired difference of two set-ups; None where either was not finished, or not with the same repeats."""
+    if off not in ladders or on not in ladders or ladders[off].detected.shape != ladders[on].detected.shape:
+        return None
+    before, after = ladders[off], ladders[on]
+    with np.errstate(invalid="ignore"):  # both off the ladder: a difference of infinities is unknown
+        draws = after.half_draws_mm - before.half_draws_mm
+        mm = float(np.subtract(after.half_mm, before.half_mm))
+    return SwitchCost(mm, percentiles(draws), certain=not (before.at_the_end or after.at_the_end))

@@ -1,4 +1,4 @@
-"""Rates, means and intervals from rows per trial: the numbers of summary.csv, the report and the final table."""
+"""Rates, means and intervals of rows per trial: the numbers of summary.csv, the report and the final table."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Measure = Literal["extent", "model"]
 MAIN = "main"
 """The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
 STATES = ("found", "wrong depth", "invalid", "invisible")
-"""States of a hole as its pixels tell them, whatever the detector says."""
+"""States of a hole by its pixels alone, whatever the detector says."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, else as undecided."
@@ -135,7 +135,7 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Results of the model alone: depth, and the standard errors that each fit states, held against the truth."""
+    """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
     import pandas as pd
 
     fits = holes[[*GROUP, "true_diameter_mm", "model_diameter_mm", *FITTED]].copy()

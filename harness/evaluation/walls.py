@@ -1,4 +1,4 @@
-"""How much of a hole's wall no view can see: pure geometry of mouths, lenses and emitters.
+"""The share of a hole's wall that no view can see: pure geometry of mouths, lenses and emitters.
 
 A straight bore with a circular mouth of radius r in the plane z = 0. A wall point at depth t and azimuth e (a unit
 vector) looks at a lens at height H above the mouth and L beside its centre through the point of the mouth at
@@ -18,7 +18,7 @@ import numpy as np
 from harness.vocabulary.units import MM
 
 AZIMUTHS = 1440
-"""Around the wall; the mean over them is off by less than 1e-5 of the wall's area."""
+"""Directions around the wall; the mean over them is off by less than 1e-5 of the wall's area."""
 
 
 def shadowed_shares(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.pod.design import Plan
+from harness.evaluation.pod.design import StudyPlan
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, RED, save_png, svg
 from harness.report.design_rows import PLACED, StudyDesign, answer, size_text
 from harness.report.pod_figure import axis_text, plain
@@ -89,7 +89,7 @@ def _heights(design: StudyDesign) -> tuple[float, float]:
     return floor, floor + ROOM * max(max(finite) - floor, 0.05 * floor)
 
 
-def _bar(axes: Axes, place: float, plan: Plan, top: float, style: dict[str, Any]) -> None:
+def _bar(axes: Axes, place: float, plan: StudyPlan, top: float, style: dict[str, Any]) -> None:
     if not np.isfinite(plan.low):
         axes.text(place, top, "none", ha="center", va="top", rotation=90, **style)
         return

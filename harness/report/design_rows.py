@@ -9,10 +9,17 @@ from typing import Any
 import numpy as np
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import LEAST_TARGETS, Plan
+from harness.evaluation.pod.design import (
+    CALLS,
+    LEAST_SIGNALS,
+    LEAST_TARGETS,
+    FramesPlan,
+    HoleFree,
+    Recommendation,
+    RepeatedStudies,
+    StudyPlan,
+)
 from harness.evaluation.pod.false_calls import SITES_PER_TARGET
-from harness.evaluation.pod.planning import CALLS, LEAST_SIGNALS, FramesPlan, HoleFree, Recommendation
-from harness.evaluation.pod.repeats import RepeatedStudies
 from harness.evaluation.pod.statement import finite
 from harness.tables.grid import aligned
 
@@ -30,7 +37,7 @@ class StudyDesign:
     origin: str
     unit: str
     range_of_sizes: tuple[float, float]
-    plans: tuple[Plan, ...]
+    plans: tuple[StudyPlan, ...]
     recommended: Recommendation
     goal: float | None
     guessed_with: int | None
@@ -99,7 +106,7 @@ def plan_rows(design: StudyDesign) -> list[tuple[bool, tuple[str, ...]]]:
     ]
 
 
-def placing(plan: Plan) -> str:
+def placing(plan: StudyPlan) -> str:
     """Where the sizes lie, in a few words: quartiles say how they crowd."""
     least, quarter, middle, three, most = np.quantile(plan.sizes, [0, 0.25, 0.5, 0.75, 1])
     if plan.placement == "uniform":
@@ -107,7 +114,7 @@ def placing(plan: Plan) -> str:
     return f"{least:.4g} to {most:.4g}, half from {quarter:.3g} to {three:.3g}, middle {middle:.3g}"
 
 
-def sizes_text(plan: Plan) -> str:
+def sizes_text(plan: StudyPlan) -> str:
     """Every size of the plan."""
     return " ".join(f"{size:.4g}" for size in plan.sizes)
 
@@ -318,7 +325,7 @@ def _curve_data(curve: PodCurve) -> dict[str, Any]:
     }
 
 
-def _plan_data(plan: Plan) -> dict[str, Any]:
+def _plan_data(plan: StudyPlan) -> dict[str, Any]:
     sizes = {name: finite(getattr(plan, name)) for name in ("true_size", "bound", "low", "high", "demonstrated")}
     plain = {name: getattr(plan, name) for name in ("targets", "placement", "pod", "confidence", "method", "studies")}
     return {**plain, **sizes, "sizes": plan.sizes.tolist(), "notes": list(plan.notes)}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.effects import Cost, EffectCosts
+from harness.evaluation.set_ups import EffectCosts, SwitchCost
 from harness.report.canvas import BLUE, GREY, INK, ORANGE, svg
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def cost_text(cost: Cost) -> str:
+def cost_text(cost: SwitchCost) -> str:
     """``+0.42 mm (0.30 to 0.55)``; a bound where a size lies off the ladder."""
     if not np.isfinite(cost.mm):
         return "off the ladder of sizes" if np.isnan(cost.mm) else f"{'+' if cost.mm > 0 else '−'}∞"

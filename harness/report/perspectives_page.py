@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluation.map_case import (
+from harness.evaluation.maps import (
     THESIS_MERGE,
     THESIS_REGISTRATION,
     AgainstOne,
     MapCase,
     against_one,
+    compare_maps,
     map_cases,
 )
-from harness.evaluation.maps import compare_maps
 from harness.evaluation.registration import by_views, summarise_registrations
 from harness.evaluation.summary import found_rule, summarise_holes
 from harness.report.examples import MappedExample

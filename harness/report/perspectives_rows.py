@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.map_case import AgainstOne, MapCase, against_one
-from harness.evaluation.map_text import change_text, ratio_text, span
-from harness.evaluation.maps import MapSetUp, label_of, maps_of
+from harness.evaluation.maps import (
+    AgainstOne,
+    MapCase,
+    MapSetUp,
+    against_one,
+    change_text,
+    label_of,
+    maps_of,
+    ratio_text,
+    span,
+)
 from harness.evaluation.registration import PARTS, trusted
 from harness.evaluation.summary import hole_list
 from harness.report.page_parts import shade

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.effects import EffectCosts, effect_costs
-from harness.evaluation.limits import LIMIT_RULE
-from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.set_ups import LIMIT_RULE, EffectCosts, compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import false_calls, found_rule, summarise_holes
 from harness.report.clouds import residual_figure
 from harness.report.effects_figure import cost_text, effects_figure

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.map_case import LARGE_MM, AgainstOne
+from harness.evaluation.maps import LARGE_MM, AgainstOne
 from harness.report.canvas import BLUE, GREY, INK, ORANGE, PALE, svg
 from harness.report.examples import MappedExample
 from harness.report.registration_figures import colour_of, method_text

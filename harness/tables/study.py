@@ -12,10 +12,9 @@ from harness.evaluation.intervals import Interval
 from harness.evaluation.pod.statement import CONFIDENCE
 from harness.evaluation.study.axes import FRAMES, AxisLine, Difference
 from harness.evaluation.study.curves import PRO_LIMIT, PixelCurves, Roc
-from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.limit import SetUpLimit, SizeRow
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.result import SetUpResult, StudyResult
-from harness.evaluation.study.table_one import SizeRow
 from harness.tables import text
 from harness.tables.grid import Grid
 from harness.tables.limits import (

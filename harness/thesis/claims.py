@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
-from harness.evaluation.map_text import span
+from harness.evaluation.maps import span
 from harness.evaluation.noise import noise_law
 from harness.evaluation.profile import AveragedCloud, hole_shapes
 from harness.evaluation.summary import MAIN, Measure, found_holes, hole_list, summarise_holes, with_columns

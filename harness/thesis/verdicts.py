@@ -12,7 +12,7 @@ from functools import wraps
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from harness.evaluation.intervals import Interval
-from harness.evaluation.map_case import MANY
+from harness.evaluation.maps import MANY
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,9 +20,20 @@ from harness.evaluation.intervals import (
     mean_difference,
     wilson,
 )
-from harness.evaluation.map_case import THESIS_MERGE, THESIS_REGISTRATION, Map, MapCase, against_one
-from harness.evaluation.map_text import change_text, frames_text, ratio_text, span
-from harness.evaluation.paired import FEWEST_BOTH, run_ratio, size_errors
+from harness.evaluation.maps import (
+    FEWEST_BOTH,
+    THESIS_MERGE,
+    THESIS_REGISTRATION,
+    Map,
+    MapCase,
+    against_one,
+    change_text,
+    frames_text,
+    ratio_text,
+    run_ratio,
+    size_errors,
+    span,
+)
 from harness.evaluation.registration import of_map, paired_ratio, per_unit, trusted
 from harness.evaluation.summary import hole_list
 from harness.thesis.verdicts import Answer, Rules, Verdict, decide, is_above_zero, rule_of

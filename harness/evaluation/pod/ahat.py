@@ -8,7 +8,7 @@ Repeated measures: k signals of one target are not k targets. The fit treats row
 (mu, sigma) consistent for the whole scatter (between targets and within), and multiplies the covariance by k, the mean
 number of signals per target: right where a target's signals are all alike, too cautious where they are not. No mixed
 model is fitted; its split of the scatter would not change the POD of a new target seen once. Both covariances stand in
-the fit. Not modelled: scatter that grows with size, curvature (`harness.evaluation.pod.diagnostics` tests both).
+the fit. Not modelled: scatter that grows with size, curvature (`diagnose` tests both).
 """
 
 from __future__ import annotations
@@ -18,16 +18,21 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special, stats
 
-from harness.evaluation.pod.censored import CensoredFit, fit_censored
 from harness.evaluation.pod.curve import Bound, PodCurve
+from harness.evaluation.pod.likelihood import ascend
 from harness.vocabulary.errors import UserError
 
 LEAST_TARGETS = 40
 """MIL-HDBK-1823A: independent targets that an a-hat study should have at least."""
 SAME = 1e-9
-"""Share of the largest signal within which signals differ by rounding alone."""
+"""Share of the largest signal within which signals differ by rounding alone; scatter below this share of the signals'
+largest deviation is a line drawn by rounding, with no likelihood."""
+LEVEL = 0.05
+"""p-value below which a diagnostic speaks against an assumption."""
+LEAST = 8
+"""Signals between the limits below which Anderson and Darling's approximation of p does not hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +68,12 @@ class AhatFit:
 
     @property
     def n(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return len(self.x)
 
     @property
     def targets(self) -> int:
-        """Independent targets."""
+        """Number of independent targets."""
         return len(np.unique(self.target))
 
     @property
@@ -93,7 +98,7 @@ def fit_ahat(
     log_signal: bool = False,
     inspections: ArrayLike | None = None,
 ) -> AhatFit:
-    """Censored regression of ``signal`` (n,) on ``size`` (n,), and POD of signals above ``decision``.
+    """Regress ``signal`` (n,) on ``size`` (n,) with censoring, and derive the POD of signals above ``decision``.
 
     Signals <= ``left`` are at the noise floor, signals >= ``right`` saturated. ``inspections`` (n,): which target a row
     inspects, where a target was measured more than once. UserError: not finite, sizes or signals <= 0 under a
@@ -101,39 +106,73 @@ def fit_ahat(
     with size.
     """
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
-    target = _targets(sizes, signals, inspections)
-    _check_limits(decision, left, right)
+    names = np.arange(len(sizes)) if inspections is None else np.asarray(inspections).astype(str)
+    if not len(sizes) == len(signals) == len(names):
+        raise UserError(f"{len(sizes)} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
+    _, first, target = np.unique(names, return_index=True, return_inverse=True)
+    if np.any(other := sizes != sizes[first][target]):
+        raise UserError(f"target {names[other][0]} has more than one size", legal="one size for a target")
+    low, high = -np.inf if left is None else left, np.inf if right is None else right
+    if not low < high:
+        raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
+    if not low <= decision <= high:
+        raise UserError(
+            f"decision {decision:g} lies outside the signals that can be told apart",
+            legal=f"between the noise floor {low:g} and saturation {high:g}",
+        )
     below = np.zeros(len(signals), bool) if left is None else signals <= left
     above = np.zeros(len(signals), bool) if right is None else signals >= right
-    _check_variation(signals[~(below | above)])
-    at_limit = np.clip(signals, -np.inf if left is None else left, np.inf if right is None else right)
+    between = signals[~(below | above)]
+    if len(between) > 1 and np.ptp(between) <= SAME * np.abs(between).max():
+        raise UserError(
+            f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}",
+            fix="take hits and misses instead: signals that are all alike say nothing of size",
+        )
     x = _axis("sizes", sizes, log_size)
-    y = _axis("signals", at_limit, log_signal)
+    y = _axis("signals", np.clip(signals, low, high), log_signal)
     threshold = float(_axis("decision", np.array([decision]), log_signal)[0])
     line = fit_censored(np.column_stack([np.ones_like(x), x]), y, below, above)
-    per_target = len(x) / len(np.unique(target))
-    curve = _curve(line, line.covariance * per_target, threshold, log_size)
-    jacobian = float(y[~(below | above)].sum()) if log_signal else 0.0
+    b0, b1 = line.coefficients
+    if b1 <= 0:
+        raise UserError(
+            f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit",
+            fix="check the columns of size and signal, or take the signal with the other sign",
+        )
+    targets = len(first)
+    per_target = len(x) / targets
+    mu, sigma = float((threshold - b0) / b1), float(line.tau / b1)
+    jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
+    curve, rows_curve = (
+        PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)
+        for covariance in (line.covariance * per_target, line.covariance)
+    )
+    notes = []
+    if targets < LEAST_TARGETS:
+        notes.append(f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
+    if per_target > 1:
+        notes.append(f"{per_target:.3g} signals per target: covariance multiplied by that, {targets} targets count")
+    if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
+        notes.append(f"a90 = {a90:.4g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
     return AhatFit(
         curve=curve,
-        rows_curve=_curve(line, line.covariance, threshold, log_size),
-        b0=float(line.coefficients[0]),
-        b1=float(line.coefficients[1]),
+        rows_curve=rows_curve,
+        b0=float(b0),
+        b1=float(b1),
         tau=line.tau,
         covariance=line.covariance * per_target,
         covariance_of_rows=line.covariance,
-        log_likelihood=line.log_likelihood - jacobian,
+        log_likelihood=line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0),
         x=x,
         y=y,
         below=below,
         above=above,
-        target=target,
+        target=np.asarray(target),
         log_size=log_size,
         log_signal=log_signal,
         decision=decision,
         left=left,
         right=right,
-        notes=_notes(curve, sizes, len(np.unique(target)), per_target),
+        notes=tuple(notes),
     )
 
 
@@ -146,7 +185,7 @@ def choose_axes(
     right: float | None = None,
     inspections: ArrayLike | None = None,
 ) -> tuple[AhatFit, ...]:
-    """Fits on all pairs of axes that the data allow, best (smallest deviance) first; never chosen by the limit.
+    """Fit all pairs of axes that the data allow, best (smallest deviance) first; never chosen by the limit.
 
     A logarithm is left out where there are sizes, or signals, floor or decision, that have none. All have three
     parameters, so the deviances compare as they stand.
@@ -155,18 +194,10 @@ def choose_axes(
     lowest = signals.min(initial=np.inf) if left is None else left
     log_sizes = (False, True) if np.all(sizes > 0) else (False,)
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
+    limits: dict[str, float | None] = {"left": left, "right": right}
     fits = [
-        fit_ahat(
-            sizes,
-            signals,
-            decision=decision,
-            left=left,
-            right=right,
-            log_size=log_size,
-            log_signal=log_signal,
-            inspections=inspections,
-        )
-        for log_size, log_signal in product(log_sizes, log_signals)
+        fit_ahat(sizes, signals, decision=decision, log_size=one, log_signal=other, inspections=inspections, **limits)
+        for one, other in product(log_sizes, log_signals)
     ]
     return tuple(sorted(fits, key=lambda fit: fit.deviance))
 
@@ -206,34 +237,11 @@ def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple
     return np.asarray(stats.norm.cdf((half - root) / leading)), np.asarray(stats.norm.cdf((half + root) / leading))
 
 
-def _curve(line: CensoredFit, covariance: np.ndarray, threshold: float, log_size: bool) -> PodCurve:
-    b0, b1 = line.coefficients
-    if b1 <= 0:
-        raise UserError(
-            f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit",
-            fix="check the columns of size and signal, or take the signal with the other sign",
-        )
-    mu, sigma = (threshold - b0) / b1, line.tau / b1
-    jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
-    return PodCurve("probit", log_size, float(mu), float(sigma), jacobian @ covariance @ jacobian.T)
-
-
 def _finite(name: str, values: ArrayLike) -> np.ndarray:
     array = np.asarray(values, float).ravel()
     if bad := int((~np.isfinite(array)).sum()):
         raise UserError(f"{bad} of {len(array)} {name} are not finite numbers", fix="leave these rows out")
     return array
-
-
-def _targets(sizes: np.ndarray, signals: np.ndarray, inspections: ArrayLike | None) -> np.ndarray:
-    """Number (n,) of the target that each row inspects; one target has one size."""
-    names = np.arange(len(sizes)) if inspections is None else np.asarray(inspections).astype(str)
-    if not len(sizes) == len(signals) == len(names):
-        raise UserError(f"{len(sizes)} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
-    _, first, target = np.unique(names, return_index=True, return_inverse=True)
-    if np.any(other := sizes != sizes[first][target]):
-        raise UserError(f"target {names[other][0]} has more than one size", legal="one size for a target")
-    return np.asarray(target)
 
 
 def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
@@ -244,32 +252,185 @@ def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
     return np.log(values)
 
 
-def _check_variation(signals: np.ndarray) -> None:
-    """Signals between the limits that differ by rounding alone have no slope and no scatter."""
-    if len(signals) > 1 and np.ptp(signals) <= SAME * np.abs(signals).max():
+# the regression
+
+
+@dataclass(frozen=True, eq=False)
+class CensoredFit:
+    """``coefficients`` (p,), scatter ``tau`` (maximum likelihood: no correction for degrees of freedom), inverse
+    observed information ``covariance`` (p + 1, p + 1) of (coefficients, tau), ``log_likelihood`` of the rows."""
+
+    coefficients: np.ndarray
+    tau: float
+    covariance: np.ndarray
+    log_likelihood: float
+
+
+def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray) -> CensoredFit:
+    """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958).
+
+    ``design`` (n, p); ``y`` (n,): the value, or the limit where ``below`` or ``above`` (n,) say that the value lies
+    beyond it. Rows are taken as independent with one scatter. Solved in Olsen's 1978 parameters (coefficients / tau,
+    1 / tau), in which the log-likelihood is concave. Raises UserError where the exact values do not determine the line
+    or its scatter.
+    """
+    exact = ~(below | above)
+    p = design.shape[1]
+    if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
         raise UserError(
-            f"the signals do not vary: all {len(signals)} between the limits are {signals[0]:.6g}",
-            fix="take hits and misses instead: signals that are all alike say nothing of size",
+            f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a regression",
+            legal=f"more than {p} signals that are not censored, at different sizes",
         )
+    start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
+    rest = y - design @ start
+    scale = float(np.sqrt(np.mean(rest[exact] ** 2)))
+    if scale <= SAME * float(np.max(np.abs(y[exact] - y[exact].mean()), initial=0.0)) or scale == 0:
+        raise UserError("the signals lie exactly on a line: there is no scatter to estimate", fix="check the column")
+    # Orthonormal columns and residuals of unit scatter: Newton's system is then well conditioned in any unit.
+    q, r = np.linalg.qr(design)
+    q, r = q * np.sqrt(len(y)), r / np.sqrt(len(y))
+    # Every row's term depends on s = row @ parameters alone, but for n ln(1 / tau).
+    rows = np.where(above, -1.0, 1.0)[:, None] * np.column_stack([-q, rest / scale])
+
+    def value_and_information(at: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Log-likelihood, its gradient and its negative Hessian."""
+        if at[-1] <= 0:
+            return -np.inf, np.zeros(p + 1), np.eye(p + 1)
+        s = rows @ at
+        tail = special.log_ndtr(s)
+        mills = np.exp(-0.5 * s**2 - 0.5 * np.log(2 * np.pi) - tail)
+        gradient = rows.T @ np.where(exact, -s, mills)
+        information = rows.T @ (np.where(exact, 1.0, mills * (mills + s))[:, None] * rows)
+        gradient[-1] += exact.sum() / at[-1]
+        information[-1, -1] += exact.sum() / at[-1] ** 2
+        value = (np.log(at[-1]) - 0.5 * s[exact] ** 2 - 0.5 * np.log(2 * np.pi)).sum() + tail[~exact].sum()
+        return float(value), gradient, information
+
+    def value_and_step(places: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, gradient, information = value_and_information(places[0])
+        return np.array([value]), np.linalg.solve(information, gradient)[None]
+
+    at = ascend(value_and_step, np.append(np.zeros(p), 1.0)[None])[0][0]
+    value, _, information = value_and_information(at)
+    tau = 1 / at[-1]
+    slopes, to_user = at[:-1] * tau, np.linalg.inv(r) * scale
+    jacobian = np.zeros((p + 1, p + 1))
+    jacobian[:p, :p] = to_user * tau
+    jacobian[:p, -1] = -(to_user @ slopes) * tau
+    jacobian[-1, -1] = -(tau**2) * scale
+    covariance = jacobian @ np.linalg.solve(information, jacobian.T)
+    log_likelihood = value - float(exact.sum() * np.log(scale))
+    covariance = (covariance + covariance.T) / 2
+    return CensoredFit(start + to_user @ slopes, float(tau * scale), covariance, log_likelihood)
 
 
-def _check_limits(decision: float, left: float | None, right: float | None) -> None:
-    low, high = -np.inf if left is None else left, np.inf if right is None else right
-    if not low < high:
-        raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
-    if not low <= decision <= high:
-        raise UserError(
-            f"decision {decision:g} lies outside the signals that can be told apart",
-            legal=f"between the noise floor {low:g} and saturation {high:g}",
-        )
+# whether the regression may be believed
 
 
-def _notes(curve: PodCurve, sizes: np.ndarray, targets: int, per_target: float) -> tuple[str, ...]:
-    notes = []
-    if targets < LEAST_TARGETS:
-        notes.append(f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
-    if per_target > 1:
-        notes.append(f"{per_target:.3g} signals per target: covariance multiplied by that, {targets} targets count")
-    if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
-        notes.append(f"a90 = {a90:.4g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
-    return tuple(notes)
+@dataclass(frozen=True)
+class Diagnostic:
+    """One test of one assumption: ``p_value`` of a statistic at least as large while the assumption holds."""
+
+    assumption: str
+    test: str
+    statistic: float
+    p_value: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether the data speak against the assumption at `LEVEL`."""
+        return self.p_value < LEVEL
+
+    @property
+    def name(self) -> str:
+        """Assumption and test."""
+        return f"{self.assumption} ({self.test})"
+
+    @property
+    def text(self) -> str:
+        """The test's answer in words."""
+        return f"doubtful at {LEVEL:.0%}" if self.doubtful else f"nothing against it at {LEVEL:.0%}"
+
+
+def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
+    """Test the four assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence; and of targets
+    measured repeatedly, independence of repeats.
+
+    The order of rows counts for independence only. The parameters are estimated, so the residuals are a little too
+    regular; below 20 signals trust none of it. Nothing with fewer than `LEAST` signals between the limits.
+    """
+    exact = ~(fit.below | fit.above)
+    if exact.sum() < LEAST:
+        return ()
+    z, x = residual_scores(fit), fit.x[exact]
+    n, target = len(z), fit.target[exact]
+
+    ratio = 0.0  # likelihood ratio of a quadratic term, which takes the censored signals in
+    spread = (fit.x - fit.x.mean()) / fit.x.std()
+    if len(np.unique(spread)) > 2:
+        columns = np.column_stack([np.ones_like(spread), spread, spread**2])
+        line, bent = (fit_censored(columns[:, :k], fit.y, fit.below, fit.above) for k in (2, 3))
+        ratio = max(float(2 * (bent.log_likelihood - line.log_likelihood)), 0.0)
+    tests = [Diagnostic("linearity", "quadratic term, likelihood ratio", ratio, float(stats.chi2.sf(ratio, 1)))]
+
+    # Breusch and Pagan 1979 with Koenker's 1981 studentised statistic n R^2 of z^2 on x.
+    share = 0.0 if x.std() == 0 or (z**2).std() == 0 else float(np.corrcoef(x, z**2)[0, 1]) ** 2
+    tests.append(Diagnostic("equal scatter", "Breusch-Pagan", n * share, float(stats.chi2.sf(n * share, 1))))
+    tests.append(_normality(z))
+
+    # Von Neumann's ratio of successive differences in the order of rows (Durbin-Watson's statistic), two-sided; with
+    # divisor n in both: mean 2, variance 4 (n - 2) / ((n - 1)(n + 1)) for independent normal values.
+    ratio = float(np.sum(np.diff(z) ** 2) / np.sum((z - z.mean()) ** 2))
+    score = (ratio - 2) / np.sqrt(4 * (n - 2) / ((n - 1) * (n + 1)))
+    tests.append(Diagnostic("independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))))
+
+    # One-way analysis of variance of the residuals over targets: alike within a target, repeats are no targets.
+    _, group, size = np.unique(target, return_inverse=True, return_counts=True)
+    if fit.per_target > 1 and 2 <= len(size) < n:
+        mean = np.bincount(group, z) / size
+        between = float(np.sum(size * (mean - z.mean()) ** 2)) / (len(size) - 1)
+        within = float(np.sum((z - mean[group]) ** 2)) / (n - len(size))
+        f = between / within if within > 0 else np.inf
+        p = float(stats.f.sf(f, len(size) - 1, n - len(size)))
+        tests.append(Diagnostic("independence of repeats", "ANOVA over targets", f, p))
+    return tuple(tests)
+
+
+def residual_scores(fit: AhatFit) -> np.ndarray:
+    """Residuals (signals between the limits,) as scores that are standard normal under the model.
+
+    Near a limit the distribution of residuals is cut off, so they are mapped through it first:
+    u = (F(r) - F(low)) / (F(high) - F(low)), z = Phi^-1(u), which is standard normal whatever was censored.
+    """
+    exact = ~(fit.below | fit.above)
+    line = (fit.b0 + fit.b1 * fit.x)[exact]
+
+    def standard(limit: float | None, none: float) -> np.ndarray:
+        if limit is None:
+            return np.full(len(line), none)
+        return ((np.log(limit) if fit.log_signal else limit) - line) / fit.tau
+
+    r, low, high = (fit.y[exact] - line) / fit.tau, standard(fit.left, -np.inf), standard(fit.right, np.inf)
+    # Mirrored where the interval lies in the upper tail: the differences of F then keep their digits.
+    mirror = np.where(np.minimum(low, r) > 0, -1.0, 1.0)
+    ends = special.ndtr(mirror * low), special.ndtr(mirror * high)
+    z = special.ndtri(np.abs(special.ndtr(mirror * r) - ends[0]) / np.abs(ends[1] - ends[0]))
+    return np.clip(np.where(np.isneginf(low) & np.isposinf(high), r, z), -38.0, 38.0)
+
+
+def _normality(z: np.ndarray) -> Diagnostic:
+    """Anderson and Darling, mean and variance estimated; p by D'Agostino and Stephens 1986, table 4.9."""
+    ordered = np.sort((z - z.mean()) / z.std(ddof=1))
+    n = len(z)
+    weights = 2 * np.arange(1, n + 1) - 1
+    logs = special.log_ndtr(ordered) + special.log_ndtr(-ordered[::-1])
+    a = (-n - float(np.mean(weights * logs))) * (1 + 0.75 / n + 2.25 / n**2)
+    if a >= 0.6:
+        p = np.exp(1.2937 - 5.709 * a + 0.0186 * a**2)
+    elif a > 0.34:
+        p = np.exp(0.9177 - 4.279 * a - 1.38 * a**2)
+    elif a > 0.2:
+        p = 1 - np.exp(-8.318 + 42.796 * a - 59.938 * a**2)
+    else:
+        p = 1 - np.exp(-13.436 + 101.14 * a - 223.73 * a**2)
+    return Diagnostic("normality", "Anderson-Darling", a, float(np.clip(p, 0, 1)) if a < 13 else 0.0)

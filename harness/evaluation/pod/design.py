@@ -1,4 +1,4 @@
-"""What a hit/miss study will be able to say, before anybody drills a hole; and what repeats of a few holes cannot say.
+"""Plans of hit/miss studies, made before anybody drills a hole; and the little that repeats of a few holes show.
 
 A study is planned from a guess of the POD curve: studies are simulated from it and analysed as real ones would be.
 MIL-HDBK-1823A asks for at least 60 independent targets, with sizes spread evenly and over where POD rises. The plan is
@@ -13,27 +13,39 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 
-from harness.evaluation.pod.curve import Bound, PodCurve
+from harness.evaluation.pod.curve import LINKS, Bound, PodCurve, link_ppf
+from harness.evaluation.pod.false_calls import threshold_for_rate
 from harness.evaluation.pod.hit_miss import Between, HitMissFit, fit_hit_miss
 from harness.evaluation.pod.likelihood_bounds import bound
+from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
-LEAST_TARGETS = 60
-"""MIL-HDBK-1823A: independent targets that a hit/miss study should have at least."""
 SPREAD_SHARE = 1 / 3
 """Share of a concentrated design's targets that is still spread over the whole range: insurance against the guess."""
 RISE = (0.03, 0.97)
 """POD between which a curve counts as rising (MIL-HDBK-1823A: sizes should cover about that)."""
+
+LEAST_SIGNALS = 40
+"""MIL-HDBK-1823A: independent targets where signals are recorded (a-hat), at least."""
+WORTH = 0.05
+"""Concentrated sizes are recommended where they lower the 90 % quantile of the bound by more than this share: evenly
+spread ones do not rest on the guess. The ratio's Monte Carlo error is 0.028 with 200 studies of 60 targets."""
+CALLS = (0, 1, 2)
+"""Numbers of false calls for which the area of an upper bound is told."""
+SHARES = (0.0, 0.5, 1.0)
+"""Shares of the variance of luck that are the target's own: none (then, and only then, rows are as good as targets),
+half, all (then a repeat tells nothing new). A study with repeats shows its own; a guess cannot."""
 
 Placement = Literal["uniform", "concentrated"]
 PLACEMENTS: tuple[Placement, ...] = ("uniform", "concentrated")
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """What studies of ``targets`` targets, placed by ``placement``, demonstrate if the guess is right.
+class StudyPlan:
+    """Expected outcome of studies of ``targets`` targets, placed by ``placement``, if the guess is right.
 
     ``bound``: median over simulated studies of the upper bound on the size with this ``pod`` (a90/95), infinite where
     half of them demonstrate none; ``low``, ``high``: their 10 % and 90 % quantiles; ``true_size``: the guess's own;
@@ -55,6 +67,25 @@ class Plan:
     notes: tuple[str, ...]
 
 
+def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
+    """The curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
+
+    UserError where it would not rise, and for sizes that are not above 0.
+    """
+    if link not in LINKS:
+        raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
+    if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
+        raise UserError(
+            f"a50 {a50:g} and a90 {a90:g}: the chance of detection has to grow with size",
+            legal="0 < a50 < a90",
+            fix="a50 is found half the time, the larger a90 nine times of ten",
+        )
+    start, end = np.log([a50, a90]) if log_size else (a50, a90)
+    half, nine_tenths = link_ppf(link, np.array([0.5, 0.9]))
+    sigma = float((end - start) / (nine_tenths - half))
+    return PodCurve(link, log_size, float(start - sigma * half), sigma, np.zeros((2, 2)))
+
+
 def design(
     guess: PodCurve,
     targets: Sequence[int],
@@ -66,8 +97,8 @@ def design(
     method: str = "likelihood ratio",
     studies: int = 200,
     seed: int = 0,
-) -> tuple[Plan, ...]:
-    """One `Plan` for each number of targets and placement, in that order; a study takes about 5 ms.
+) -> tuple[StudyPlan, ...]:
+    """Simulate one `StudyPlan` for each number of targets and placement, in that order; a study takes about 5 ms.
 
     Studies are analysed with the guess's link and axis (and with a floor or a ceiling where it has one, at about a
     second a study), so choosing a model costs nothing here. A study that found all or nothing, or whose POD does not
@@ -82,14 +113,51 @@ def design(
         )
     if studies < 1 or min(targets, default=0) < 2:
         raise UserError(f"{studies} studies of {list(targets)} targets", legal="one study, two targets at least")
-    plans = []
+    bounded: Between = "none"
+    if guess.floor > 0:
+        bounded = "both" if guess.ceiling < 1 else "floor"
+    elif guess.ceiling < 1:
+        bounded = "ceiling"
+    true_size, plans = guess.size_at(pod), []
     for number in targets:
         for placement in placements:
             sizes = place_sizes(guess, number, range_of_sizes, placement)
             stream = random_stream(seed, "pod design", number, placement)
-            hits = stream.random((studies, number)) < guess.pod(sizes)
-            bounds = np.array([_bound_of(sizes, row, guess, pod, confidence, method) for row in hits])
-            plans.append(_plan(guess, sizes, placement, bounds, range_of_sizes, pod, confidence, method))
+            bounds = np.full(studies, np.inf)
+            for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
+                try:
+                    fit = fit_hit_miss(
+                        sizes, hits.astype(float), link=guess.link, log_size=guess.log_size, bounded=bounded
+                    )
+                except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
+                    continue
+                bounds[study] = bound(fit, pod, confidence, method).value
+            notes = []
+            if number < LEAST_TARGETS:
+                notes.append(f"{number} targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
+            if not low <= true_size <= high:
+                notes.append(
+                    f"the guess's size at POD {pod:g}, {true_size:.4g}, lies outside the range: it is extrapolated"
+                )
+            # Order statistics, as there is no mean between a number and infinity.
+            quantiles = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
+            plans.append(
+                StudyPlan(
+                    targets=number,
+                    placement=placement,
+                    pod=pod,
+                    confidence=confidence,
+                    method=method,
+                    studies=studies,
+                    true_size=true_size,
+                    bound=quantiles[1],
+                    low=quantiles[0],
+                    high=quantiles[2],
+                    demonstrated=float(np.mean(np.isfinite(bounds))),
+                    sizes=sizes,
+                    notes=tuple(notes),
+                )
+            )
     return tuple(plans)
 
 
@@ -112,8 +180,42 @@ def place_sizes(guess: PodCurve, number: int, range_of_sizes: tuple[float, float
     return np.sort(np.concatenate([_evenly(spread, low, high), _evenly(number - spread, start, end)]))
 
 
+def _evenly(number: int, low: float, high: float) -> np.ndarray:
+    """Midpoints of equal parts: no target wasted on the very ends."""
+    return low + (high - low) * (np.arange(number) + 0.5) / max(number, 1)
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """The ``plan`` to take. ``enough``: it has the handbook's number of targets. ``reaches``: nine of ten of its
+    studies demonstrate the wanted size, None where none was wanted; where it is False no plan does."""
+
+    plan: StudyPlan
+    enough: bool
+    reaches: bool | None
+
+
+def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> Recommendation:
+    """Choose the plan with the fewest targets, `LEAST_TARGETS` or more if any plan has them, of whose studies nine of
+    ten demonstrate ``goal`` (None: no wish); the most targets where none do. Evenly spread, unless concentrating is
+    `WORTH` it."""
+    enough = [plan for plan in plans if plan.targets >= LEAST_TARGETS]
+    # Below the handbook's minimum the most targets are nearest to it.
+    allowed = enough or [plan for plan in plans if plan.targets == max(one.targets for one in plans)]
+    reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
+    pool = reaching or allowed
+    number = (min if reaching else max)(plan.targets for plan in pool)
+    by_placement = {plan.placement: plan for plan in pool if plan.targets == number}
+    even, close = by_placement.get("uniform"), by_placement.get("concentrated")
+    if even is None or close is None:
+        plan = next(iter(by_placement.values()))
+    else:
+        plan = close if close.high < (1 - WORTH) * even.high else even
+    return Recommendation(plan, bool(enough), None if goal is None else bool(reaching))
+
+
 def guess_with_frames(guess: PodCurve, frames: int, *, guessed_with: int, fixed_share: float) -> PodCurve:
-    """The guess for another number of averaged frames.
+    """Carry the guess to another number of averaged frames.
 
     Noise has a white part that averages out and a fixed part that does not: variance(N) / variance(``guessed_with``) =
     (1 - s) guessed_with / N + s, ``fixed_share`` s of the variance in the guess. With the target's shape known, its
@@ -130,6 +232,98 @@ def guess_with_frames(guess: PodCurve, frames: int, *, guessed_with: int, fixed_
     if guess.log_size:
         return replace(guess, mu=guess.mu + float(np.log(ratio)))
     return replace(guess, mu=guess.mu * ratio, sigma=guess.sigma * ratio, covariance=guess.covariance * ratio**2)
+
+
+def fixed_share(white: float, fixed: float, frames: int) -> float:
+    """Share of the variance of the average of ``frames`` that more frames do not lessen. ``white``, ``fixed``: standard
+    deviations, in one unit, of one frame's noise that averages out and of the error that is in every frame."""
+    if not (np.isfinite([white, fixed]).all() and min(white, fixed) >= 0 and max(white, fixed) > 0):
+        raise UserError(f"white noise {white:g}, fixed noise {fixed:g}", legal="0 or more, not both 0")
+    if frames < 1:
+        raise UserError(f"guessed with {frames} frames", legal="one frame at least")
+    return float(fixed**2 / (white**2 / frames + fixed**2))
+
+
+@dataclass(frozen=True, eq=False)
+class FramesPlan:
+    """The guess for another number of averaged ``frames``, and what one study would demonstrate with them."""
+
+    frames: int
+    curve: PodCurve
+    plan: StudyPlan
+
+
+def plans_by_frames(
+    guess: PodCurve,
+    frames: Sequence[int],
+    *,
+    guessed_with: int,
+    fixed_share: float,
+    targets: int,
+    range_of_sizes: tuple[float, float],
+    pod: float,
+    confidence: float,
+    studies: int,
+    seed: int,
+) -> tuple[FramesPlan, ...]:
+    """Plan with the guess carried to each of ``frames`` by `guess_with_frames`, on the same evenly spread targets and
+    with the same luck. UserErrors as of `design` and `guess_with_frames`."""
+    out = []
+    for number in frames:
+        curve = guess_with_frames(guess, number, guessed_with=guessed_with, fixed_share=fixed_share)
+        (plan,) = design(
+            curve,
+            (targets,),
+            range_of_sizes,
+            placements=("uniform",),
+            pod=pod,
+            confidence=confidence,
+            studies=studies,
+            seed=seed,
+        )
+        out.append(FramesPlan(number, curve, plan))
+    return tuple(out)
+
+
+@dataclass(frozen=True)
+class HoleFree:
+    """Hole-free boards of ``board_m2`` for ``rate_per_m2`` false calls.
+
+    ``calibration_boards``: the fewest from which a threshold can be had; such a threshold gives ``expected_per_m2`` on
+    average, and no more than ``upper_per_m2`` with ``confidence``. ``areas_m2``: for each of `CALLS` false calls the
+    area, on other boards, on which no more of them bound the rate by the wanted one, with the same confidence.
+    """
+
+    rate_per_m2: float
+    board_m2: float
+    confidence: float
+    calibration_boards: int
+    expected_per_m2: float
+    upper_per_m2: float
+    areas_m2: tuple[float, ...]
+
+    def boards(self, area_m2: float) -> int:
+        """Number of boards that have this area."""
+        return int(np.ceil(area_m2 / self.board_m2 * (1 - 1e-12)))
+
+
+def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> HoleFree:
+    """State how much hole-free area has to be inspected, by the rule of `threshold_for_rate` and by Poisson's law."""
+    if not (np.isfinite([rate_per_m2, board_m2]).all() and rate_per_m2 > 0 and board_m2 > 0):
+        raise UserError(f"{rate_per_m2:g} false calls per m2 on boards of {board_m2:g} m2", legal="both above 0")
+    calling = -float(np.expm1(-rate_per_m2 * board_m2))
+    fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
+    # Any distinct scores: what the rule says of its rates does not depend on them.
+    threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
+    return HoleFree(
+        rate_per_m2=rate_per_m2,
+        board_m2=board_m2,
+        confidence=confidence,
+        calibration_boards=fewest,
+        expected_per_m2=threshold.rate_per_m2,
+        upper_per_m2=threshold.upper_per_m2,
+        areas_m2=tuple(float(stats.chi2.ppf(confidence, 2 * (calls + 1)) / 2 / rate_per_m2) for calls in CALLS),
+    )
 
 
 @dataclass(frozen=True)
@@ -158,7 +352,7 @@ def repeats_are_not_targets(
     confidence: float = 0.95,
     method: str = "likelihood ratio",
 ) -> RepeatsCheck:
-    """Both limits of one set of inspections: ``size``, ``hit`` (0/1) and ``target`` (identity), each (n,).
+    """State both limits of one set of inspections: ``size``, ``hit`` (0/1) and ``target`` (identity), each (n,).
 
     Fifty repeats of eight holes repeat the noise, not the holes: they are eight targets. UserErrors as of
     `harness.evaluation.pod.hit_miss.fit_hit_miss`.
@@ -171,67 +365,95 @@ def repeats_are_not_targets(
     rows = fit_hit_miss(np.asarray(size, float), np.asarray(hit, float), link=link, log_size=log_size)
     wrong = bound(rows, pod, confidence, method)
     name = f"a{100 * pod:g}/{100 * confidence:g}"
+    said = [f"{limit.value:.4g}" if limit.demonstrated else "not demonstrated" for limit in (right, wrong)]
     text = (
-        f"{fit.n} inspections of {fit.targets} targets are {fit.targets} targets: {name} {_said(right)}; "
-        f"taken for {fit.n} targets, wrongly, {_said(wrong)}"
+        f"{fit.n} inspections of {fit.targets} targets are {fit.targets} targets: {name} {said[0]}; "
+        f"taken for {fit.n} targets, wrongly, {said[1]}"
     )
     return RepeatsCheck(fit.targets, fit.n, right, wrong, fit, text)
 
 
-def _said(limit: Bound) -> str:
-    return f"{limit.value:.4g}" if limit.demonstrated else "not demonstrated"
+@dataclass(frozen=True)
+class RepeatedStudies:
+    """``studies`` simulated studies, each of ``repeats`` inspections of ``targets`` targets of ``sizes`` (targets,).
+
+    ``share``: of the variance of luck, the target's own. ``right``, ``wrong``: medians of the upper bound that counts
+    targets and of the one that counts rows, infinite where half of the studies demonstrate none; ``*_demonstrated``:
+    share of studies with a finite one; ``*_too_small``: share whose bound is below ``true_size``, which has to be no
+    more than 1 - confidence. ``text``: the first study that has a curve, in words; empty where none has.
+    """
+
+    share: float
+    targets: int
+    repeats: int
+    studies: int
+    true_size: float
+    sizes: np.ndarray
+    right: float
+    wrong: float
+    right_demonstrated: float
+    wrong_demonstrated: float
+    right_too_small: float
+    wrong_too_small: float
+    text: str
 
 
-def _evenly(number: int, low: float, high: float) -> np.ndarray:
-    """Midpoints of equal parts: no target wasted on the very ends."""
-    return low + (high - low) * (np.arange(number) + 0.5) / max(number, 1)
-
-
-def _bound_of(
-    sizes: np.ndarray, hits: np.ndarray, guess: PodCurve, pod: float, confidence: float, method: str
-) -> float:
-    try:
-        fit = fit_hit_miss(sizes, hits.astype(float), link=guess.link, log_size=guess.log_size, bounded=_bounded(guess))
-    except UserError:  # One class only, or a slope that is not positive: such a study demonstrates nothing.
-        return float("inf")
-    return bound(fit, pod, confidence, method).value
-
-
-def _bounded(guess: PodCurve) -> Between:
-    if guess.floor > 0:
-        return "both" if guess.ceiling < 1 else "floor"
-    return "ceiling" if guess.ceiling < 1 else "none"
-
-
-def _plan(
+def repeated_studies(
     guess: PodCurve,
-    sizes: np.ndarray,
-    placement: Placement,
-    bounds: np.ndarray,
+    targets: int,
+    repeats: int,
     range_of_sizes: tuple[float, float],
-    pod: float,
-    confidence: float,
-    method: str,
-) -> Plan:
-    # Order statistics, as there is no mean between a number and infinity.
-    low, middle, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf")
-    true_size, notes = guess.size_at(pod), []
-    if len(sizes) < LEAST_TARGETS:
-        notes.append(f"{len(sizes)} targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
-    if not range_of_sizes[0] <= true_size <= range_of_sizes[1]:
-        notes.append(f"the guess's size at POD {pod:g}, {true_size:.4g}, lies outside the range: it is extrapolated")
-    return Plan(
-        targets=len(sizes),
-        placement=placement,
-        pod=pod,
-        confidence=confidence,
-        method=method,
-        studies=len(bounds),
-        true_size=true_size,
-        bound=float(middle),
-        low=float(low),
-        high=float(high),
-        demonstrated=float(np.mean(np.isfinite(bounds))),
-        sizes=sizes,
-        notes=tuple(notes),
-    )
+    *,
+    shares: Sequence[float] = SHARES,
+    pod: float = 0.9,
+    confidence: float = 0.95,
+    studies: int = 200,
+    seed: int = 0,
+) -> tuple[RepeatedStudies, ...]:
+    """Simulate studies with repeats: one row for each of ``shares``; sizes evenly spread. Any single inspection is
+    found with the guess's POD at any share (luck is a normal copula). A study without a rising curve demonstrates
+    nothing. Bounds by likelihood ratio."""
+    if targets < 2 or repeats < 2:
+        raise UserError(f"{repeats} repeats of {targets} targets", legal="two repeats of two targets at least")
+    sizes, true_size = place_sizes(guess, targets, range_of_sizes, "uniform"), guess.size_at(pod)
+    rows = []
+    for share in shares:
+        stream = random_stream(seed, "repeats", targets, repeats)
+        right, wrong, texts = np.full(studies, np.inf), np.full(studies, np.inf), []
+        for study in range(studies):
+            own, of_noise = stream.standard_normal((targets, 1)), stream.standard_normal((targets, repeats))
+            luck = stats.norm.cdf(np.sqrt(share) * own + np.sqrt(1 - share) * of_noise)
+            hit = luck < guess.pod(sizes)[:, None]
+            try:
+                check = repeats_are_not_targets(
+                    np.repeat(sizes, repeats),
+                    hit.ravel(),
+                    np.repeat(np.arange(targets), repeats),
+                    link=guess.link,
+                    log_size=guess.log_size,
+                    pod=pod,
+                    confidence=confidence,
+                )
+            except UserError:  # One class only, or a slope that is not positive: such a study demonstrates nothing.
+                continue
+            right[study], wrong[study] = check.right.value, check.wrong.value
+            texts.append(check.text)
+        medians = [float(np.quantile(one, 0.5, method="inverted_cdf")) for one in (right, wrong)]
+        rows.append(
+            RepeatedStudies(
+                share=share,
+                targets=targets,
+                repeats=repeats,
+                studies=studies,
+                true_size=true_size,
+                sizes=sizes,
+                right=medians[0],
+                wrong=medians[1],
+                right_demonstrated=float(np.mean(np.isfinite(right))),
+                wrong_demonstrated=float(np.mean(np.isfinite(wrong))),
+                right_too_small=float(np.mean(right < true_size)),
+                wrong_too_small=float(np.mean(wrong < true_size)),
+                text=texts[0] if texts else "",
+            )
+        )
+    return tuple(rows)

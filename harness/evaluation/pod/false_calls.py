@@ -1,7 +1,6 @@
-"""False calls: how likely on an unflawed site, how many per area, and the threshold for a wanted rate.
+"""False calls: their rate per area, and the threshold for a wanted rate.
 
-MIL-HDBK-1823A asks for at least three unflawed sites for each flawed one. All bounds are one-sided upper bounds unless
-an interval is named; sites, signals and runs are taken as independent.
+All bounds are one-sided upper bounds unless an interval is named; runs are taken as independent.
 """
 
 from __future__ import annotations
@@ -10,71 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize, stats
+from scipy import stats
 
 from harness.evaluation.intervals import Interval, poisson_rate
-from harness.evaluation.pod.censored import fit_censored
 from harness.vocabulary.errors import UserError
 
 SITES_PER_TARGET = 3
 """MIL-HDBK-1823A: unflawed sites for each flawed one, at least."""
-
-
-@dataclass(frozen=True)
-class FalseCalls:
-    """Probability of a false call at one unflawed site: estimate and ``upper`` bound at one-sided ``confidence``."""
-
-    probability: float
-    upper: float
-    confidence: float
-    sites: int
-    method: str
-
-
-def false_call_probability(calls: int, sites: int, confidence: float = 0.95) -> FalseCalls:
-    """PFP from ``calls`` on ``sites`` unflawed sites; upper bound by Clopper and Pearson, Beta(k + 1, n - k)."""
-    if not (sites >= 1 and 0 <= calls <= sites):
-        raise UserError(
-            f"{calls} false calls on {sites} unflawed sites", legal="0 <= calls <= sites, one site at least"
-        )
-    upper = 1.0 if calls == sites else float(stats.beta.ppf(confidence, calls + 1, sites - calls))
-    return FalseCalls(calls / sites, upper, confidence, sites, "Clopper-Pearson")
-
-
-def false_call_probability_of_noise(
-    signals: ArrayLike,
-    decision: float,
-    *,
-    left: float | None = None,
-    log_signal: bool = False,
-    confidence: float = 0.95,
-) -> FalseCalls:
-    """PFP = 1 - F(decision), F the normal distribution of noise-only ``signals`` (n,) by maximum likelihood.
-
-    ``left``: signals at or below it are censored. Bound: exact by the non-central t distribution where nothing is
-    censored, else by the delta method on (decision - mean) / deviation. An extrapolation by the normal law where no
-    signal comes near the decision: look at the signals' distribution first.
-    """
-    values = np.asarray(signals, float).ravel()
-    if len(values) < 3 or not np.all(np.isfinite(values)):
-        raise UserError(f"{len(values)} noise-only signals, or some not finite", legal="three finite signals or more")
-    if left is not None and decision < left:
-        raise UserError(f"decision {decision:g} lies below the noise floor {left:g}")
-    below = np.zeros(len(values), bool) if left is None else values <= left
-    values = values if left is None else np.maximum(values, left)
-    if log_signal and min(values.min(), decision) <= 0:
-        raise UserError("signals or a decision <= 0 have no logarithm", legal="values above 0")
-    y, threshold = (np.log(values), float(np.log(decision))) if log_signal else (values, decision)
-    fit = fit_censored(np.ones((len(y), 1)), y, below, np.zeros(len(y), bool))
-    mean, deviation = float(fit.coefficients[0]), fit.tau
-    z = (threshold - mean) / deviation
-    if below.any():
-        gradient = np.array([-1.0, -z]) / deviation
-        lower = z - float(stats.norm.ppf(confidence) * np.sqrt(gradient @ fit.covariance @ gradient))
-        method = "normal noise, delta method"
-    else:
-        lower, method = _lower_score(z, len(y), confidence), "normal noise, non-central t"
-    return FalseCalls(float(stats.norm.sf(z)), float(stats.norm.sf(lower)), confidence, len(y), method)
 
 
 @dataclass(frozen=True)
@@ -90,7 +31,7 @@ class FalseCallRate:
 
 
 def false_call_rate(calls: int, area_m2: float, confidence: float = 0.95) -> FalseCallRate:
-    """Rate of ``calls`` false calls on ``area_m2`` of unflawed surface as a Poisson count; both limits exact."""
+    """State the rate of ``calls`` false calls on ``area_m2`` of unflawed surface as a Poisson count; limits exact."""
     if calls < 0 or not area_m2 > 0:
         raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="no fewer than 0 calls, an area above 0")
     low, high = poisson_rate(calls, area_m2, confidence)
@@ -144,23 +85,3 @@ def threshold_for_rate(
     bound = float(stats.beta.ppf(confidence, above + 1, n - above))
     rate, upper = -np.log1p(-np.array([(above + 1) / (n + 1), bound])) / area_m2
     return Threshold(value, float(rate), float(upper), confidence, n, above)
-
-
-def _lower_score(z: float, n: int, confidence: float) -> float:
-    """Lower bound of (decision - mean) / deviation: sqrt(n) times its estimate is non-central t, n - 1 degrees.
-
-    ``z`` uses the maximum likelihood deviation (divisor n).
-    """
-    t = z * np.sqrt(n - 1)
-
-    def excess(score: float) -> float:
-        return float(stats.nct.cdf(t, n - 1, np.sqrt(n) * score)) - confidence
-
-    # Far from the estimate SciPy's non-central t is not a number: the bracket grows from the first-order deviation.
-    reach = float(stats.norm.ppf(confidence) * np.sqrt(1 / n + z**2 / (2 * (n - 1))))
-    low, high = z - reach, z
-    while excess(low) < 0:
-        low -= reach
-    while excess(high) > 0:
-        high += reach
-    return float(optimize.brentq(excess, low, high, xtol=1e-10))

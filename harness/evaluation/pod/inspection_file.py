@@ -13,7 +13,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.limits import TABLE_BYTES, bounded_bytes
 
 FEWEST_ROWS = 10
-"""Below this nobody fits two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
+"""Too few below this for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
 SEPARATORS = (",", ";", "\t")
 
 
@@ -32,13 +32,13 @@ class Inspections:
 
     @property
     def targets(self) -> int:
-        """The number of different targets."""
+        """Number of different targets."""
         return len(self.size) if self.target is None else len(set(self.target.tolist()))
 
 
 def read_inspections(path: Path, size: str, response: str, target: str | None = None) -> Inspections:
-    """The named columns of a file with a header row; UTF-8 with or without a byte order mark; comma, semicolon or tab
-    between columns (with the latter two a comma within a number is its decimal mark).
+    """Read the named columns of a file with a header row; UTF-8 with or without a byte order mark; comma, semicolon or
+    tab between columns (with the latter two a comma within a number is its decimal mark).
 
     Raises UserError: no such file, one larger than `limits.TABLE_BYTES`, not UTF-8, a column that is missing, named
     twice or chosen twice, a row of another length, what is no finite number (with its line), fewer than `FEWEST_ROWS`
@@ -65,10 +65,23 @@ def read_inspections(path: Path, size: str, response: str, target: str | None = 
         np.array([_number(path, line, header[place], row[place], separator) for line, row in rows])
         for place in places[:2]
     )
-    names = None if target is None else np.array([_name(path, line, target, row[places[2]]) for line, row in rows])
-    read = Inspections(path, size, response, sizes, responses, names, np.array([line for line, _ in rows]))
-    _one_size_a_target(read)
-    return read
+    lines, names = np.array([line for line, _ in rows]), None
+    if target is not None:
+        texts = [row[places[2]].strip() for _, row in rows]
+        seen: dict[str, int] = {}
+        for k, name in enumerate(texts):
+            if not name:
+                fix = "name the target, or take the row out"
+                raise UserError(f"{path}, line {lines[k]}: {target} is empty", fix=fix)
+            first = seen.setdefault(name, k)
+            if sizes[first] != sizes[k]:
+                raise UserError(
+                    f"{path}: target {name!r} has size {sizes[first]:g} in line {lines[first]} and "
+                    f"{sizes[k]:g} in line {lines[k]}",
+                    fix="give every target one size (the true one), or different targets different names",
+                )
+        names = np.array(texts)
+    return Inspections(path, size, response, sizes, responses, names, lines)
 
 
 def require_hits(read: Inspections) -> None:
@@ -155,23 +168,3 @@ def _number(path: Path, line: int, column: str, text: str, separator: str) -> fl
             fix="mend the row, or take it out",
         )
     return number
-
-
-def _name(path: Path, line: int, column: str, text: str) -> str:
-    if not text.strip():
-        raise UserError(f"{path}, line {line}: {column} is empty", fix="name the target, or take the row out")
-    return text.strip()
-
-
-def _one_size_a_target(read: Inspections) -> None:
-    if read.target is None:
-        return
-    seen: dict[str, int] = {}
-    for row, name in enumerate(read.target.tolist()):
-        first = seen.setdefault(name, row)
-        if read.size[first] != read.size[row]:
-            raise UserError(
-                f"{read.path}: target {name!r} has size {read.size[first]:g} in line {read.line[first]} and "
-                f"{read.size[row]:g} in line {read.line[row]}",
-                fix="give every target one size (the true one), or different targets different names",
-            )

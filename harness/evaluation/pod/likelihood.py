@@ -1,220 +1,228 @@
-"""The likelihood of hits and misses under a link: its value, its slope, and the flat and the steep ends of it.
+"""The likelihood of hits and misses under a link, and the one maximiser of the statistics: many problems at once.
 
-P(hit) = floor + (ceiling - floor) F(b0 + b1 z). Sizes enter as z, centred and scaled to unit spread, so that no unit of
-size makes the maximisation ill-conditioned. For all four links ln F and ln(1 - F) are concave, so without floor and
-ceiling the log-likelihood is concave in (b0, b1) and has one maximum wherever hits and misses overlap.
+P(hit) = floor + (ceiling - floor) F(design @ b + offset). Sizes enter standardised (mean 0, unit spread), so that no
+unit of size makes the maximisation ill-conditioned. For all four links ln F and ln(1 - F) are concave, so without floor
+and ceiling the log-likelihood is concave in b and has one maximum wherever hits and misses overlap. Where they do not,
+Firth's penalty makes the estimate finite.
 
-Sources: McCullagh and Nelder, Generalized Linear Models (1989), sections 2.5 and 4.3; Firth, Biometrika 80 (1993), 27;
-that the penalised estimate is finite for these links: Kosmidis and Firth, Biometrika 108 (2021), 71.
+Sources: McCullagh and Nelder, Generalized Linear Models (1989), sections 2.5 and 4.3; Firth, Biometrika 80 (1993), 27,
+in the form of Kosmidis and Firth, Biometrika 96 (2009), 793; finite for these links: the same, 108 (2021), 71.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, special
+from scipy import optimize
 
-from harness.evaluation.pod.curve import link_ppf
+from harness.evaluation.pod.curve import link_ppf, logs_of_link, slopes_of_link
 
-LARGEST_PREDICTOR = 500.0
-"""|b0 + b1 z| beyond which every link is 0 or 1 to the last bit; exp() of it does not overflow."""
-
-
-@dataclass(frozen=True)
-class Links:
-    """ln F, ln(1 - F) and ln f (the density) at the linear predictor, each of its shape."""
-
-    log_hit: np.ndarray
-    log_miss: np.ndarray
-    log_density: np.ndarray
+STEPS, PLAIN_STEPS = 200, 12
+"""Steps and halvings of a problem at most, and Newton steps that are tried first; five or six are usual."""
+TOLERANCE = 1e-7
+"""A step smaller than this has arrived: Newton's errors are squared with every step."""
 
 
-def logs_of_link(link: str, predictor: np.ndarray) -> Links:
-    """The logarithms that a likelihood is made of, exact in both tails."""
-    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
-    if link == "logit":
-        log_hit, log_miss = -np.logaddexp(0.0, -t), -np.logaddexp(0.0, t)
-        return Links(log_hit, log_miss, log_hit + log_miss)
-    if link == "probit":
-        return Links(special.log_ndtr(t), special.log_ndtr(-t), -0.5 * t * t - 0.5 * np.log(2.0 * np.pi))
-    sign = 1.0 if link == "cloglog" else -1.0
-    hazard = np.exp(sign * t)
-    nearer, other = -hazard, np.log(-np.expm1(-hazard))
-    density = sign * t - hazard
-    return Links(other, nearer, density) if link == "cloglog" else Links(nearer, other, density)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HitsAndMisses:
-    """``z`` (n,) standardised sizes, ``hit`` (n,) booleans, ``link`` one of `LINKS`; ``penalty``: how often
-    Jeffreys' prior (half the logarithm of the information's determinant) is added: 0 for none, 1 for Firth's penalty, k
-    where every target has k rows. ``floor`` and ``ceiling`` are held fixed and counted by `value` alone."""
+    """Hits and misses of one study or of several (d) on the same rows.
 
-    z: np.ndarray
-    hit: np.ndarray
+    ``design`` (n, p): columns of the predictor; ``hits``, ``misses`` (n,) or (d, n) counts; ``link`` one of `LINKS`.
+    ``penalty`` (a number, or (d,)): how often Jeffreys' prior (half the logarithm of the information's determinant) is
+    added: None for never, 1 for Firth's penalty, k where every target has k rows; for p = 2 only. ``floor`` and
+    ``ceiling`` are held fixed and counted by `value` alone.
+    """
+
+    design: np.ndarray
+    hits: np.ndarray
+    misses: np.ndarray
     link: str
-    penalty: float = 0.0
+    penalty: np.ndarray | float | None = None
+    offset: float = 0.0
     floor: float = 0.0
     ceiling: float = 1.0
 
-    def value(self, b0: np.ndarray | float, b1: np.ndarray | float) -> np.ndarray:
-        """(Penalised) log-likelihood at intercepts and slopes of any common shape."""
-        predictor = np.asarray(b0, float)[..., None] + np.asarray(b1, float)[..., None] * self.z
-        logs = logs_of_link(self.link, predictor)
-        found, missed = self._bounded(logs.log_hit, self.floor), self._bounded(logs.log_miss, 1.0 - self.ceiling)
-        value = np.where(self.hit, found, missed).sum(axis=-1)
-        return np.asarray(value + self.penalty * self._jeffreys(logs) if self.penalty else value)
+    @property
+    def z(self) -> np.ndarray:
+        """(n,) sizes: the design's second column."""
+        return np.asarray(self.design[:, 1])
 
-    def information(self, b0: float, b1: float) -> np.ndarray:
-        """(2, 2) expected information of (b0, b1)."""
-        weight = _weight(logs_of_link(self.link, b0 + b1 * self.z))
-        cross = float(weight @ self.z)
-        return np.array([[weight.sum(), cross], [cross, weight @ self.z**2]])
+    def value(self, b: np.ndarray) -> np.ndarray:
+        """(Penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
+        found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
+        if self.floor > 0 or self.ceiling < 1:
+            with np.errstate(divide="ignore"):
+                between = np.log(self.ceiling - self.floor)
+                found = np.logaddexp(np.log(self.floor), between + found)
+                missed = np.logaddexp(np.log(1.0 - self.ceiling), between + missed)
+        value = (self.hits * found + self.misses * missed).sum(axis=-1)
+        if self.penalty is not None:
+            weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])
+            total, cross, square = weight.sum(-1), weight @ self.z, weight @ self.z**2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                prior = 0.5 * (np.log(total) + np.log(np.maximum(square - cross**2 / total, 0.0)))
+            value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
+        return np.asarray(value)
 
-    def slope_and_weight(self, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of each row's log-likelihood by its predictor, and its expected information."""
-        logs = logs_of_link(self.link, predictor)
-        toward = np.where(self.hit, logs.log_hit, logs.log_miss)
-        slope = np.where(self.hit, 1.0, -1.0) * np.exp(logs.log_density - toward)
-        return slope, _weight(logs)
+    def information(self, b: np.ndarray) -> np.ndarray:
+        """(p, p) expected information of one study at b (p,)."""
+        up, down, _ = slopes_of_link(self.link, self.design @ b + self.offset)
+        return np.asarray(self.design.T @ (((self.hits + self.misses) * up * down)[:, None] * self.design))
 
-    def _bounded(self, log_share: np.ndarray, least: float) -> np.ndarray:
-        """ln(least + (ceiling - floor) share), which for floor 0 and ceiling 1 is the link's own."""
-        if self.floor == 0 and self.ceiling == 1:
-            return log_share
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.logaddexp(np.log(least), np.log(self.ceiling - self.floor) + log_share))
+    def step(self, b: np.ndarray) -> np.ndarray:
+        """(d, p) Newton steps of (d,) studies at b (d, p), scoring steps under a penalty; where the information is
+        singular, in studies that have run off to infinity, without meaning."""
+        up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
+        slope = self.hits * up - self.misses * down
+        with np.errstate(all="ignore"):
+            if self.penalty is not None:
+                z, weight = self.z, (self.hits + self.misses) * up * down
+                total, cross, square = weight.sum(axis=1), weight @ z, weight @ z**2
+                determinant = total * (square - cross**2 / total)
+                leverage = weight * (square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2)
+                leverage /= determinant[:, None]
+                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (2.0 * bend - up + down)
+                first, second = slope.sum(axis=1), slope @ z
+                along = np.stack([square * first - cross * second, total * second - cross * first], axis=1)
+                return np.asarray(along / determinant[:, None])
+            if self.link == "logit":  # the same in fewer operations
+                weight = (self.hits + self.misses) * up * down
+            else:
+                weight = self.hits * up * np.maximum(up - bend, 0.0) + self.misses * down * np.maximum(down + bend, 0.0)
+            p = self.design.shape[1]
+            if p == 1:
+                return np.asarray((slope @ self.design) / (weight @ self.design**2))
+            products = (self.design[:, :, None] * self.design[:, None, :]).reshape(-1, p * p)
+            information = (weight @ products).reshape(-1, p, p)
+            ridge = (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(p)
+            return np.asarray(np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0])
 
-    def _jeffreys(self, logs: Links) -> np.ndarray:
-        weight = _weight(logs)
-        total, cross, square = weight.sum(-1), (weight * self.z).sum(-1), (weight * self.z**2).sum(-1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            centred = square - cross**2 / total
-            penalty = 0.5 * (np.log(total) + np.log(np.maximum(centred, 0.0)))
-        return np.asarray(np.where(np.isfinite(penalty), penalty, -np.inf))
+    def of(self, rows: np.ndarray) -> HitsAndMisses:
+        """Some of several studies."""
+        penalty = None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
+        return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
 
 
-def _weight(logs: Links) -> np.ndarray:
-    return np.asarray(np.exp(2.0 * logs.log_density - logs.log_hit - logs.log_miss))
+def ascend(
+    value_and_step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    start: np.ndarray,
+    tolerance: float = TOLERANCE,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The maxima (d, p) that steps reach from ``start`` (d, p), and their values (d,).
 
-
-def maximum(data: HitsAndMisses) -> tuple[float, float]:
-    """(b0, b1) of the largest likelihood by Fisher scoring with halved steps; hits and misses must overlap."""
-    design = np.column_stack([np.ones_like(data.z), data.z])
-    place = np.array([float(link_ppf(data.link, np.mean(data.hit))), 0.0])
-    value = float(data.value(*place))
-    for _ in range(200):
-        slope, weight = data.slope_and_weight(design @ place)
-        step = np.linalg.solve(design.T @ (weight[:, None] * design), design.T @ slope)
-        while (better := float(data.value(*(place + step)))) < value and np.abs(step).max() > 1e-13:
-            step = step / 2.0
-        if better < value:
+    ``value_and_step(places (k, p), which (k,))`` of the problems ``which``. A step that lowers the value is halved, a
+    problem that has arrived rests; one without a maximum ends where the steps ran out.
+    """
+    place, moving = start.copy(), np.arange(len(start))
+    best, step = value_and_step(place, moving)
+    for _ in range(STEPS):
+        moving = moving[np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))]
+        if not len(moving):
             break
-        place, value = place + step, better
-        if np.abs(step).max() <= 1e-11 * (1.0 + np.abs(place).max()):
-            break
-    return float(place[0]), float(place[1])
-
-
-def penalised_maximum(data: HitsAndMisses) -> tuple[float, float]:
-    """(b0, b1) of the largest penalised likelihood, which is finite for separated data too (`data.penalty`). Under
-    cloglog and loglog it can have several maxima: the higher one is taken from a flat start, from the first and from
-    the best of `steep_starts`."""
-    flat = np.array([float(link_ppf(data.link, np.mean(data.hit))), 1.0])
-    steep = steep_starts(float(data.z[~data.hit].max()), float(data.z[data.hit].min()))
-    best_steep = steep[int(np.argmax([data.value(*one) for one in steep]))]
-    found = [
-        optimize.minimize(
-            lambda place: -float(data.value(place[0], place[1])),
-            start,
-            method="Nelder-Mead",
-            options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 5000, "maxfev": 5000},
+        trial = place[moving] + step[moving]
+        value, following = value_and_step(trial, moving)
+        better = value >= best[moving] - 1e-13 * np.abs(value)
+        ahead = moving[better]
+        place[ahead], best[ahead], step[ahead] = (
+            trial[better],
+            np.maximum(value[better], best[ahead]),
+            following[better],
         )
-        for start in (flat, steep[0], best_steep)
-    ]
-    best = min(found, key=lambda one: float(one.fun))
-    return float(best.x[0]), float(best.x[1])
+        step[moving[~better]] *= 0.5
+    return place, best
 
 
-def steep_starts(below: np.ndarray | float, above: np.ndarray | float) -> np.ndarray:
-    """(k, 2, ...) intercepts and slopes of curves that rise between the largest miss ``below`` and the smallest hit
-    ``above``, in sizes of unit spread: the first with predictors -1.5 and 1.5 there (where they are not too close), the
-    others of several widths through both ends and the middle."""
-    gap = np.asarray(above, float) - below
-    fitting = np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0)
-    widths = [(slope * np.ones_like(gap), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
-    return np.array([(-slope * (below + share * gap), slope) for slope, share in ((fitting, 0.5), *widths)])
+def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """(d, p) coefficients with the largest likelihood of several studies, from ``start`` (p,); without a penalty.
+
+    Hits and misses of every study must overlap, else its coefficients end where the steps ran out. Plain Newton steps
+    need no values and nearly always arrive, and where they do, it is at the maximum; the others are searched again.
+    """
+    place = np.tile(np.asarray(start, float), (len(data.hits), 1))
+    moving = np.arange(len(place))
+    for _ in range(PLAIN_STEPS):
+        if not len(moving):
+            return place
+        with np.errstate(all="ignore"):
+            step = (data if len(moving) == len(place) else data.of(moving)).step(place[moving])
+            place[moving] += step
+        moving = moving[~(np.abs(step).max(axis=1) <= tolerance)]
+    begin = np.tile(np.asarray(start, float), (len(moving), 1))
+    place[moving], _ = ascend(_of(data.of(moving)), begin, tolerance)
+    return place
 
 
-def slope_of_log_density(link: str, predictor: np.ndarray) -> np.ndarray:
-    """d ln f / dt at t = ``predictor``, f the link's density."""
-    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
-    if link == "logit":
-        return np.asarray(-np.tanh(0.5 * t))
-    if link == "probit":
-        return np.asarray(-t)
-    return np.asarray(1.0 - np.exp(t) if link == "cloglog" else np.exp(-t) - 1.0)
+def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
+    """(d, 2) intercepts and slopes with the largest penalised likelihood of several studies, finite for separated data
+    too. Logit and probit have one maximum; under cloglog and loglog the highest is taken that is reached from a flat
+    start, from a curve that fits the gap between the largest miss and the smallest hit, and from the best of others."""
+    z, hits = data.z, data.hits
+    below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
+    gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
+    # Predictors of -1.5 and 1.5 at the ends of the gap, where these are not too close; then several widths through
+    # both its ends and its middle.
+    widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
+    widths += [(np.full_like(gap, slope), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
+    steep = np.array([np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths])
+    climb = _of(data)
+    if data.link in ("logit", "probit"):
+        return ascend(climb, steep[0], tolerance)[0]
+    share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
+    flat = np.stack([link_ppf(data.link, share), np.ones(len(hits))], axis=1)
+    rows = np.arange(len(hits))
+    best = steep[np.array([data.value(start) for start in steep]).argmax(axis=0), rows]
+    found = [ascend(climb, start, tolerance) for start in (flat, steep[0], best)]
+    return np.asarray(np.array([place for place, _ in found])[np.argmax([value for _, value in found], axis=0), rows])
 
 
-def profile(data: HitsAndMisses, z0: float, predictor: float) -> float:
-    """Largest (penalised) log-likelihood of the rising curves (b1 >= 0) whose predictor is ``predictor`` at ``z0``."""
-    return _penalised_profile(data, z0, predictor) if data.penalty else _plain_profile(data, z0, predictor)
+def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
+    """Largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is ``level`` at
+    ``z0``, and the slope there; ``slope``: where the search begins, such as the slope at a neighbouring ``z0``."""
+    if data.penalty is not None:  # not proved to be concave, so the search begins with a grid
+        rising = _largest(
+            lambda s: data.value(np.stack([level - np.exp(s) * z0, np.exp(s)], axis=-1)), PENALISED_SLOPES
+        )
+        return max(rising, float(data.value(np.array([level, 0.0])))), slope
+    line = replace(data, design=data.z[:, None] - z0, offset=level, hits=data.hits[None], misses=data.misses[None])
+    best = np.maximum(maxima(line, np.array([slope]), 1e-5), 0.0)
+    return float(line.value(best)[0]), float(best[0, 0])
 
 
-def _plain_profile(data: HitsAndMisses, z0: float, predictor: float) -> float:
-    """Newton on the concave function of b1 alone, kept inside a bracket of its slope's change of sign."""
-    away = data.z - z0
-
-    def slope_of(b1: float) -> tuple[float, float]:
-        slope, weight = data.slope_and_weight(predictor + b1 * away)
-        return float(slope @ away), float(weight @ away**2)
-
-    low, high, b1 = 0.0, np.inf, 0.0
-    for _ in range(200):
-        slope, curvature = slope_of(b1)
-        if slope <= 0 and b1 == 0.0:
-            break
-        low, high = (b1, high) if slope > 0 else (low, b1)
-        step = b1 + slope / curvature if curvature > 0 else np.inf
-        if not low < step < high:
-            step = 0.5 * (low + high) if np.isfinite(high) else 2.0 * low + 1.0
-        if not np.isfinite(high):
-            step = min(step, 4.0 * low + 10.0)
-        if abs(step - b1) <= 1e-11 * (1.0 + b1):
-            break
-        b1 = step
-    return float(data.value(predictor - b1 * z0, b1))
+PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
+"""Natural logarithms of the slopes that a penalised profile is searched at first."""
 
 
-def _penalised_profile(data: HitsAndMisses, z0: float, predictor: float) -> float:
-    """The penalised function of b1 alone, searched over ln b1 from a coarse grid: it is not proved to be concave."""
+def flat_maximum(data: HitsAndMisses, highest: float) -> float:
+    """Largest (penalised) log-likelihood of one study's curves that do not rise at all, with a predictor of at most
+    ``highest``: the limit of `profile` as ``z0`` grows without end."""
+    if data.penalty is None:
+        rate = data.hits.sum() / (data.hits + data.misses).sum()
+        return float(data.value(np.array([min(highest, float(link_ppf(data.link, rate))), 0.0])))
+    levels = np.linspace(highest - 12.0, highest, 400)
+    largest = _largest(lambda level: data.value(np.stack([level, 0.0 * level], axis=-1)), levels)
+    return max(largest, float(data.value(np.array([highest, 0.0]))))
 
-    def value(log_b1: np.ndarray | float) -> np.ndarray:
-        b1 = np.exp(log_b1)
-        return data.value(predictor - b1 * z0, b1)
 
-    grid = np.linspace(np.log(1e-8), np.log(1e4), 140)
-    best = int(np.argmax(value(grid)))
+def _of(data: HitsAndMisses) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Values and steps of several studies, for `ascend`."""
+
+    def value_and_step(places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        some = data.of(which)
+        value = some.value(places)
+        return np.where(np.isfinite(value), value, -np.inf), some.step(places)
+
+    return value_and_step
+
+
+def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
+    """Largest value of a function of one number, refined between the best place of a grid and its neighbours."""
+    best = int(np.argmax(function(grid)))
     found = optimize.minimize_scalar(
-        lambda log_b1: -float(value(log_b1)),
+        lambda at: -float(function(np.asarray(at))),
         bounds=(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]),
         method="bounded",
         options={"xatol": 1e-9},
     )
-    return float(max(-found.fun, data.value(predictor, 0.0)))
-
-
-def flat_maximum(data: HitsAndMisses, highest: float) -> float:
-    """Largest (penalised) log-likelihood of curves that do not rise at all, with a predictor of at most ``highest``:
-    what `profile` tends to as ``z0`` grows without end."""
-    if not data.penalty:
-        return float(data.value(min(highest, float(link_ppf(data.link, np.mean(data.hit)))), 0.0))
-    levels = np.linspace(highest - 12.0, highest, 400)
-    best = int(np.argmax(data.value(levels, 0.0)))
-    found = optimize.minimize_scalar(
-        lambda level: -float(data.value(level, 0.0)),
-        bounds=(levels[max(best - 1, 0)], levels[min(best + 1, len(levels) - 1)]),
-        method="bounded",
-    )
-    return float(max(-found.fun, data.value(highest, 0.0)))
+    return float(-found.fun)

@@ -17,8 +17,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from harness.evaluation.pod.curve import Bound, link_cdf, link_ppf
-from harness.evaluation.pod.floor_ceiling import Bounded, bounded_profile, most_likely_below
-from harness.evaluation.pod.hit_miss import HitMissFit
+from harness.evaluation.pod.hit_miss import HitMissFit, bounded_profile, most_likely_below
 from harness.evaluation.pod.likelihood import flat_maximum, profile
 from harness.vocabulary.errors import UserError
 
@@ -49,11 +48,10 @@ def bound(
         raise UserError(f"design effect {design_effect:g} is out of range", legal="above 0")
     if pod <= fit.curve.floor:
         raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
-    repeats = design_effect * fit.repeats
     if method == "wald":
-        x, why = _wald_bound(fit, pod, confidence, repeats)
+        x, why = _wald_bound(fit, pod, confidence, design_effect)
     else:
-        x, why = _likelihood_bound(fit, pod, criterion(method, confidence) * repeats)
+        x, why = _likelihood_bound(fit, pod, criterion(method, confidence) * design_effect * fit.repeats)
     with np.errstate(over="ignore"):
         value = float(np.exp(x)) if fit.curve.log_size else x
     if not np.isfinite(value):
@@ -71,7 +69,8 @@ def band(
     x = np.log(sizes) if fit.curve.log_size else np.asarray(sizes, float)
     if method == "wald":
         middle = fit.b0 + fit.b1 * x
-        reach = _normal(confidence) * np.sqrt(_variance(fit.covariance, x))
+        v = fit.covariance
+        reach = float(stats.norm.ppf(confidence)) * np.sqrt(v[0, 0] + 2.0 * x * v[0, 1] + x**2 * v[1, 1])
         low, high = middle - reach, middle + reach
     else:
         outline = _outline(fit, criterion(method, confidence) * fit.repeats)
@@ -83,19 +82,19 @@ def band(
 
 
 def criterion(method: str, confidence: float) -> float:
-    """What 2 (llmax - ll) may reach: 3.841 for the likelihood ratio, 2.706 for the one-sided profile, at 95 %."""
+    """Largest 2 (llmax - ll) in the set: 3.841 for the likelihood ratio, 2.706 for the one-sided profile, at 95 %."""
     share = confidence if method == "likelihood ratio" else 2.0 * confidence - 1.0
     return float(stats.chi2.ppf(share, 1))
 
 
 def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
     """The largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and why."""
-    data, z_best = fit.data, (_x_at(fit, pod) - fit.centre) / fit.spread
-    place = Bounded(
-        fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread, fit.curve.floor, fit.curve.ceiling, fit.log_likelihood
-    )
-    top = float(data.value(place.b0, place.b1))
-    level = float(link_ppf(fit.curve.link, np.array(pod)))
+    data, place, level = fit.data, fit.place, float(link_ppf(fit.curve.link, np.array(pod)))
+    share = (pod - fit.curve.floor) / (fit.curve.ceiling - fit.curve.floor)
+    # The curve's middle where floor or ceiling keep it from this POD.
+    z_best = fit.curve.mu + fit.curve.sigma * (float(link_ppf(fit.curve.link, np.array(share))) if 0 < share < 1 else 0)
+    z_best = (z_best - fit.centre) / fit.spread
+    top = float(data.value(place[:2]))
     plain = replace(data, floor=0.0, ceiling=1.0)
     flat = 2.0 * (top - flat_maximum(plain, level))
     if flat <= allowed:
@@ -104,10 +103,16 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     if low <= allowed:
         return float("inf"), f"a ceiling of {pod:.0%} or less fits too (ratio {low:.2f} <= {allowed:.2f})"
 
+    slope = place[1]
+
     def excess(z: float) -> float:
+        """The root of the ratio, which grows about linearly with z, less that of the criterion."""
+        nonlocal slope
         if fit.bounded == "none":
-            return 2.0 * (top - profile(plain, z, level)) - allowed
-        return 2.0 * (top - bounded_profile(data, place, fit.bounded, z, pod)) - allowed
+            value, slope = profile(plain, z, level, slope)
+        else:
+            value = bounded_profile(data, place, fit.bounded, z, pod)
+        return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
 
     reach = 0.25
     while excess(z_best + reach) <= 0:
@@ -119,12 +124,12 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     return fit.centre + fit.spread * float(z), ""
 
 
-def _wald_bound(fit: HitMissFit, pod: float, confidence: float, repeats: float) -> tuple[float, str]:
+def _wald_bound(fit: HitMissFit, pod: float, confidence: float, design_effect: float) -> tuple[float, str]:
     """The root of (b0 + b1 x - t)^2 = z^2 Var(b0 + b1 x) above the estimate; none where the slope may be 0."""
     if fit.bounded != "none":
         raise UserError("no Wald bound with a floor or a ceiling", legal="likelihood ratio, profile")
-    level, z2 = float(link_ppf(fit.curve.link, np.array(pod))), _normal(confidence) ** 2
-    v = fit.covariance / fit.repeats * repeats
+    level, z2 = float(link_ppf(fit.curve.link, np.array(pod))), float(stats.norm.ppf(confidence)) ** 2
+    v = fit.covariance * design_effect
     square = fit.b1**2 - z2 * v[1, 1]
     if square <= 0:
         return float("inf"), f"the slope is within {np.sqrt(z2):.3f} standard errors of 0"
@@ -133,34 +138,30 @@ def _wald_bound(fit: HitMissFit, pod: float, confidence: float, repeats: float) 
     return float((-half + np.sqrt(max(half**2 - square * constant, 0.0))) / square), ""
 
 
-def _x_at(fit: HitMissFit, pod: float) -> float:
-    """x (size or ln size) of this POD on the fitted curve; its middle where floor or ceiling keep it from that."""
-    share = (pod - fit.curve.floor) / (fit.curve.ceiling - fit.curve.floor)
-    if not 0 < share < 1:
-        return fit.curve.mu
-    return fit.curve.mu + fit.curve.sigma * float(link_ppf(fit.curve.link, np.array(share)))
-
-
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0.
 
     Along directions evenly spread in the metric of the covariance; a concave likelihood crosses it once in each.
     """
-    data = fit.data
-    best = np.array([fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread])
+    data, best = fit.data, fit.place[:2]
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
-    root = np.linalg.cholesky(scale @ fit.covariance_of_rows @ scale.T)
+    metric = scale @ fit.covariance_of_rows @ scale.T
+    try:
+        root = np.linalg.cholesky(metric)
+    except np.linalg.LinAlgError:  # a step, whose covariance is singular: any metric will do that spans both directions
+        spread, directions = np.linalg.eigh(metric)
+        root = directions * np.sqrt(np.maximum(spread, 1e-4 * max(float(spread[-1]), 1e-8)))
     angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
     step = np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T
     with np.errstate(divide="ignore"):
         farthest = np.where(step[:, 1] < 0, -best[1] / step[:, 1], np.inf)
-    lowest = float(data.value(*best)) - 0.5 * allowed
-    inside = _distances(lambda r: data.value(best[0] + r * step[:, 0], best[1] + r * step[:, 1]) - lowest, farthest)
+    lowest = float(data.value(best)) - 0.5 * allowed
+    inside = _distances(lambda r: data.value(best + r[:, None] * step) - lowest, farthest)
     return np.asarray(best + inside[:, None] * step)
 
 
 def _distances(excess: Callable[[np.ndarray], np.ndarray], farthest: np.ndarray) -> np.ndarray:
-    """Where ``excess``, above 0 at distance 0, falls through 0, direction by direction; the farthest looked at
+    """Find where ``excess``, above 0 at distance 0, falls through 0, direction by direction; the farthest looked at
     where it does not.
 
     Doubled distances bracket it, then the Illinois variant of the false position (Dowell and Jarratt, BIT 11 (1971)).
@@ -189,14 +190,6 @@ def _distances(excess: Callable[[np.ndarray], np.ndarray], farthest: np.ndarray)
         if np.all(ends | (outside - inside <= 1e-9 * outside) | (np.abs(value) <= 1e-9)):
             break
     return np.where(ends, outside, r)
-
-
-def _variance(covariance: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.asarray(covariance[0, 0] + 2.0 * x * covariance[0, 1] + x**2 * covariance[1, 1])
-
-
-def _normal(confidence: float) -> float:
-    return float(stats.norm.ppf(confidence))
 
 
 def _check(pod: float, confidence: float, method: str) -> None:

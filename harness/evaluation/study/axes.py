@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.evaluation.intervals import Interval
+from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.over_boards import percentiles
 from harness.vocabulary.seeds import canonical_json
 
 FRAMES = "capture.frames"
@@ -39,7 +38,7 @@ class Difference:
 
     @property
     def beyond_chance(self) -> bool:
-        """Whether the interval leaves out 1."""
+        """Return whether the interval leaves out 1."""
         return self.interval.above(1.0) or self.interval.below(1.0)
 
 
@@ -57,57 +56,52 @@ class AxisLine:
 
     @property
     def numeric(self) -> bool:
-        """Whether the axis can be drawn to scale."""
-        return all(isinstance(value, int | float) and not isinstance(value, bool) for value in self.values)
+        """Return whether the axis can be drawn to scale."""
+        return all(_is_number(value) for value in self.values)
 
 
 def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
-    """Every line of two set-ups or more, axis by axis; frames last."""
+    """Find every line of two set-ups or more, axis by axis; frames last."""
     places = [{**limit.record.axes, FRAMES: limit.record.frames} for limit in limits]
-    axes = list(dict.fromkeys(name for place in places for name in place))
     lines = []
-    for axis in axes:
+    for axis in dict.fromkeys(name for place in places for name in place):
         groups: dict[str, list[int]] = {}
         for index, place in enumerate(places):
             if axis in place:
-                held = {name: value for name, value in place.items() if name != axis}
-                groups.setdefault(canonical_json(held), []).append(index)
+                groups.setdefault(canonical_json({name: place[name] for name in place if name != axis}), []).append(
+                    index
+                )
         for members in groups.values():
-            ordered = _ascending([(places[index][axis], limits[index]) for index in members])
-            if len(ordered) > 1:
-                held = {name: value for name, value in places[members[0]].items() if name != axis}
-                lines.append(_line(axis, held, ordered))
+            if all(_is_number(places[index][axis]) for index in members):
+                members = sorted(members, key=lambda index: places[index][axis])
+            if len(members) > 1:
+                line = tuple(limits[index] for index in members)
+                lines.append(
+                    AxisLine(
+                        axis=axis,
+                        held={name: value for name, value in places[members[0]].items() if name != axis},
+                        values=tuple(places[index][axis] for index in members),
+                        limits=line,
+                        steps=tuple(difference(one, other) for one, other in pairwise(line)),
+                        whole=difference(line[0], line[-1]),
+                    )
+                )
     return tuple(lines)
 
 
 def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
-    """How a90 changes from one set-up to another."""
-    paired = _same_boards(frm, to)
+    """Compare a90 of one set-up with that of another.
+
+    Boards of one family keep number, places and sizes where something else is changed, such as depth or albedo. Those
+    whose trials failed in one of the two are missing there, and draws of different boards are no pairs.
+    """
+    a, b = frm.record.inspected, to.record.inspected
+    paired = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("board", "hole", "x_mm", "y_mm"))
     before, after = frm.a90_draws_mm, to.a90_draws_mm
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = after / before if paired else np.divide.outer(after, before).ravel()
         return Difference(frm, to, float(np.divide(to.a90_mm, frm.a90_mm)), percentiles(ratios), paired)
 
 
-def _same_boards(frm: SetUpLimit, to: SetUpLimit) -> bool:
-    """Boards of one family keep number, places and sizes where something else is changed, such as depth or albedo.
-    Those whose trials failed in one of the two are missing there, and draws of different boards are no pairs."""
-    a, b = frm.record.inspected, to.record.inspected
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("board", "hole", "x_mm", "y_mm"))
-
-
-def _ascending(members: list[tuple[Any, SetUpLimit]]) -> list[tuple[Any, SetUpLimit]]:
-    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value, _ in members)
-    return sorted(members, key=lambda member: member[0]) if numbers else members
-
-
-def _line(axis: str, held: Mapping[str, Any], ordered: list[tuple[Any, SetUpLimit]]) -> AxisLine:
-    limits = tuple(limit for _, limit in ordered)
-    return AxisLine(
-        axis=axis,
-        held=held,
-        values=tuple(value for value, _ in ordered),
-        limits=limits,
-        steps=tuple(difference(one, other) for one, other in pairwise(limits)),
-        whole=difference(limits[0], limits[-1]),
-    )
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,4 +1,4 @@
-"""Hits by chance: how often a damage would be found though the detector saw nothing of it.
+"""Hits by chance: the rate at which damage would be found though the detector saw nothing of it.
 
 Positions are shuffled: the places of one board's damage are laid over the findings of every other run that count for no
 damage, on damaged boards and on hole-free ones. The share of places with one within the hit radius is the probability
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval, clopper_pearson
+from harness.evaluation.intervals import UNKNOWN, Interval, clopper_pearson, percentiles
 from harness.evaluation.pod.false_calls import FalseCallRate
-from harness.evaluation.study.over_boards import DRAWS, board_weights, percentiles, row_weights
+from harness.evaluation.study.over_boards import DRAWS, board_weights, row_weights
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,7 +41,7 @@ class ChanceHits:
     sites_over_boards: Interval
 
     def without(self, pod: float) -> float:
-        """POD by sight alone: (POD - chance) / (1 - chance), 0 where chance explains all."""
+        """Return POD by sight alone: (POD - chance) / (1 - chance), 0 where chance explains all."""
         return max(0.0, (pod - self.probability) / (1 - self.probability)) if self.probability < 1 else 0.0
 
 
@@ -54,12 +54,18 @@ def chance_hits(
     rate: FalseCallRate | None = None,
     draws: int = DRAWS,
 ) -> ChanceHits:
-    """Chance hits of one set-up at one number of frames, from its rows of the study's tables."""
+    """Count chance hits of one set-up at one number of frames, from its rows of the study's tables."""
     places = holes.drop_duplicates(["board", "hole"])
-    damaged, flawless = (_hit_counts(places, runs, findings, role, radius_mm) for role in ("damaged", "hole_free"))
-    probability, laid, drawn = _shuffled(places, damaged, flawless, draws)
+    probability, laid, drawn = _shuffled(places, runs, findings, radius_mm, draws)
     area_m2 = np.pi * (radius_mm / 1000) ** 2
-    found, n, over_boards = _sites(sites, draws)
+    n, found, over_boards = 0, 0.0, UNKNOWN
+    if not sites.empty:
+        share = sites.groupby(["board", "hole"], sort=True)["detected"].mean()
+        board, shares = share.index.get_level_values("board").to_numpy(), share.to_numpy(float)
+        n, found = len(shares), float(shares.sum())
+        if len(np.unique(board)) > 1 and found:
+            weights = row_weights(board, draws, "hole-free")
+            over_boards = percentiles((weights @ shares) / weights.sum(axis=1))
     low, high = clopper_pearson(found, n)
     expected_upper = np.nan if rate is None else float(-np.expm1(-rate.upper_per_m2 * area_m2))
     return ChanceHits(
@@ -77,68 +83,35 @@ def chance_hits(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Counts:
-    """``hits`` (i, j): places of damaged board i that have a finding of board j near, over all j's ``runs`` (j,)."""
-
-    boards: np.ndarray
-    runs: np.ndarray
-    hits: np.ndarray
-
-
-def _hit_counts(
-    places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, role: str, radius_mm: float
-) -> _Counts:
-    ran = runs[runs["role"] == role]
-    boards, runs_of = np.unique(ran["board"].to_numpy(), return_counts=True)
-    names, of_place = np.unique(places["board"].to_numpy(), return_inverse=True)
-    counts = np.zeros((len(names), len(boards)))
-    if findings.empty:
-        return _Counts(boards, runs_of.astype(float), counts)
-    unmatched = findings[(findings["role"] == role) & (findings["hole"] == "")]
-    at = places[["true_x_mm", "true_y_mm"]].to_numpy(float)
-    for _, here in unmatched.groupby(["board", "repeat"], sort=True):
-        offset = at[:, None] - here[["x_mm", "y_mm"]].to_numpy(float)
-        near = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
-        column = int(np.searchsorted(boards, here["board"].iloc[0]))
-        counts[:, column] += np.bincount(of_place, near, len(names))
-    return _Counts(boards, runs_of.astype(float), counts)
-
-
-def _shuffled(places: pd.DataFrame, damaged: _Counts, flawless: _Counts, draws: int) -> tuple[float, int, np.ndarray]:
+def _shuffled(
+    places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float, draws: int
+) -> tuple[float, int, np.ndarray]:
     """The share of places with a finding near, the number of places laid, and the share of boards drawn again."""
-    names, size = np.unique(places["board"].to_numpy(), return_counts=True)
-    other = (names[:, None] != damaged.boards).astype(float)
-    hits, laid = damaged.hits * other, size[:, None] * damaged.runs * other
-    hits_free, laid_free = flawless.hits, size[:, None] * flawless.runs
-    total = laid.sum() + laid_free.sum()
-    if not total:
+    names, of_place, size = np.unique(places["board"].to_numpy(), return_inverse=True, return_counts=True)
+    at = places[["true_x_mm", "true_y_mm"]].to_numpy(float)
+    w = board_weights(len(names), draws)
+    hits, laid, weights = [], [], []
+    for role in ("damaged", "hole_free"):
+        boards, runs_of = np.unique(runs["board"][runs["role"] == role].to_numpy(), return_counts=True)
+        counts = np.zeros((len(names), len(boards)))  # places of board i that have a finding of board j near
+        if not findings.empty:
+            unmatched = findings[(findings["role"] == role) & (findings["hole"] == "")]
+            for _, here in unmatched.groupby(["board", "repeat"], sort=True):
+                offset = at[:, None] - here[["x_mm", "y_mm"]].to_numpy(float)
+                near = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
+                counts[:, np.searchsorted(boards, here["board"].iloc[0])] += np.bincount(of_place, near, len(names))
+        other = np.ones_like(counts)
+        if role == "damaged":  # a board's places are not laid over its own runs
+            other = (names[:, None] != boards).astype(float)
+            where = np.minimum(np.searchsorted(names, boards), len(names) - 1)
+            weights.append(np.where(names[where] == boards, w[:, where], 0.0))  # none without places
+        else:
+            weights.append(board_weights(len(boards), draws, "hole-free") if len(boards) else np.zeros((draws, 0)))
+        hits.append(counts * other)
+        laid.append(size[:, None] * runs_of * other)
+    all_hits, all_laid, of_runs = (np.column_stack(parts) for parts in (hits, laid, weights))
+    if not all_laid.sum():
         return np.nan, 0, np.full(draws, np.nan)
-    w, v = board_weights(len(names), draws), _weights_of(len(flawless.boards), draws)
-    of_damaged = np.column_stack([_laid_weights(w, names, damaged.boards), v])
-    both, all_laid = np.column_stack([hits, hits_free]), np.column_stack([laid, laid_free])
     with np.errstate(invalid="ignore", divide="ignore"):
-        drawn = ((w @ both) * of_damaged).sum(axis=1) / ((w @ all_laid) * of_damaged).sum(axis=1)
-    return float((hits.sum() + hits_free.sum()) / total), int(total), drawn
-
-
-def _weights_of(boards: int, draws: int) -> np.ndarray:
-    return board_weights(boards, draws, "hole-free") if boards else np.zeros((draws, 0))
-
-
-def _laid_weights(weights: np.ndarray, names: np.ndarray, boards: np.ndarray) -> np.ndarray:
-    """(draws, boards) weights of the boards whose runs are laid on; a damaged board without places has none."""
-    at = np.minimum(np.searchsorted(names, boards), len(names) - 1)
-    return np.where(names[at] == boards, weights[:, at], 0.0)
-
-
-def _sites(sites: pd.DataFrame, draws: int) -> tuple[float, int, Interval]:
-    """Sites found (a site's repeats count as shares of one), sites, and the share's interval over boards."""
-    if sites.empty:
-        return 0.0, 0, UNKNOWN
-    share = sites.groupby(["board", "hole"], sort=True)["detected"].mean()
-    board, found = share.index.get_level_values("board").to_numpy(), share.to_numpy(float)
-    if len(np.unique(board)) < 2 or not found.any():
-        return float(found.sum()), len(found), UNKNOWN
-    weights = row_weights(board, draws, "hole-free")
-    return float(found.sum()), len(found), percentiles((weights @ found) / weights.sum(axis=1))
+        drawn = ((w @ all_hits) * of_runs).sum(axis=1) / ((w @ all_laid) * of_runs).sum(axis=1)
+    return float(all_hits.sum() / all_laid.sum()), int(all_laid.sum()), drawn

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval
-from harness.evaluation.study.over_boards import DRAWS, board_weights, percentiles, row_weights
+from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
+from harness.evaluation.study.over_boards import DRAWS, board_weights, row_weights
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,8 +46,8 @@ class Roc:
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
-    """At ``threshold`` (k,), descending: ``false_calls_per_m2`` (k,), ``found`` (k,) share of all damages,
-    ``found_low`` and ``found_high`` (k,) its interval over boards. ``large_found`` (k,): share of those of a50 and more
+    """Shares and rates at ``threshold`` (k,), descending: ``false_calls_per_m2`` (k,), ``found`` (k,) share of all
+    damages with ``found_low``, ``found_high`` (k,) over boards. ``large_found`` (k,): share of those of a50 and more
     whose signal is above it, None without them. ``at``: (false calls per m2, found) at the threshold in use;
     ``area_m2`` of hole-free boards inspected.
     """
@@ -82,7 +82,7 @@ class PixelCurves:
 def roc_curves(
     holes: pd.DataFrame, sites: pd.DataFrame, threshold: float, a50_mm: float, a90_mm: float, draws: int = DRAWS
 ) -> tuple[Roc, ...]:
-    """ROC of all damages, and of those below a50, from a50 to a90 and above, where there are any."""
+    """Draw the ROC of all damages, and of those below a50, from a50 to a90 and above, where there are any."""
     if holes.empty or sites.empty:
         return ()
     size = holes["true_diameter_mm"].to_numpy(float)
@@ -92,7 +92,32 @@ def roc_curves(
         "a50 to a90": (size >= a50_mm) & (size < a90_mm),
         "a90 and above": size >= a90_mm,
     }
-    return tuple(_roc(name, holes[of], sites, threshold, draws) for name, of in classes.items() if of.any())
+    negative, found = _signal(sites), []
+    of_free = row_weights(sites["board"].to_numpy(), draws, "hole-free")
+    for name, of in classes.items():
+        damages, positive = holes[of], _signal(holes[of])
+        if not len(damages):
+            continue
+        levels = np.unique(np.concatenate([positive, negative]))[::-1]
+        false, true = (1 - np.searchsorted(np.sort(s), levels, "left") / len(s) for s in (negative, positive))
+        area = _rank_area(positive, negative, np.ones((1, len(positive))), np.ones((1, len(negative))))
+        interval = UNKNOWN
+        if min(len(np.unique(table["board"])) for table in (damages, sites)) > 1:
+            of_damaged = row_weights(damages["board"].to_numpy(), draws)
+            interval = percentiles(_rank_area(positive, negative, of_damaged, of_free))
+        found.append(
+            Roc(
+                name=name,
+                false=np.concatenate([[0.0], false]),
+                true=np.concatenate([[0.0], true]),
+                at=(float((negative > threshold).mean()), float((positive > threshold).mean())),
+                area=float(area[0]),
+                area_interval=interval,
+                damages=len(positive),
+                unflawed=len(negative),
+            )
+        )
+    return tuple(found)
 
 
 def free_response(
@@ -102,7 +127,7 @@ def free_response(
     a50_mm: float,
     draws: int = DRAWS,
 ) -> FreeResponse | None:
-    """The free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
+    """Draw the free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
     threshold was counted.
 
     Thresholds with fewer false calls than a higher one has are left out: that far down findings run into one another,
@@ -121,15 +146,16 @@ def free_response(
     # A board that was too full for any damage has runs, and no inspections.
     counted = damaged.pivot_table("hits", "board", "threshold", "sum", sort=True).reindex(of_board.index, fill_value=0)
     hits, inspections = counted[thresholds].to_numpy(float), of_board.to_numpy(float)
-    low, high = _columns_percentiles(_shares(hits, inspections, draws))
+    weights = board_weights(len(inspections), draws)
+    edges = [percentiles(column) for column in ((weights @ hits) / (weights @ inspections)[:, None]).T]
     size, signal = holes["true_diameter_mm"].to_numpy(float), _signal(holes)
     large = signal[size >= a50_mm]
     return FreeResponse(
         threshold=thresholds,
         false_calls_per_m2=calls[kept] / area_m2,
         found=hits.sum(axis=0) / inspections.sum(),
-        found_low=low,
-        found_high=high,
+        found_low=np.array([edge.low for edge in edges]),
+        found_high=np.array([edge.high for edge in edges]),
         large_found=(large[:, None] > thresholds).mean(axis=0) if len(large) else None,
         at=(int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean())),
         area_m2=area_m2,
@@ -137,7 +163,7 @@ def free_response(
 
 
 def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None:
-    """Per-region overlap and ROC of pixels of one set-up; None without damaged or without undamaged pixels."""
+    """Compute per-region overlap and ROC of pixels of one set-up; None without damaged or without undamaged pixels."""
     if pixels.empty:
         return None
     of_damage = pixels["hole"] != ""
@@ -172,27 +198,6 @@ def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None
     )
 
 
-def _roc(name: str, damages: pd.DataFrame, sites: pd.DataFrame, threshold: float, draws: int) -> Roc:
-    positive, negative = _signal(damages), _signal(sites)
-    levels = np.unique(np.concatenate([positive, negative]))[::-1]
-    above_false, above_true = (
-        1 - np.searchsorted(np.sort(of), levels, "left") / len(of) for of in (negative, positive)
-    )
-    of_damaged = row_weights(damages["board"].to_numpy(), draws)
-    of_free = row_weights(sites["board"].to_numpy(), draws, "hole-free")
-    enough = min(len(np.unique(table["board"])) for table in (damages, sites)) > 1
-    return Roc(
-        name=name,
-        false=np.concatenate([[0.0], above_false]),
-        true=np.concatenate([[0.0], above_true]),
-        at=(float((negative > threshold).mean()), float((positive > threshold).mean())),
-        area=float(_rank_area(positive, negative, np.ones((1, len(positive))), np.ones((1, len(negative))))[0]),
-        area_interval=percentiles(_rank_area(positive, negative, of_damaged, of_free)) if enough else UNKNOWN,
-        damages=len(positive),
-        unflawed=len(negative),
-    )
-
-
 def _signal(table: pd.DataFrame) -> np.ndarray:
     """Signals; where no pixel was judged nothing can be found at any threshold."""
     signal = table["signal"].to_numpy(float)
@@ -210,20 +215,9 @@ def _rank_area(positive: np.ndarray, negative: np.ndarray, weights: np.ndarray, 
         return np.asarray(won / (weights.sum(axis=1) * others.sum(axis=1)))
 
 
-def _shares(hits: np.ndarray, inspections: np.ndarray, draws: int) -> np.ndarray:
-    """(draws, k) shares of hits (boards, k) among inspections (boards,) of boards drawn again."""
-    weights = board_weights(len(inspections), draws)
-    return np.asarray((weights @ hits) / (weights @ inspections)[:, None])
-
-
-def _columns_percentiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    intervals = [percentiles(column) for column in values.T]
-    return np.array([one.low for one in intervals]), np.array([one.high for one in intervals])
-
-
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """Per board (b,) and threshold (k,), descending: ``above`` and ``share`` (b, k) summed over a board's regions;
+    """Counts per board (b,) and threshold (k,), descending: ``above`` and ``share`` (b, k) summed over its regions;
     ``pixels``, ``regions`` (b,)."""
 
     board: np.ndarray

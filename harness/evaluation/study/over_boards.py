@@ -1,4 +1,4 @@
-"""What boards have in common: curves refitted to boards drawn again, and the design effect of damages sharing boards.
+"""Common effects of boards: curves refitted to boards drawn again, and the design effect of damages sharing boards.
 
 Damages of one board share its shape, its pose and its render, so boards, not damages, are what a study draws at random.
 Whole boards are therefore resampled with replacement (the cluster bootstrap; Davison and Hinkley 1997, section 3.8).
@@ -12,16 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval
-from harness.evaluation.pod.curve import PodCurve, link_ppf
-from harness.evaluation.pod.likelihood import logs_of_link, slope_of_log_density
-from harness.evaluation.study.penalised import penalised_maxima
+from harness.evaluation.pod.curve import PodCurve, link_ppf, slopes_of_link
+from harness.evaluation.pod.likelihood import HitsAndMisses, maxima, penalised_maxima
 from harness.vocabulary.seeds import random_stream
 
 DRAWS = 500
 """The 95 % percentile is then the 475th smallest, known to about one percentile."""
-STEPS = 60
-"""Newton steps and halvings of a draw; from the study's own fit five or six do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,95 +31,67 @@ class Targets:
 
     @property
     def boards(self) -> int:
-        """Different boards."""
+        """Number of different boards."""
         return len(np.unique(self.board))
 
 
 def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray) -> Targets:
-    """Rows (n,) of inspections as targets: repeats of one damage of one board are one target."""
+    """Join rows (n,) of inspections to targets: repeats of one damage of one board are one target."""
     _, boards = np.unique(board, return_inverse=True)
     _, holes = np.unique(hole, return_inverse=True)
     _, first, which = np.unique(boards * (holes.max(initial=0) + 1) + holes, return_index=True, return_inverse=True)
-    return Targets(
-        board[first], size_mm[first], np.bincount(which, np.asarray(hit, float)), np.bincount(which).astype(float)
-    )
+    hits, inspections = np.bincount(which, np.asarray(hit, float)), np.bincount(which).astype(float)
+    return Targets(board[first], size_mm[first], hits, inspections)
 
 
 def board_weights(boards: int, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """(draws, boards) how often each board is in each draw: the same for the same number of boards of a population, so
-    that set-ups are paired; boards of two populations ("damaged", "hole-free") are drawn independently."""
+    """Draw boards again: (draws, boards) how often each is in each draw; the same for the same number of boards of a
+    population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     stream = random_stream(0, "boards drawn again", population, boards)
     return stream.multinomial(boards, np.full(boards, 1.0 / boards), size=draws).astype(float)
 
 
 def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """(draws, n) `board_weights` laid on rows that belong to ``board`` (n,)."""
+    """Lay `board_weights` on rows that belong to ``board`` (n,): (draws, n)."""
     names, which = np.unique(board, return_inverse=True)
     return board_weights(len(names), draws, population)[:, which]
 
 
-def percentiles(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
-    """The percentile interval of draws (B,); NaN ones are left out, and where they are more than half it is unknown."""
-    known = values[~np.isnan(values)]
-    if len(known) < 2 or len(known) < 0.5 * len(values):
-        return UNKNOWN
-    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
-    return Interval(float(low), float(high))
-
-
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
-    """(len(pods), draws) sizes in mm with these PODs, ``curve``'s link and axis refitted to boards drawn again as
-    `harness.evaluation.pod.hit_miss` fits one study: by Firth's penalty where hits and misses do not overlap."""
+    """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm with these PODs.
+
+    A draw is fitted as `harness.evaluation.pod.hit_miss` fits a study: by Firth's penalised likelihood where its hits
+    and misses do not overlap. Without an estimate in a draw: infinite where nothing is found or the chance does not
+    grow with size; the smallest size inspected where everything is found.
+    """
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre, spread = float(x.mean()), float(x.std()) or 1.0
     z = (x - centre) / spread
     weights = row_weights(targets.board, draws)
     hits, misses = weights * targets.hits, weights * (targets.inspections - targets.hits)
-    start = np.array([(centre - curve.mu) / curve.sigma, spread / curve.sigma])
-    repeats = (weights @ targets.inspections) / weights.sum(axis=1)
-    at = fitted_sizes(z, hits, misses, curve.link, start, pods, repeats)
-    back = centre + spread * at
-    with np.errstate(over="ignore"):
-        return np.exp(back) if curve.log_size else back
-
-
-def fitted_sizes(
-    z: np.ndarray,
-    hits: np.ndarray,
-    misses: np.ndarray,
-    link: str,
-    start: np.ndarray,
-    pods: tuple[float, ...],
-    repeats: np.ndarray | None = None,
-) -> np.ndarray:
-    """(len(pods), draws) sizes with these PODs, by curves fitted to each draw's ``hits`` and ``misses`` (draws, n) at
-    sizes ``z`` (n,); ``start`` (2,): coefficients that the search begins with.
-
-    Without an estimate in a draw: infinite where nothing is found or the chance does not grow with size; the smallest
-    size inspected where everything is found. Where hits and misses do not overlap, the curve by Firth's penalised
-    likelihood with ``repeats`` (draws,) inspections of a target; the middle of the gap, for all PODs, without them.
-    """
     largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
     smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
-    at: np.ndarray = np.full((len(pods), len(hits)), np.inf)
+    repeats = (weights @ targets.inspections) / weights.sum(axis=1)
+    data = HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, curve.link)
+    start = np.array([(centre - curve.mu) / curve.sigma, spread / curve.sigma])
+    b = np.full((draws, 2), np.nan)
+    overlap = largest_miss > smallest_hit
+    b[overlap] = maxima(data.of(overlap), start)
+    apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & ~overlap
+    if apart.any():
+        some = HitsAndMisses(data.design, hits[apart], misses[apart], curve.link, repeats[apart])
+        b[apart] = penalised_maxima(some, 1e-6)
+    at = crossings(b, curve.link, pods)
     at[:, largest_miss == -np.inf] = z.min()
-    apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & (largest_miss <= smallest_hit)
-    levels = np.asarray(link_ppf(link, np.array(pods)))[:, None]
-    if repeats is None:
-        at[:, apart] = 0.5 * (largest_miss + smallest_hit)[apart]
-    elif apart.any():
-        at[:, apart] = _crossings(penalised_maxima(z, hits[apart], misses[apart], link, repeats[apart]), levels)
-    overlap = (largest_miss > smallest_hit).nonzero()[0]
-    design = np.column_stack([np.ones_like(z), z])
-    at[:, overlap] = _crossings(weighted_maxima(design, hits[overlap], misses[overlap], link, start), levels)
-    return at
+    with np.errstate(over="ignore"):
+        return np.asarray(np.exp(centre + spread * at) if curve.log_size else centre + spread * at)
 
 
-def _crossings(b: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """(levels, draws) sizes at which curves ``b`` (draws, 2) reach predictors ``levels`` (k, 1); infinite if flat."""
-    b0, b1 = b.T
+def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
+    """Sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite where flat or unknown."""
+    levels = link_ppf(link, np.array(pods))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(b1 > 0, (levels - b0) / b1, np.inf)
+        return np.where(b[:, 1] > 0, (levels - b[:, 0]) / b[:, 1], np.inf)
 
 
 def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
@@ -136,67 +104,15 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
     if targets.boards < 2 or len(targets.board) < 3:
         return np.nan
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
-    slope, weight = _score(curve.link, (x - curve.mu) / curve.sigma, targets.hits, targets.inspections - targets.hits)
+    up, down, _ = slopes_of_link(curve.link, (x - curve.mu) / curve.sigma)
+    slope = targets.hits * up - (targets.inspections - targets.hits) * down
     design = np.column_stack([np.ones_like(x), x])
     # x_p = (level - b0) / b1: its slopes by b0 and b1.
     gradient = -curve.sigma * np.array([1.0, curve.mu + curve.sigma * float(link_ppf(curve.link, np.array(pod)))])
-    toward = np.linalg.solve(design.T @ (weight[:, None] * design), gradient)
-    influence = (design * slope[:, None]) @ toward
+    information = design.T @ ((targets.inspections * up * down)[:, None] * design)
+    influence = (design * slope[:, None]) @ np.linalg.solve(information, gradient)
     _, which = np.unique(targets.board, return_inverse=True)
-    of_boards, of_targets = (_sandwich(one) for one in (np.bincount(which, influence), influence))
+    of_boards, of_targets = (
+        float((one**2).sum() * len(one) / (len(one) - 1)) for one in (np.bincount(which, influence), influence)
+    )
     return of_boards / of_targets if of_targets > 0 else np.nan
-
-
-def _sandwich(influence: np.ndarray) -> float:
-    units = len(influence)
-    return float((influence**2).sum() * units / (units - 1))
-
-
-def _score(link: str, predictor: np.ndarray, hits: np.ndarray, misses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope of the log-likelihood by the predictor, and its expected information, of rows of counts."""
-    logs = logs_of_link(link, predictor)
-    slope = hits * np.exp(logs.log_density - logs.log_hit) - misses * np.exp(logs.log_density - logs.log_miss)
-    return slope, (hits + misses) * np.exp(2.0 * logs.log_density - logs.log_hit - logs.log_miss)
-
-
-def weighted_maxima(
-    design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray
-) -> np.ndarray:
-    """(draws, p) coefficients of ``design`` (n, p) with the largest likelihood of ``hits`` and ``misses`` (draws, n).
-
-    Newton's method on all draws at once from ``start`` (p,), on a likelihood that is concave for all four links; a step
-    that lowers it is halved, a draw that has arrived rests. Hits and misses of every draw must overlap, else its
-    coefficients end where the steps ran out.
-    """
-    place = np.tile(np.asarray(start, float), (len(hits), 1))
-    best = np.full(len(hits), -np.inf)
-    step = np.zeros_like(place)
-    moving = np.arange(len(hits))
-    for _ in range(STEPS):
-        if not len(moving):
-            break
-        trial = place[moving] + step[moving]
-        predictor = trial @ design.T
-        logs = logs_of_link(link, predictor)
-        k, m = hits[moving], misses[moving]
-        value = (k * logs.log_hit + m * logs.log_miss).sum(axis=1)
-        better = value >= best[moving] - 1e-13 * np.abs(value)
-        step[moving[~better]] *= 0.5
-        ahead = moving[better]
-        place[ahead], best[ahead] = trial[better], np.maximum(value[better], best[ahead])
-        up, down = np.exp(logs.log_density - logs.log_hit), np.exp(logs.log_density - logs.log_miss)
-        bend = slope_of_log_density(link, predictor)
-        slope = k * up - m * down
-        weight = k * up * np.maximum(up - bend, 0.0) + m * down * np.maximum(down + bend, 0.0)
-        step[ahead] = _steps(design, slope[better], weight[better])
-        moving = moving[np.abs(step[moving]).max(axis=1) > 1e-7 * (1.0 + np.abs(place[moving]).max(axis=1))]
-    return place
-
-
-def _steps(design: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(draws, p) Newton steps; a singular information, of draws that have run off to infinity, gives none."""
-    p = design.shape[1]
-    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), p * p)
-    information = (weight @ products).reshape(-1, p, p)
-    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(p) + 1e-300 * np.eye(p)
-    return np.asarray(np.linalg.solve(information + ridge, (slope @ design)[:, :, None])[:, :, 0])

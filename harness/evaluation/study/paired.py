@@ -1,20 +1,30 @@
-"""Two set-ups on the same boards, compared board by board; and on boards of their own, compared by their limits.
+"""Two set-ups compared: hits and a90 board by board, their limits, and their false calls.
 
 Boards are the unit: damages of one board share its render, its pose and its surface, so they are not exchanged one by
-one. Not in any test here: that each set-up drew its own calibration of the threshold. A gate needs a margin for that
-(`harness.evaluation.study.verdict`).
+one. Not in any test of hits and limits: that each set-up drew its own calibration of the threshold. A gate needs a
+margin for that (`harness.evaluation.study.verdict`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from harness.evaluation.intervals import Interval
+from harness.evaluation.intervals import Interval, percentiles
+from harness.evaluation.pod.likelihood import HitsAndMisses, maxima
+from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.over_boards import percentiles
-from harness.evaluation.study.record import Inspected
+from harness.evaluation.study.over_boards import Targets, crossings, targets_of
+from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.vocabulary.seeds import random_stream
+
+Tails = tuple[float, float]
+"""One-sided p: (worse, better) for the second set-up."""
+
+
+# hits on the same inspections
 
 
 @dataclass(frozen=True)
@@ -35,42 +45,18 @@ class HitsChange:
     more_p: float
 
     @property
-    def sides(self) -> tuple[float, float]:
+    def sides(self) -> Tails:
         """p of (worse, better)."""
         return self.fewer_p, self.more_p
 
     @property
     def boards_p(self) -> float:
-        """The test over boards, two-sided: what decides."""
+        """The test over boards, two-sided: the test that decides."""
         return min(1.0, 2 * min(self.fewer_p, self.more_p))
 
 
-@dataclass(frozen=True)
-class LimitChange:
-    """a90 of the second set-up over and less that of the first.
-
-    ``interval_mm``: 95 % percentiles of the difference over boards drawn again: the same boards for both where
-    ``paired``, else independently. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown (shrunk), and
-    with 500 draws never below 1/501 where paired. Unpaired it is a share of all 250,000 pairs of draws; of a share
-    below 1/501 each the tails of both are no more than their few outermost draws: significance there is a matter of
-    the two distributions hardly overlapping, not of a p known to its digits.
-    """
-
-    ratio: float
-    difference_mm: float
-    interval_mm: Interval
-    grown_p: float
-    shrunk_p: float
-    paired: bool
-
-    @property
-    def sides(self) -> tuple[float, float]:
-        """p of (worse, better)."""
-        return self.grown_p, self.shrunk_p
-
-
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
-    """On the inspections (board, hole, repeat) that both have; None where there are none."""
+    """Compare hits on the inspections (board, hole, repeat) that both have; None where there are none."""
     one, two = shared_rows(first, second)
     if not len(one):
         return None
@@ -99,7 +85,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
     return float(binomtest(only_first, discordant, 0.5).pvalue) if discordant else 1.0
 
 
-def sign_flip(gained: np.ndarray) -> tuple[float, float]:
+def sign_flip(gained: np.ndarray) -> Tails:
     """(P(sum <= observed), P(sum >= observed)) of integer differences (n,) whose signs are tossed independently.
 
     Fisher's randomisation test for pairs, exact: the distribution of the sum is built up board by board. Its null is
@@ -112,15 +98,49 @@ def sign_flip(gained: np.ndarray) -> tuple[float, float]:
         tossed = 0.5 * chance
         tossed[size:] += 0.5 * chance[: len(chance) - size]
         chance = tossed
-    observed = int(gained[gained > 0].sum())
+    return _tails(chance, int(gained[gained > 0].sum()))
+
+
+def _tails(chance: np.ndarray, observed: int) -> Tails:
+    """(P(<= observed), P(>= observed)) of a distribution over 0, 1, ..."""
     return min(1.0, float(chance[: observed + 1].sum())), min(1.0, float(chance[observed:].sum()))
 
 
+# limits
+
+
+@dataclass(frozen=True)
+class LimitChange:
+    """a90 of the second set-up over and less that of the first.
+
+    ``interval_mm``: 95 % percentiles of the difference over boards drawn again: the same boards for both where
+    ``paired``, else independently. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown (shrunk), and
+    with 500 draws never below 1/501 where paired. Unpaired it is a share of all 250,000 pairs of draws; of a share
+    below 1/501 each the tails of both are no more than their few outermost draws: significance there is a matter of
+    the two distributions hardly overlapping, not of a p known to its digits.
+    """
+
+    ratio: float
+    difference_mm: float
+    interval_mm: Interval
+    grown_p: float
+    shrunk_p: float
+    paired: bool
+
+    @property
+    def sides(self) -> Tails:
+        """p of (worse, better)."""
+        return self.grown_p, self.shrunk_p
+
+
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
-    """``same_boards``: of equal numbers and damage. Paired only if both were inspected on the same of them."""
+    """Compare two a90 by boards drawn again. ``same_boards``: of equal numbers and damage; paired only if both were
+    inspected on the same of them."""
     one, two = first.a90_draws_mm, second.a90_draws_mm
-    paired = same_boards and bool(np.array_equal(_boards(first), _boards(second))) and len(one) == len(two)
-    differences = _less(two, one) if paired else _less(two[:, None], one[None, :]).ravel()
+    boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
+    paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(one) == len(two)
+    with np.errstate(invalid="ignore"):  # NaN, no evidence either way, where both are infinite
+        differences = two - one if paired else (two[:, None] - one[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
     weight = 1.0 / (1 + len(one))  # no share of so few draws is evidence below this
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
@@ -129,11 +149,263 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
 
-def _less(second: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Second less first; NaN (no evidence either way) where both are infinite."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(second - first)
+# a90 on the same boards
+
+LINK = "logit"
+"""The link, on size itself, for all: the choice of a curve must not depend on which result is whose."""
+TOSSES = 19_999
+ENOUGH = 10
+"""Tosses as far out after which p is known to about a third of itself and no more are drawn."""
+FIRST_TOSSES = 64
+CELLS = 200_000
+"""Tosses times damages at a time: a few MB."""
+ARRIVED = 1e-5
+"""Newton's errors are squared with every step."""
+TIE = 1e-6
+"""Newton's method leaves errors of this order in ln a90: closer ones are ties, and ties count against."""
 
 
-def _boards(limit: SetUpLimit) -> np.ndarray:
-    return np.unique(limit.record.inspected.board)
+@dataclass(frozen=True)
+class SwapChange:
+    """``ratio``: a90 of the second set-up over that of the first, by curves of `LINK` on size for both, NaN where
+    neither has one. ``grown_p``, ``shrunk_p``: one-sided, 1 on the side on which it does not lie; of ``tosses``."""
+
+    ratio: float
+    grown_p: float
+    shrunk_p: float
+    tosses: int
+
+    @property
+    def sides(self) -> Tails:
+        """p of (worse, better)."""
+        return self.grown_p, self.shrunk_p
+
+
+@dataclass(frozen=True, eq=False)
+class Exchange:
+    """Damages that both set-ups inspected, one a row: ``board`` (n,) as 0, 1, ...; ``z`` (n,) sizes in ``spread_mm``
+    from ``centre_mm``; ``first``, ``second`` (n,) hits of ``inspections`` (n,); ``start`` (2,): the pooled curve."""
+
+    board: np.ndarray
+    z: np.ndarray
+    centre_mm: float
+    spread_mm: float
+    first: np.ndarray
+    second: np.ndarray
+    inspections: np.ndarray
+    start: np.ndarray
+
+    @property
+    def boards(self) -> int:
+        """Number of boards that both inspected."""
+        return int(self.board.max()) + 1
+
+    def log_ratios(self, exchanged: np.ndarray) -> np.ndarray:
+        """ln(a90 of the second / a90 of the first), (draws,), with the results of boards ``exchanged`` (draws, boards)
+        exchanged. NaN where neither has an a90."""
+        swapped = exchanged[:, self.board]
+        with np.errstate(invalid="ignore"):
+            return self._log_a90(np.where(swapped, self.first, self.second)) - self._log_a90(
+                np.where(swapped, self.second, self.first)
+            )
+
+    def _log_a90(self, hits: np.ndarray) -> np.ndarray:
+        """(draws,) of ``hits`` (draws, n).
+
+        Infinite where nothing is found or the chance does not grow with size; the middle of the gap where hits and
+        misses do not overlap; at least the smallest damage, which is it where everything is found. Any rule would do
+        that does not ask whose results they are; a90 of a limit is estimated with more care.
+        """
+        misses = self.inspections - hits
+        largest_miss = np.where(misses > 0, self.z, -np.inf).max(axis=1)
+        smallest_hit = np.where(hits > 0, self.z, np.inf).min(axis=1)
+        overlap = largest_miss > smallest_hit
+        at = 0.5 * (largest_miss + smallest_hit)
+        b = maxima(_curves(self.z, hits[overlap], misses[overlap]), self.start, ARRIVED)
+        at[overlap] = crossings(b, LINK, (POD,))[0]
+        return np.asarray(np.log(self.centre_mm + self.spread_mm * np.maximum(at, self.z.min())))
+
+
+def exchange(first: Inspected, second: Inspected) -> Exchange | None:
+    """Pair the inspections that both have; None where there are none."""
+    one, two = shared_rows(first, second)
+    if not len(one):
+        return None
+    before, now = (
+        targets_of(first.board[one], first.hole[one], first.diameter_mm[one], hit)
+        for hit in (first.hit[one], second.hit[two])
+    )
+    centre, spread = float(before.size_mm.mean()), float(before.size_mm.std()) or 1.0
+    z = (before.size_mm - centre) / spread
+    boards = np.unique(before.board, return_inverse=True)[1]
+    return Exchange(boards, z, centre, spread, before.hits, now.hits, before.inspections, _pooled(z, before, now))
+
+
+def swap_change(first: Inspected, second: Inspected, tosses: int = TOSSES) -> SwapChange | None:
+    """Test whether a90 differs on the inspections that both have: results exchanged board by board, curves refitted.
+
+    The total of hits cannot tell alone: where luck grows and a50 stays, small damages are won and large ones lost, and
+    a90 grows with as many hits. Nor can boards drawn again: of 500 draws none says less than 1/501.
+
+    Fisher's randomisation test for pairs: were the set-ups alike, each board's two results might as well be exchanged,
+    and so might all of them at once. The distribution of ln(a90 / a90) is therefore symmetric, and a one-sided p is
+    half of the two-sided one. Tosses are drawn until `ENOUGH` of them are as far out as what was observed, but no more
+    than ``tosses`` (Besag and Clifford, Biometrika 78 (1991), 301: the p is exact whatever their number), so that a
+    small p is known well and a large one costs little. None without shared inspections. Deterministic; the studies
+    exchanged give the same p on the other side.
+    """
+    pair = exchange(first, second)
+    if pair is None:
+        return None
+    observed = float(pair.log_ratios(np.zeros((1, pair.boards), bool))[0])
+    ratio = float(np.exp(observed))
+    if np.isnan(observed) or abs(observed) <= TIE:
+        return SwapChange(ratio, 1.0, 1.0, 0)
+    stream = random_stream(0, "set-ups exchanged", pair.boards)
+    most = max(1, CELLS // len(pair.z))
+    drawn = as_far = 0
+    p = np.nan
+    while drawn < tosses and np.isnan(p):
+        count = min(max(FIRST_TOSSES, drawn), most, tosses - drawn)
+        ratios = pair.log_ratios(stream.random((count, pair.boards)) < 0.5)
+        far = ~(np.abs(ratios) < abs(observed) - TIE)  # NaN is as far
+        reached = np.flatnonzero(as_far + np.cumsum(far) >= ENOUGH)
+        if len(reached):
+            count = int(reached[0]) + 1
+            p = ENOUGH / (drawn + count)
+        as_far += int(far.sum())
+        drawn += count
+    p = (as_far + 1) / (tosses + 1) if np.isnan(p) else p
+    grown, shrunk = (0.5 * p, 1.0) if observed > 0 else (1.0, 0.5 * p)
+    return SwapChange(ratio, grown, shrunk, drawn)
+
+
+def _pooled(z: np.ndarray, before: Targets, now: Targets) -> np.ndarray:
+    """(2,) coefficients of one curve for both, the same whichever is first. Without meaning where the hits of both do
+    not overlap the misses of both: then no exchange has a curve to be searched."""
+    hits = before.hits + now.hits
+    misses = before.inspections + now.inspections - hits
+    flat = np.array([0.0, 1.0])
+    if not (hits.any() and misses.any()) or z[misses > 0].max() <= z[hits > 0].min():
+        return flat
+    return np.asarray(maxima(_curves(z, hits[None], misses[None]), flat)[0])
+
+
+def _curves(z: np.ndarray, hits: np.ndarray, misses: np.ndarray) -> HitsAndMisses:
+    return HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, LINK)
+
+
+# false calls
+
+SAME = 1e-6
+"""Relative difference of one threshold from machine to machine."""
+
+
+@dataclass(frozen=True)
+class CallsChange:
+    """``calls`` on ``areas_m2`` of hole-free boards, ``calling`` of ``boards`` with a call (first repeat of each), each
+    (first, second).
+
+    ``counts_p``: conditional binomial test of two Poisson counts, two-sided (Przyborowski and Wilenski 1940), as if
+    thresholds were known. ``more_p``, ``fewer_p``: one-sided, they decide. They toss the signs of boards where frames
+    and threshold are the same (``way`` "signs"); allow for two draws of the calibration on different frames
+    ("calibrations"); and are the larger of both on identical frames with calibrated thresholds that differ ("both").
+    """
+
+    calls: tuple[int, int]
+    areas_m2: tuple[float, float]
+    boards: tuple[int, int]
+    calling: tuple[int, int]
+    counts_p: float
+    more_p: float
+    fewer_p: float
+    way: Literal["signs", "calibrations", "both"]
+
+    @property
+    def sides(self) -> Tails:
+        """p of (worse, better)."""
+        return self.more_p, self.fewer_p
+
+    @property
+    def rates_per_m2(self) -> tuple[float, float]:
+        """False calls per square metre, (first, second)."""
+        return self.calls[0] / self.areas_m2[0], self.calls[1] / self.areas_m2[1]
+
+    @property
+    def ratio(self) -> float:
+        """Second rate over first: infinite where only the second has calls, 1 where neither has."""
+        before, now = self.rates_per_m2
+        return now / before if before else (np.inf if now else 1.0)
+
+
+def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float | None) -> CallsChange | None:
+    """Compare false calls of two set-ups whose thresholds were each calibrated on hole-free boards of their own.
+
+    Two honest calibrations for one wanted rate give two different true rates: with the 4th highest of 60 scores as
+    threshold, the chance that a new board calls is Beta(4, 57) distributed (Wilks 1941), half its mean to either side.
+    A test of two Poisson counts that ignores it is called at 5 % in 20 % of honest pairs with 240 hole-free boards
+    each. So the test that decides gives each set-up its own draw of that distribution, and asks how many of all boards
+    that called are the second's. On identical frames with the same threshold both had the same luck: there the signs of
+    each board's difference are tossed instead, and smaller changes show. Identical frames alone are not enough: a
+    detector that scores otherwise has luck of its own on them, and of two equally good ones with 240 boards each, that
+    toss alone calls 6 % at 0.1 %. So where detector, version, settings or anything else moved the threshold, both tests
+    must agree.
+
+    None where either has no hole-free board. ``wanted_per_m2``: the rate that both were calibrated to, None where the
+    threshold is the lowest without a false call, or was given (no calibration runs).
+    """
+    from scipy.stats import betabinom, binomtest, hypergeom
+
+    one, two = first.unflawed, second.unflawed
+    areas = (float(one.area_m2.sum()), float(two.area_m2.sum()))
+    if not min(areas) > 0:
+        return None
+    calls = (int(one.calls.sum()), int(two.calls.sum()))
+    counts = float(binomtest(calls[1], sum(calls), areas[1] / sum(areas)).pvalue) if sum(calls) else 1.0
+    (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
+    # Scores on identical frames are alike if the calibration took the same number for threshold, which two ways of
+    # scoring do by chance only where scores are few whole numbers. A given threshold had no luck.
+    way: Literal["signs", "calibrations", "both"] = "both"
+    if first.frames_digest != second.frames_digest:
+        way = "calibrations"
+    elif not (first.calibration_runs or second.calibration_runs) or np.isclose(
+        first.threshold, second.threshold, rtol=SAME, atol=0.0
+    ):
+        way = "signs"
+    by_signs = by_draws = (0.0, 0.0)
+    if way != "calibrations":
+        shared, at, there = np.intersect1d(np.unique(one.board), np.unique(two.board), return_indices=True)
+        sums = [np.bincount(np.unique(t.board, return_inverse=True)[1], t.calls) for t in (one, two)]
+        gained = (sums[1][there] - sums[0][at]).round().astype(int) if len(shared) else np.zeros(0, int)
+        by_signs = sign_flip(gained)
+    if way != "signs":
+        total = calling_1 + calling_2
+        ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)
+        of_second = np.arange(total + 1)  # how many of all boards that called are the second's
+        if ranks[0] is None or ranks[1] is None:
+            chance = hypergeom.pmf(of_second, boards_1 + boards_2, total, boards_2)
+        else:
+            logs = betabinom.logpmf(total - of_second, boards_1, *ranks[0])
+            logs = logs + betabinom.logpmf(of_second, boards_2, *ranks[1])
+            chance = np.exp(logs - logs.max())
+            chance = chance / chance.sum()
+        by_draws = _tails(chance, calling_2) if total else (1.0, 1.0)
+    fewer, more = (max(pair) for pair in zip(by_signs, by_draws, strict=True))
+    return CallsChange(calls, areas, (boards_1, boards_2), (calling_1, calling_2), counts, more, fewer, way)
+
+
+def _calling(table: Unflawed) -> tuple[int, int]:
+    """(boards, those of them that called), in the first repeat of each: repeats of one board are not independent."""
+    first = table.repeat == table.repeat.min()
+    return int(first.sum()), int((table.calls[first] > 0).sum())
+
+
+def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
+    """(r, n + 1 - r): the threshold is the r-th highest of n calibration runs' scores, as
+    `harness.evaluation.pod.false_calls.threshold_for_rate` takes it; None where it was given."""
+    n = record.calibration_runs
+    if not n:
+        return None
+    silent = -np.expm1(-wanted_per_m2 * float(record.unflawed.area_m2.mean())) if wanted_per_m2 else 0.0
+    r = int(np.clip(np.floor((n + 1) * silent * (1 + 1e-12)), 1, n))
+    return r, n + 1 - r

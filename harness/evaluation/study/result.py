@@ -18,11 +18,10 @@ from harness.evaluation.study.curves import (
     pixel_curves,
     roc_curves,
 )
-from harness.evaluation.study.limit import SetUpLimit, limit_of
+from harness.evaluation.study.limit import SetUpLimit, SizeRow, limit_of, pod_at
 from harness.evaluation.study.over_boards import DRAWS
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.evaluation.study.surface import PodSurface, surface_of
-from harness.evaluation.study.table_one import SizeRow, pod_at
 from harness.evaluation.study.validity import Section, validity_of
 from harness.tables.trials import ResultTables
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval
+from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
 from harness.evaluation.pod.curve import link_cdf, link_ppf
-from harness.evaluation.pod.likelihood import logs_of_link
-from harness.evaluation.study.over_boards import DRAWS, percentiles, row_weights, weighted_maxima
+from harness.evaluation.pod.likelihood import HitsAndMisses, maxima
+from harness.evaluation.study.over_boards import DRAWS, row_weights
 from harness.evaluation.study.record import SetUpRecord
 
 LINKS = ("logit", "probit")
@@ -54,65 +54,79 @@ class PodSurface:
         return link_cdf(self.link, _design(a, d, len(self.b) > 3) @ self.b)
 
 
+def depth_varies(depth_mm: np.ndarray) -> bool:
+    """Return whether depths (n,) differ enough to matter."""
+    return bool(len(depth_mm) and depth_mm.max() >= LEAST_RATIO * depth_mm.min())
+
+
 def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | None, str]:
-    """The surface, or None and why there is none."""
+    """Fit the surface; None, and why, where there is none."""
+    from scipy.stats import chi2
+
     seen = record.inspected
-    if not len(seen.hit) or seen.hit.all() or not seen.hit.any():
+    hit = seen.hit
+    if not len(hit) or hit.all() or not hit.any():
         return None, "every damage fared alike: there is no surface to fit"
     if seen.depth_mm.min() <= 0 or not depth_varies(seen.depth_mm):
         return None, f"depth does not vary: {seen.depth_mm.min():g} to {seen.depth_mm.max():g} mm"
     if np.ptp(seen.diameter_mm) == 0:
         return None, f"diameter does not vary: {seen.diameter_mm[0]:g} mm"
     a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
-    if _separated(_design(a, d, False), seen.hit):
+    if _separated(_design(a, d, False), hit):
         return None, "hits and misses do not overlap over diameter and depth (separation): no maximum likelihood"
-    repeats = len(seen.hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
-    plain = min((_fit(a, d, seen.hit, link, False) for link in LINKS), key=lambda fit: fit.deviance)
-    crossed = _fit(a, d, seen.hit, plain.link, True) if not _separated(_design(a, d, True), seen.hit) else None
-    p = np.nan if crossed is None else _chi2_tail(max(plain.deviance - crossed.deviance, 0.0) / repeats)
-    bent = crossed if crossed is not None and p < 0.05 else None
-    falling = "" if bent is None else _falling(bent.b, a, d)
-    chosen = plain if bent is None or falling else bent
-    if plain.b[1] <= 0 and chosen is plain:
+    repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
+
+    def fit(link: str, crossed: bool) -> tuple[float, np.ndarray, str]:
+        """Deviance, coefficients and link."""
+        design, hits = _design(a, d, crossed), hit.astype(float)
+        b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
+        return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), b, link
+
+    deviance, b, link = min((fit(link, False) for link in LINKS), key=lambda one: one[0])
+    p, note = np.nan, "POD falls with depth" if b[2] < 0 else ""
+    rises = b[1] > 0
+    if not _separated(_design(a, d, True), hit):
+        less, bent, _ = fit(link, True)
+        p = float(chi2.sf(max(deviance - less, 0.0) / repeats, 1))
+        if p < 0.05:
+            # The slope along the one is linear in the other, so its ends tell.
+            along = min(_slopes(bent[None], 0.0, end)[0][0] for end in (d.min(), d.max()))
+            across = min(_slopes(bent[None], end, 0.0)[1][0] for end in (a.min(), a.max()))
+            falling = " and ".join(name for name, slope in (("diameter", along), ("depth", across)) if slope < 0)
+            if falling:
+                note = f"with an interaction POD would fall with {falling} inside what was inspected: fitted without"
+            else:
+                deviance, b, note, rises = less, bent, "", True
+    if not rises:
         return None, "the chance of detection does not grow with diameter"
-    return _surface(record, chosen, p, draws, _note(plain, falling) if chosen is plain else ""), ""
+
+    weights = row_weights(seen.board, draws)
+    drawn = _coefficients(_design(a, d, len(b) > 3), weights * hit, weights * ~hit, link, b)
+    depths = np.geomspace(seen.depth_mm.min(), seen.depth_mm.max(), DEPTHS)
+    along, across = _slopes(np.vstack([b, drawn]), a.mean(), d.mean())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.where(along > 0, across / along, np.nan)
+    many = len(np.unique(seen.board)) > 1
+    edges = [percentiles(column) if many else UNKNOWN for column in _a90(drawn, link, np.log(depths)).T]
+    return PodSurface(
+        link=link,
+        b=b,
+        interaction_p=p,
+        deviance=deviance,
+        depth_mm=depths,
+        a90_mm=_a90(b[None], link, np.log(depths))[0],
+        a90_low_mm=np.array([edge.low for edge in edges]),
+        a90_high_mm=np.array([edge.high for edge in edges]),
+        depth_slope=float(slope[0]),
+        depth_slope_interval=percentiles(slope[1:]) if many else UNKNOWN,
+        diameter_range_mm=(float(seen.diameter_mm.min()), float(seen.diameter_mm.max())),
+        depth_range_mm=(float(seen.depth_mm.min()), float(seen.depth_mm.max())),
+        note=note,
+    ), ""
 
 
-def _falling(b: np.ndarray, a: np.ndarray, d: np.ndarray) -> str:
-    """With which of the two POD falls somewhere between the least and the largest ln a and ln d, "" with neither. The
-    slope along the one is linear in the other, so its ends tell."""
-    along = min(_slopes(b[None], 0.0, end)[0][0] for end in (d.min(), d.max()))
-    across = min(_slopes(b[None], end, 0.0)[1][0] for end in (a.min(), a.max()))
-    return " and ".join(name for name, slope in (("diameter", along), ("depth", across)) if slope < 0)
-
-
-def _note(plain: _Fit, falling: str) -> str:
-    if falling:
-        return f"with an interaction POD would fall with {falling} inside what was inspected: fitted without"
-    return "POD falls with depth" if plain.b[2] < 0 else ""
-
-
-def depth_varies(depth_mm: np.ndarray) -> bool:
-    """Whether depths (n,) differ enough to matter."""
-    return bool(len(depth_mm) and depth_mm.max() >= LEAST_RATIO * depth_mm.min())
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    link: str
-    b: np.ndarray
-    deviance: float
-
-
-def _fit(a: np.ndarray, d: np.ndarray, hit: np.ndarray, link: str, crossed: bool) -> _Fit:
-    design = _design(a, d, crossed)
-    b = _maxima(design, hit.astype(float)[None], (~hit).astype(float)[None], link, None)[0]
-    logs = logs_of_link(link, design @ b)
-    return _Fit(link, b, float(-2 * np.where(hit, logs.log_hit, logs.log_miss).sum()))
-
-
-def _maxima(
-    design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray | None
+def _coefficients(
+    design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray | None = None
 ) -> np.ndarray:
     """(draws, p) coefficients; columns are centred and scaled for the search, whose first column is the constant."""
     centre, scale = design[:, 1:].mean(axis=0), design[:, 1:].std(axis=0)
@@ -121,37 +135,7 @@ def _maxima(
     back[0, 1:] = -centre / scale
     z = np.column_stack([np.ones(len(design)), (design[:, 1:] - centre) / scale])
     first = np.zeros(design.shape[1]) if start is None else np.linalg.solve(back, start)
-    return weighted_maxima(z, hits, misses, link, first) @ back.T
-
-
-def _surface(record: SetUpRecord, fit: _Fit, p: float, draws: int, note: str) -> PodSurface:
-    seen = record.inspected
-    a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
-    crossed = len(fit.b) > 3
-    weights = row_weights(seen.board, draws)
-    b = _maxima(_design(a, d, crossed), weights * seen.hit, weights * ~seen.hit, fit.link, fit.b)
-    depths = np.geomspace(seen.depth_mm.min(), seen.depth_mm.max(), DEPTHS)
-    drawn = _a90(b, fit.link, np.log(depths))
-    edges = [percentiles(column) for column in drawn.T]
-    along, across = _slopes(np.vstack([fit.b, b]), a.mean(), d.mean())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(along > 0, across / along, np.nan)
-    many = len(np.unique(seen.board)) > 1
-    return PodSurface(
-        link=fit.link,
-        b=fit.b,
-        interaction_p=p,
-        deviance=fit.deviance,
-        depth_mm=depths,
-        a90_mm=_a90(fit.b[None], fit.link, np.log(depths))[0],
-        a90_low_mm=np.array([edge.low if many else np.nan for edge in edges]),
-        a90_high_mm=np.array([edge.high if many else np.nan for edge in edges]),
-        depth_slope=float(slope[0]),
-        depth_slope_interval=percentiles(slope[1:]) if many else UNKNOWN,
-        diameter_range_mm=(float(seen.diameter_mm.min()), float(seen.diameter_mm.max())),
-        depth_range_mm=(float(seen.depth_mm.min()), float(seen.depth_mm.max())),
-        note=note,
-    )
+    return maxima(HitsAndMisses(z, hits, misses, link), first) @ back.T
 
 
 def _design(a: np.ndarray, d: np.ndarray, crossed: bool) -> np.ndarray:
@@ -175,17 +159,11 @@ def _a90(b: np.ndarray, link: str, log_depth: np.ndarray) -> np.ndarray:
 
 
 def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
-    """Whether a plane parts hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear programming:
-    the largest sum of one-sided margins, which is 0 where hits and misses overlap."""
+    """Return whether a plane parts hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
+    programming: the largest sum of one-sided margins, which is 0 where hits and misses overlap."""
     from scipy.optimize import linprog
 
     scaled = np.column_stack([np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)])
     signed = np.where(hit, 1.0, -1.0)[:, None] * scaled
     found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1), method="highs")
     return bool(-found.fun > 1e-7 * len(signed))
-
-
-def _chi2_tail(statistic: float) -> float:
-    from scipy.stats import chi2
-
-    return float(chi2.sf(statistic, 1))

@@ -3,15 +3,14 @@ statistics depart from MIL-HDBK-1823A. Every sentence is true of the study at ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from harness.evaluation.pod.false_calls import SITES_PER_TARGET
-from harness.evaluation.pod.state_hits import LEAST_TARGETS
+from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.evaluation.study.chance import ChanceHits
-from harness.evaluation.study.held import held_sentences, is_swept, number, swept_sentences, varied_sentences
 from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.surface import depth_varies
@@ -21,7 +20,30 @@ KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom"
 TESTS_THE_HARNESS = ("oracle", "blind")
 """Detectors whose limits say something of the harness only."""
 RISE = (0.05, 0.95)
-"""Between these the curve rises; sizes should reach past both, or the curve is known from one side."""
+"""POD between which the curve rises; sizes should reach past both, or the curve is known from one side."""
+
+
+SPREADS = {
+    "distance_jitter_mm": "its distance by ±{} mm",
+    "offset_mm": "its place across the view by ±{} mm, both ways",
+    "tilt_deg": "its tilt by ±{}° about two axes",
+    "roll_deg": "its roll by ±{}°",
+}
+"""Half-widths (of a family of boards) of uniform distributions, by the key that declares them."""
+DRAWN = {"diameter_mm": "diameter", "depth_mm": "depth"}
+"""Ranges of each damage, by the key that declares them."""
+GROUPS = (
+    ("Boards", ("source.target",)),
+    ("Camera", ("source.camera",)),
+    ("Views", ("source.views",)),
+    ("Averaging", ("capture",)),
+    ("Map", ("mapping",)),
+    ("Detector", ("detector",)),
+    ("Render", ("source.render",)),
+)
+"""Headings of what is held, for each part of the declaration."""
+NOT_HELD = ("source.target.seed", "source.target.damage", "source.target.sizes")
+"""Drawn at random, or told elsewhere."""
 
 
 def validity_of(
@@ -30,7 +52,7 @@ def validity_of(
     chances: Sequence[ChanceHits | None],
     facts: Mapping[str, Any],
 ) -> tuple[Section, ...]:
-    """Headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ``sweep``, ...)."""
+    """State headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
     sections = (
         ("What was varied", (*_inspected(limits), *varied_sentences(facts), *swept_sentences(facts))),
         ("What was held", held_sentences(facts)),
@@ -49,23 +71,20 @@ def _inspected(limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
     said: dict[str, list[str]] = {}
     for limit in limits:
         seen = limit.record.inspected
-        if len(seen.hit):
-            said.setdefault(_sizes(limit), []).append(limit.record.label)
+        if not len(seen.hit):
+            continue
+        low, high = float(seen.depth_mm.min()), float(seen.depth_mm.max())
+        deep = f"all {number(low)} mm deep" if low == high else f"{_span(low, high)} mm deep"
+        noise = limit.inspections / limit.targets
+        repeats = "" if noise == 1 else f", each inspected {number(noise)} times with new noise"
+        text = (
+            f"{limit.targets} damages on {limit.boards} boards, "
+            f"{_span(seen.diameter_mm.min(), seen.diameter_mm.max())} mm in diameter and {deep}{repeats}"
+        )
+        said.setdefault(text, []).append(limit.record.label)
     if len(said) == 1:
         return (f"{next(iter(said))}.",)
     return tuple(f"{', '.join(labels)}: {text}." for text, labels in said.items())
-
-
-def _sizes(limit: SetUpLimit) -> str:
-    seen = limit.record.inspected
-    depths = (float(seen.depth_mm.min()), float(seen.depth_mm.max()))
-    deep = f"all {number(depths[0])} mm deep" if depths[0] == depths[1] else f"{_span(*depths)} mm deep"
-    noise = limit.inspections / limit.targets
-    repeats = "" if noise == 1 else f", each inspected {number(noise)} times with new noise"
-    return (
-        f"{limit.targets} damages on {limit.boards} boards, {_span(seen.diameter_mm.min(), seen.diameter_mm.max())} mm "
-        f"in diameter and {deep}{repeats}"
-    )
 
 
 def _hits(record: StudyRecord, limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
@@ -150,7 +169,27 @@ def _departures(
             "Every limit is that of its threshold as it was calibrated: another draw of the calibration boards would "
             "give another threshold, which is in no interval here."
         )
-    said += [*_over_depths(limits), *_few_targets(limits), *_few_sites(limits, chances), *_sizes_miss_the_rise(limits)]
+    # The handbook's curve has one size; depth is a second one.
+    varied = [one.record.inspected.depth_mm for one in limits if one.statement]
+    varied = [depths for depths in varied if depth_varies(depths)]
+    if varied:
+        span = _span(min(float(one.min()) for one in varied), max(float(one.max()) for one in varied))
+        said.append(
+            f"Depths from {span} mm share one curve over diameter: a50, a90 and a90/95 are those of the depths as they "
+            "were drawn together, not those of any one depth."
+        )
+    few = [one for one in limits if one.targets < LEAST_TARGETS]
+    if few:
+        labels = ", ".join(one.record.label for one in few)
+        said.append(f"{labels}: fewer than {LEAST_TARGETS} targets ({min(one.targets for one in few)}).")
+    # Unflawed places are where damage could have been drawn, on hole-free boards.
+    ratios = [one.sites / limit.targets for limit, one in zip(limits, chances, strict=True) if one and limit.targets]
+    if ratios and min(ratios) < SITES_PER_TARGET:
+        said.append(
+            f"Unflawed places for each damage: {number(min(ratios))}; the handbook asks for {SITES_PER_TARGET}. "
+            "Besides, false calls are counted on the whole face of hole-free boards."
+        )
+    said += _sizes_miss_the_rise(limits)
     if any(limit.statement is not None for limit in limits):
         said.append(
             "The model is the one with the least deviance, and its bound is that of this one model: that the same data "
@@ -172,41 +211,15 @@ def _departures(
     return tuple(said)
 
 
-def _over_depths(limits: Sequence[SetUpLimit]) -> list[str]:
-    """The handbook's curve has one size; depth is a second one."""
-    depths = [one.record.inspected.depth_mm for one in limits if one.statement]
-    varied = [one for one in depths if depth_varies(one)]
-    if not varied:
-        return []
-    span = _span(min(float(one.min()) for one in varied), max(float(one.max()) for one in varied))
-    return [
-        f"Depths from {span} mm share one curve over diameter: a50, a90 and a90/95 are those of the depths as they "
-        "were drawn together, not those of any one depth."
-    ]
-
-
-def _few_targets(limits: Sequence[SetUpLimit]) -> list[str]:
-    few = [one for one in limits if one.targets < LEAST_TARGETS]
-    return [f"{_labels(few)}: fewer than {LEAST_TARGETS} targets ({min(one.targets for one in few)})."] if few else []
-
-
-def _few_sites(limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None]) -> list[str]:
-    """Unflawed places are where damage could have been drawn, on hole-free boards."""
-    ratios = [one.sites / limit.targets for limit, one in zip(limits, chances, strict=True) if one and limit.targets]
-    if not ratios or min(ratios) >= SITES_PER_TARGET:
-        return []
-    return [
-        f"Unflawed places for each damage: {number(min(ratios))}; the handbook asks for {SITES_PER_TARGET}. Besides, "
-        "false calls are counted on the whole face of hole-free boards."
-    ]
-
-
 def _sizes_miss_the_rise(limits: Sequence[SetUpLimit]) -> list[str]:
     said = []
     for limit in limits:
         if limit.statement is None:
             continue
-        low, high = (float(limit.statement.curve.pod(np.array(size))) for size in (_smallest(limit), limit.largest_mm))
+        low, high = (
+            float(limit.statement.curve.pod(np.array(size)))
+            for size in (limit.record.inspected.diameter_mm.min(), limit.largest_mm)
+        )
         if low > RISE[0]:
             said.append(f"{limit.record.label}: the smallest size inspected is found with a POD of {_percent(low)}.")
         if high < RISE[1]:
@@ -217,7 +230,7 @@ def _sizes_miss_the_rise(limits: Sequence[SetUpLimit]) -> list[str]:
 
 
 def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """What no number of this study speaks of."""
+    """Name the subjects that no number of this study speaks of."""
     source = facts.get("source", {})
     simulated = source.get("kind") == "simulated"
     said = ["An inspector, who can miss findings and doubt others: the POD is that of the program alone."]
@@ -239,16 +252,111 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     return tuple(said)
 
 
+def number(value: float) -> str:
+    """Write three significant digits without an exponent where four figures will do."""
+    if value != 0 and (abs(value) >= 1e4 or abs(value) < 1e-3):
+        return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def varied_sentences(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Say what was drawn anew for every board of a family: sizes, depths, places, pose, grain; but for swept ones."""
+    target = _at(facts, "source.target")
+    if not isinstance(target, Mapping) or target.get("name") != "drawn":
+        return ()
+    damage = target.get("damage", {})
+    drawn = [
+        f"{name} from {_range(damage[key])} mm"
+        for key, name in DRAWN.items()
+        if key in damage and not is_swept(facts, f"source.target.damage.{key}")
+    ]
+    law = {"uniform": "uniform", "log": "uniform in its logarithm"}.get(str(damage.get("sizes")), "")
+    said = []
+    if drawn:
+        parts = f"one from each of {damage.get('per_board')} equal parts of its range on every board"
+        how = f", the diameter {law}, {parts}" if law else ""
+        said.append(f"Drawn for every damage: {' and '.join(drawn)}{how}; and its place on the board.")
+    pose = [
+        text.format(f"{target[key]:g}")
+        for key, text in SPREADS.items()
+        if target.get(key) and not is_swept(facts, f"source.target.{key}")
+    ]
+    if pose:
+        said.append(f"Drawn uniformly for every board: {', '.join(pose)}.")
+    if target.get("material", {}).get("grain_contrast"):
+        said.append("Every board has a grain of its own.")
+    return tuple(said)
+
+
+def is_swept(facts: Mapping[str, Any], path: str) -> bool:
+    """Return whether an axis changes what stands at a dotted path, with its surroundings or in part."""
+    return any(_under(path, [axis]) or _under(axis, [path]) for axis in facts.get("sweep") or {})
+
+
+def swept_sentences(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """List the axes of the experiment with their values."""
+    sweep = facts.get("sweep") or {}
+    return tuple(f"{path}: {', '.join(_plain(value) for value in values)}." for path, values in sweep.items())
+
+
+def held_sentences(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """State everything that was the same for all: one sentence for each part of the declaration."""
+    swept = tuple(facts.get("sweep") or {})
+    said = []
+    for name, roots in GROUPS:
+        leaves = [leaf for root in roots for leaf in _leaves(_at(facts, root), root)]
+        kept = [
+            f"{path.removeprefix(roots[0]).lstrip('.')} {value}"
+            for path, value in leaves
+            if not _under(path, NOT_HELD) and not _under(path, swept) and path.rsplit(".", 1)[-1] not in SPREADS
+        ]
+        if kept:
+            said.append(f"{name}: {', '.join(kept)}.")
+    return tuple(said)
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """(dotted path, text) of everything that was given; nothing for what was not."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{path}.{key}")
+    elif value is not None and value != [] and value != () and value != "":
+        yield path, _plain(value)
+
+
+def _under(path: str, roots: Sequence[str]) -> bool:
+    return any(path == root or path.startswith(f"{root}.") for root in roots)
+
+
+def _at(facts: Mapping[str, Any], path: str) -> Any:
+    value: Any = facts
+    for key in path.split("."):
+        if not isinstance(value, Mapping) or key not in value:
+            return None
+        value = value[key]
+    return value
+
+
+def _range(limits: Any) -> str:
+    if isinstance(limits, Sequence) and len(limits) == 2:
+        return f"{limits[0]:g} to {limits[1]:g}"
+    return _plain(limits)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, int | float):
+        return f"{value:g}"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_plain(one) for one in value) + "]"
+    return str(value)
+
+
 def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def _labels(limits: Sequence[SetUpLimit]) -> str:
-    return ", ".join(limit.record.label for limit in limits)
-
-
-def _smallest(limit: SetUpLimit) -> float:
-    return float(limit.record.inspected.diameter_mm.min(initial=np.inf))
 
 
 def _size(limit: SetUpLimit, value: float) -> str:

@@ -1,4 +1,4 @@
-"""Whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks.
+"""The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks.
 
 Worse is a set-up whose a90 has grown by more than `MARGIN` and by more than chance explains, or that calls falsely that
 much oftener than chance explains; or that has no limit any more. The test is by Holm's step-down over both questions of
@@ -6,27 +6,34 @@ all set-ups at `ALPHA`, so a comparison of many set-ups raises no more false ala
 what no test here does: each set-up draws its own calibration of the threshold.
 
 On the same boards two tests answer the question of the limit, and its p is twice the smaller one's (Bonferroni): that
-of hits (`harness.evaluation.study.paired`), which is strong where the whole curve moves, and that of a90 itself
-(`harness.evaluation.study.paired_swap`), which sees a curve that flattens. The second takes seconds, and is asked only
-where a90 has changed by more than the margin and the first does not decide; unasked, its p is taken as 1. On other
-boards the bootstrap of a90 answers (`harness.evaluation.study.paired.LimitChange`).
+of hits (`harness.evaluation.study.paired.hits_change`), which is strong where the whole curve moves, and that of a90
+itself (`swap_change`, there), which sees a curve that flattens. The second takes seconds, and is asked only where a90
+has changed by more than the margin and the first does not decide; unasked, its p is taken as 1. On other boards the
+bootstrap of a90 answers (`limit_change`, there).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from harness.evaluation.pod.curve import Bound
 from harness.evaluation.study.limit import SetUpLimit, limit_of
-from harness.evaluation.study.paired import HitsChange, LimitChange, hits_change, limit_change
-from harness.evaluation.study.paired_calls import CallsChange, calls_change
-from harness.evaluation.study.paired_set_ups import Pair, differences, not_comparable, paired_set_ups
-from harness.evaluation.study.paired_swap import SwapChange, swap_change
-from harness.evaluation.study.record import StudyRecord
+from harness.evaluation.study.paired import (
+    CallsChange,
+    HitsChange,
+    LimitChange,
+    SwapChange,
+    Tails,
+    calls_change,
+    hits_change,
+    limit_change,
+    swap_change,
+)
+from harness.evaluation.study.record import SetUpRecord, StudyRecord
+from harness.vocabulary.seeds import canonical_json
 
 MARGIN = 1.10
 """Growth of a90, or of the rate of false calls, up to which nothing is worse (and shrinkage, nothing better)."""
@@ -34,7 +41,7 @@ ALPHA = 0.001
 """Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
 its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
 LIMIT_TESTS = 2
-"""Of hits and of a90: by so much each one's p is multiplied."""
+"""Two tests, of hits and of a90: each p is multiplied by their number."""
 TOSSES_PER_QUESTION, MOST_TOSSES = 5_000, 50_000
 """So many that four tosses as far out still convict one of that many questions. Of more than 50 questions, those of 25
 set-ups, none is decided by the test of a90: it would take a minute for each."""
@@ -56,6 +63,9 @@ SIGNS: dict[Mark, str] = {
     "only in second": ">",
 }
 """asv's signs, where it has one: + is a larger number, which is worse."""
+OTHER_DAMAGE_P = 0.001
+"""Boards drawn anew from one family differ by chance; less likely than this, they are taken for another family."""
+Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +83,8 @@ class ComparedSetUps:
     hits: HitsChange | None
     calls: CallsChange | None
     swap: SwapChange | None = None
-    limit_p: tuple[float, float] = (1.0, 1.0)
-    calls_p: tuple[float, float] = (1.0, 1.0)
+    limit_p: Tails = (1.0, 1.0)
+    calls_p: Tails = (1.0, 1.0)
     mark: Mark = "as good"
     why: str = ""
 
@@ -85,7 +95,7 @@ class ComparedSetUps:
         return " → ".join(dict.fromkeys(labels))
 
     def limit_test(self, side: int) -> Literal["hits", "a90", "bootstrap", ""]:
-        """Which test ``limit_p[side]`` is of: the one with the smaller p; empty where there is none."""
+        """Name the test that ``limit_p[side]`` is of: the one with the smaller p; empty where there is none."""
         if self.limit is None:
             return ""
         if self.hits is None:
@@ -95,7 +105,7 @@ class ComparedSetUps:
 
     @property
     def is_worse(self) -> bool:
-        """Whether a gate fails on it."""
+        """Return whether a gate fails on it."""
         return self.mark in ("worse", "newly failing")
 
 
@@ -120,16 +130,36 @@ def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
 
 
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
-    """``second`` against ``first``. Deterministic."""
-    rows = [_measured(first, second, pair) for pair in paired_set_ups(first, second)]
+    """Compare ``second`` with ``first``. Deterministic."""
+    rows = []
+    for one, other in paired_set_ups(first, second):
+        limits = (limit_of(one) if one else None, limit_of(other) if other else None)
+        row = ComparedSetUps(*limits, (), None, None, None, mark="only in second" if one is None else "only in first")
+        if one is not None and other is not None and limits[0] is not None and limits[1] is not None:
+            changed = differences(one, other)
+            if why := not_comparable(first, second, one, other):
+                row = replace(row, changed=changed, mark="not comparable", why=why)
+            else:
+                same = one.targets_digest == other.targets_digest
+                row = ComparedSetUps(
+                    *limits,
+                    changed,
+                    limit=limit_change(limits[0], limits[1], same),
+                    hits=hits_change(one.inspected, other.inspected) if same else None,
+                    calls=calls_change(one, other, first.false_calls_per_m2),
+                )
+        rows.append(row)
     questions = sum(p is not None for row in rows for p in _p_values(row))
     rows = [_with_swap(row, questions, alpha) for row in rows]
-    worse, better = (_adjusted(rows, side) for side in (0, 1))
-    judged = []
-    for row in rows:
-        limits, calls = ((next(worse), next(better)) for _ in range(2))
-        judged.append(_judged(replace(row, limit_p=limits, calls_p=calls), alpha))
-    return Comparison(first, second, tuple(judged), alpha)
+    # A question that was not asked is no member of the family.
+    asked = [p for row in rows for p in _p_values(row)]
+    sides = []
+    for side in (0, 1):
+        adjusted = iter(holm(p[side] for p in asked if p is not None))
+        sides.append([1.0 if p is None else float(next(adjusted)) for p in asked])
+    p = list(zip(*sides, strict=True))
+    rows = [replace(row, limit_p=p[2 * k], calls_p=p[2 * k + 1]) for k, row in enumerate(rows)]
+    return Comparison(first, second, tuple(_judged(row, alpha) for row in rows), alpha)
 
 
 def holm(p_values: Iterable[float]) -> np.ndarray:
@@ -142,23 +172,85 @@ def holm(p_values: Iterable[float]) -> np.ndarray:
     return adjusted
 
 
-def _measured(first: StudyRecord, second: StudyRecord, pair: Pair) -> ComparedSetUps:
-    one, other = pair
-    limits = (limit_of(one) if one else None, limit_of(other) if other else None)
-    if one is None or other is None or limits[0] is None or limits[1] is None:
-        mark: Mark = "only in second" if one is None else "only in first"
-        return ComparedSetUps(*limits, (), None, None, None, mark=mark)
-    changed = differences(one, other)
-    if why := not_comparable(first, second, one, other):
-        return ComparedSetUps(*limits, changed, None, None, None, mark="not comparable", why=why)
-    same = one.targets_digest == other.targets_digest
-    return ComparedSetUps(
-        *limits,
-        changed,
-        limit=limit_change(limits[0], limits[1], same),
-        hits=hits_change(one.inspected, other.inspected) if same else None,
-        calls=calls_change(one, other, first.false_calls_per_m2),
+# set-ups of two studies
+
+
+def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
+    """Pair set-ups by variant and frames; those left by place on the axes and frames; a single one of each is a pair.
+
+    In the order of ``first``; what only one study has stands with None, the second's at the end.
+    """
+    if len(first.set_ups) == len(second.set_ups) == 1:
+        return ((first.set_ups[0], second.set_ups[0]),)
+    ways: tuple[Callable[[SetUpRecord], Hashable], ...] = (
+        lambda one: (one.variant, one.frames),
+        lambda one: (canonical_json(dict(one.axes)), one.frames),
     )
+    partner: dict[int, SetUpRecord] = {}
+    free = list(second.set_ups)
+    for way in ways:
+        for place, one in enumerate(first.set_ups):
+            found = [other for other in free if way(other) == way(one)] if place not in partner else []
+            if len(found) == 1:
+                partner[place] = found[0]
+                free.remove(found[0])
+    pairs: list[Pair] = [(one, partner.get(place)) for place, one in enumerate(first.set_ups)]
+    return (*pairs, *((None, one) for one in free))
+
+
+def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord) -> str:
+    """Say why the two were not measured in the same way: another hit radius, wanted false calls, or damage.
+
+    Empty where they were: another detector, camera, number of frames or noise is what is to be compared. Damage of
+    other boards is compared by Kolmogorov and Smirnov's test of two samples with as many values as there are boards,
+    since damages of one board may be alike: cautious where they are not.
+    """
+    from scipy.stats import kstwobign
+
+    if first.hit_radius_mm != second.hit_radius_mm:
+        return f"hits within {first.hit_radius_mm:g} mm there, within {second.hit_radius_mm:g} mm here"
+    if first.false_calls_per_m2 != second.false_calls_per_m2:
+        there, here = (
+            "no stated rate of false calls" if rate is None else f"{rate:g} false calls per m²"
+            for rate in (first.false_calls_per_m2, second.false_calls_per_m2)
+        )
+        return f"thresholds for {there} there, for {here} here"
+    if bool(one.calibration_runs) != bool(other.calibration_runs):
+        return "the threshold of one is calibrated, that of the other given"
+    if one.targets_digest == other.targets_digest:
+        return ""
+    boards = [len(np.unique(record.inspected.board)) for record in (one, other)]
+    if not min(boards):
+        return ""
+    for column, what in (("diameter_mm", "sizes"), ("depth_mm", "depths")):
+        values = [np.sort(getattr(record.inspected, column)) for record in (one, other)]
+        at = np.concatenate(values)
+        shares = [np.searchsorted(sample, at, side="right") / len(sample) for sample in values]
+        distance = float(np.abs(shares[0] - shares[1]).max())
+        if kstwobign.sf(distance / np.sqrt(1 / boards[0] + 1 / boards[1])) < OTHER_DAMAGE_P:
+            return f"the damage is of other {what}"
+    return ""
+
+
+def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
+    """List what differs and may be the cause, in words."""
+    said = []
+    if (one.detector, one.detector_version) != (other.detector, other.detector_version):
+        said.append(f"{one.detector} {one.detector_version} → {other.detector} {other.detector_version}")
+    if one.frames != other.frames:
+        said.append(f"frames {one.frames} → {other.frames}")
+    for axis in sorted({*one.axes, *other.axes}):
+        before, now = one.axes.get(axis, "default"), other.axes.get(axis, "default")
+        if before != now:
+            said.append(f"{axis} {before} → {now}")
+    if one.targets_digest != other.targets_digest:
+        said.append("other boards")
+    elif one.frames_digest != other.frames_digest:
+        said.append("other frames of the same boards")
+    return tuple(said)
+
+
+# the verdict on a set-up
 
 
 def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSetUps:
@@ -174,15 +266,7 @@ def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSet
     return replace(row, swap=swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
 
 
-def _adjusted(rows: list[ComparedSetUps], side: int) -> Iterator[float]:
-    """Adjusted p of each row's limit and false calls in turn; ``side`` 0: worse, 1: better. A question that was not
-    asked is no member of the family."""
-    asked = [p for row in rows for p in _p_values(row)]
-    adjusted = iter(holm(p[side] for p in asked if p is not None))
-    return iter([1.0 if p is None else float(next(adjusted)) for p in asked])
-
-
-def _p_values(row: ComparedSetUps) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
+def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None]:
     """(worse, better) of the limit and of false calls."""
     calls = None if row.calls is None else row.calls.sides
     if row.hits is not None:
@@ -217,7 +301,7 @@ def _judged(row: ComparedSetUps, alpha: float) -> ComparedSetUps:
 
 
 def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
-    """What ``before`` had and ``now`` has not, in words; empty where nothing."""
+    """Say what ``before`` had and ``now`` has not; empty where nothing."""
     if now.record.failed > before.record.failed:
         return f"{now.record.failed} trials failed, {before.record.failed} before"
     if np.isfinite(before.a90_mm) and not np.isfinite(now.a90_mm):
@@ -236,10 +320,7 @@ def _growth(first: SetUpLimit, second: SetUpLimit) -> float:
 
 def _grown(first: SetUpLimit, second: SetUpLimit) -> str:
     before, now = first.a90_95, second.a90_95
-    if before.demonstrated != now.demonstrated:
-        return f"a90/95 {_bound_text(before)} → {_bound_text(now)}"
-    return f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
-
-
-def _bound_text(bound: Bound) -> str:
-    return f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated"
+    if before.demonstrated == now.demonstrated:
+        return f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
+    there, here = (f"{one.value:.2f} mm" if one.demonstrated else "not demonstrated" for one in (before, now))
+    return f"a90/95 {there} → {here}"
