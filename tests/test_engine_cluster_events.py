@@ -25,7 +25,7 @@ from harness.engine.cluster_worker import Carried, Worker
 from harness.engine.work import Ended, Job, Limits
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.sources import source_digest
-from scenes.render import cache, store
+from scenes.render import cache
 
 FIRST, SECOND = "tcp://first:1", "tcp://second:1"
 
@@ -211,6 +211,6 @@ def test_what_a_killed_driver_leaves_in_the_cache_is_a_leftover(tmp_path):
     engine, _ = engine_with(Joined(FIRST, worker(can_render=True)))
     engine.submit(render(tmp_path))
     assert len(list(tmp_path.iterdir())) == 1
-    assert [one.path for one in store.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())
+    assert [one.path for one in cache.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())
     engine.__exit__()
     assert not list(tmp_path.iterdir())

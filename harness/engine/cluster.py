@@ -384,7 +384,7 @@ class ClusterEngine:
     # ---------------------------------------------------------------- the cache
 
     def _place_probe(self, folder: Path) -> None:
-        """A file that tells whether a worker sees the driver's cache of renders; to `scenes.render.store` a leftover,
+        """A file that tells whether a worker sees the driver's cache of renders; to `scenes.render.cache` a leftover,
         where this process is killed."""
         self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
         write_text(self._probe, self._nonce)

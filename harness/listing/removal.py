@@ -12,7 +12,7 @@ from pathlib import Path
 
 from harness.listing.results import DIGEST_NAME, ENTRY_NAME, EXPERIMENT_NAME, POINT_NAME, files_below, folders_in
 from harness.vocabulary.errors import UserError
-from scenes.render.store import StoredFile, damaged_renders, leftovers, longest_unused, stored_renders
+from scenes.render.cache import StoredFile, damaged_renders, leftovers, longest_unused, stored_renders
 
 RESULT_FILES = frozenset(
     {"experiment.yaml", "provenance.json", "study.json", "summary.csv", "report.html", "compare.json", "compare.html"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.listing.text import age_text, size_text
-from scenes.render.store import damaged_renders, leftovers, stored_renders
+from scenes.render.cache import damaged_renders, leftovers, stored_renders
 
 
 def cache_folder(out: Path) -> Path:

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from harness.vocabulary.geometry import Region
-from scenes.sensor.camera import AnyCamera, CameraConfig, load_camera
-from scenes.sensor.effects import NONE, EffectsConfig
+from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, EffectsConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
 
 SEED = 1
 """Of all noise on the bench; streams differ by camera and scene."""
-NOISE = NONE.model_copy(update={"noise": True, "ambient": True, "saturation": True})
+NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
 """What the calibration point speaks of: the noise of each pixel, without traits of a unit or of a frame."""
 WHOLE = EffectsConfig()
 """The camera as it is."""

@@ -25,8 +25,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
-from scenes.sensor.camera import AnyCamera, CameraConfig, camera_of
-from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 
 LEAST_FRAMES = 4

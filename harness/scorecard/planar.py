@@ -14,7 +14,7 @@ from harness.scorecard.temporal import correlation_at, temporal_sigma_m
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
-from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.camera import EffectsConfig
 from scenes.view import NoiseFreeView
 
 PATCH = (40, 24)

@@ -14,7 +14,7 @@ from harness.scorecard.estimate import NOTHING, Estimate
 from harness.vocabulary.units import MM
 from scenes.render.cache import cached_view
 from scenes.render.settings import RenderConfig
-from scenes.sensor.effects import NONE
+from scenes.sensor.camera import NO_EFFECTS
 from scenes.target.custom import BoardConfig, FlatConfig, MaterialConfig, PoseConfig, RoomConfig, TargetConfig
 
 BOARD_MM = (400.0, 300.0)
@@ -49,7 +49,7 @@ def board_bend(bench: Bench, c: RoomConditions) -> Estimate:
 def _errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.ndarray]:
     """(n,) errors of z at the valid pixels of the board's inside, and what the render leaves of noise there; in mm."""
     view, _ = cached_view(board_in_room(c.distance_m), bench.camera.optics, RenderConfig(), bench.renders)
-    unit = bench.unit(view, NONE.model_copy(update={"multipath": c.multipath}))
+    unit = bench.unit(view, NO_EFFECTS.model_copy(update={"multipath": c.multipath}))
     stack = taken(unit, 1, bench.camera_name, "room")
     board = view.surface == view.surface_names.index("board")
     rim = 2 * (2 * bench.camera.optics.margin_px + 1)
