@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
 def _clean_cache(options: argparse.Namespace) -> int:
     from harness.listing.removal import cache_removal, checked_inside
     from harness.listing.text import bytes_of, cache_folder, many, seconds_of, size_text
-    from scenes.render.store import alone, removed
+    from scenes.render.cache import alone, removed
 
     limit = None if options.limit is None else bytes_of(options.limit)
     older_s = None if options.older_than is None else seconds_of(options.older_than)

@@ -149,7 +149,7 @@ def _list_cache(options: argparse.Namespace) -> int:
     import time
 
     from harness.listing.text import age_text, cache_folder, size_text
-    from scenes.render.store import damaged_renders, leftovers, stored_renders
+    from scenes.render.cache import damaged_renders, leftovers, stored_renders
 
     if options.name is not None:
         raise UserError(f"the cache has no part called {options.name!r}", fix="python -m harness.ls cache")

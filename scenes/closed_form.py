@@ -27,8 +27,8 @@ WHITE = 0.8
 """The colour albedo of closed-form surfaces; no sensor uses it."""
 
 Covers = Callable[[np.ndarray], np.ndarray]
-"""From slopes (..., 2) of points on the front plane, as seen from the lens, to whether the front is there; False for
-NaN."""
+"""Function of slopes (..., 2) of points on the front plane, as seen from the lens: whether the front is there; False
+for NaN."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class _Layers:
     optics: Optics
 
     def seen(self, rays: np.ndarray, weights: np.ndarray) -> _Seen:
-        """What footprints (..., k, 2) with ``weights`` (k,) sum up."""
+        """Sum up footprints (..., k, 2) with ``weights`` (k,)."""
         on_front, _, light, path_m, shadowed = self.meet(rays)
         phasor = [(weights * light * np.exp(1j * k * path_m)).sum(axis=-1) for k in _wave_numbers(self.optics)]
         state = on_front + 2 * shadowed
@@ -186,8 +186,8 @@ class _Layers:
         )
 
     def meet(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """For rays (..., 2): whether they meet the front, where they end (..., 3), the light there, its path in m,
-        and whether they end in the front's shadow."""
+        """Return for rays (..., 2): whether they meet the front, where they end (..., 3), the light there, its path in
+        m, and whether they end in the front's shadow."""
         on_front = self.covers(rays)
         front_points, back_points = (_points(rays, plane.z_along_m(rays)) for plane in (self.front, self.back))
         front_light, front_path = _lit(front_points, self.front, self.albedo, self.optics)
@@ -198,7 +198,7 @@ class _Layers:
         return on_front, points, light, np.where(on_front, front_path, back_path), shadowed
 
     def _in_shadow(self, points: np.ndarray) -> np.ndarray:
-        """Whether the way from points (..., 3) of the back to the emitter passes through the front.
+        """Tell whether the way from points (..., 3) of the back to the emitter passes through the front.
 
         It crosses the front's plane, n . p = -distance with n = (slope_x, slope_y, -1), at p + t w.
         """

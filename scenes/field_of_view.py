@@ -1,4 +1,4 @@
-"""Whether a camera sees a target, and on which part of its sensor."""
+"""Field of view: a target that a camera sees, and the part of its sensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.face import OUTLINE_STEPS, face_grid_m, outline_board_m
 
 NEAREST_M = 0.05
-"""Between the face and the lens' plane, whatever the camera."""
+"""Least distance of the face from the lens' plane, whatever the camera."""
 
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
@@ -32,7 +32,8 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
 
 
 def seen_region(outline_camera_m: np.ndarray, optics: Optics) -> Region:
-    """The pixels on which an outline (n, 3) lies. Raises UserError where part of it is off the sensor or behind it."""
+    """Return the pixels on which an outline (n, 3) lies. Raises UserError where part of it is off the sensor or behind
+    it."""
     lens = optics.lens
     nearest_m = float(outline_camera_m[:, 2].min())
     if nearest_m <= NEAREST_M:

@@ -1,4 +1,4 @@
-"""What the render needs to know of a camera: where it looks from, what lights the scene, at which frequencies."""
+"""Optics of a camera, as the render needs them: its lens, the light of the scene, the frequencies."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ MAX_VIEWS = 200
 
 
 class _Guess(Config):
-    """How far the nominal pose of every view but the first, the guess from which a registration starts, is off: turned
+    """Error of the nominal pose of every view but the first, the guess from which a registration starts: it is turned
     by ``guess_error_deg`` about a random axis through the target's centre, and shifted by ``guess_error_mm`` in a
     random direction."""
 
@@ -77,7 +77,7 @@ AnyViews = ArcViews | GridViews | HandHeldViews | ListedViews
 
 
 def view_count(views: AnyViews) -> int:
-    """How many views there are."""
+    """Return the number of views."""
     return len(views.poses) if isinstance(views, ListedViews) else views.count
 
 
@@ -162,7 +162,7 @@ def _jitter_mm(views: ArcViews | GridViews, number: int) -> tuple[float, float, 
 
 @lru_cache(maxsize=16)
 def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
-    """For each view: turns about x, y, z in degrees, shifts along x, y, z in mm; none at the first."""
+    """Return for each view: turns about x, y, z in degrees, shifts along x, y, z in mm; none at the first."""
     rng = random_stream(views.seed, "hand-held")
     phases, cycles = rng.uniform(0, 2 * np.pi, (6, 3)), rng.uniform(0.3, 1.5, (6, 3))
     time = np.linspace(0.0, 1.0, views.count) if views.count > 1 else np.zeros(1)

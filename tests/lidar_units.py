@@ -8,14 +8,15 @@ import numpy as np
 
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
-from scenes.sensor.camera import CameraConfig, camera_of, load_camera
-from scenes.sensor.effects import NONE
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
 
 CAMERA = load_camera("realsense_l515")
-QUIET = CameraConfig(name="realsense_l515", effects=NONE.model_copy(update={"multipath": True, "saturation": True}))
+QUIET = CameraConfig(
+    name="realsense_l515", effects=NO_EFFECTS.model_copy(update={"multipath": True, "saturation": True})
+)
 PATCH = Region(372, 422, 500, 560)
 RAW = {"engine.side_weight": 0.0, "engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
 """No smoothing and no gate that looks at neighbours."""

@@ -15,8 +15,7 @@ from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import WIDEST_PX, AmcwCamera
-from scenes.sensor.camera import CameraConfig, load_camera, read_camera
-from scenes.sensor.effects import NONE
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera, read_camera
 from scenes.sensor.source import SimulatedUnit
 
 MIDDLE = Region(90, 150, 120, 200)
@@ -73,7 +72,7 @@ def read(data: dict[str, Any], folder) -> AmcwCamera:
 
 
 def quiet(**effects: bool) -> CameraConfig:
-    return CameraConfig(effects=NONE.model_copy(update=effects))
+    return CameraConfig(effects=NO_EFFECTS.model_copy(update=effects))
 
 
 TWO = {

@@ -24,13 +24,12 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.amcw import listed
+from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.amcw.light_noise import light_of_samples
-from scenes.sensor.amcw.linear_frames import LANES
-from scenes.sensor.camera import CameraConfig, camera_of
-from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.amcw.kernels import LANES
+from scenes.sensor.amcw.linear import light_of_samples
+from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.source import SimulatedUnit
 
@@ -284,11 +283,11 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     assert summer is not None and isinstance(imager, AmcwImager)
     light, places = summer.light, summer.list
     normals = standard_normals(random_stream(1), (len(places.halo), 3, 2, LANES))
-    planes = np.empty((len(places.halo), 3, listed.BLOCK), np.float32)
-    listed.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
+    planes = np.empty((len(places.halo), 3, kernels.BLOCK), np.float32)
+    kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
     filtered = np.empty((3, 3, len(places.range), LANES), np.float32)
     edge = np.empty((3, len(places.range), LANES), np.float32)
-    listed.filter_listed(planes, places.window, *imager.filter_settings, filtered, edge)
+    kernels.filter_listed(planes, places.window, *imager.filter_settings, filtered, edge)
     by_plane = planes.reshape(-1, 3, 3, LANES)
     for lane in (0, LANES - 1):
         shape = unit.exposure.shape

@@ -20,9 +20,22 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
 from scenes.render import cache
-from scenes.render.cache import ARRAYS, cached_view, read_view, render_key, stored_view, view_bytes, write_view
+from scenes.render.cache import (
+    ARRAYS,
+    alone,
+    cached_view,
+    damaged_renders,
+    in_use,
+    leftovers,
+    read_view,
+    render_key,
+    stored_renders,
+    stored_view,
+    trim_cache,
+    view_bytes,
+    write_view,
+)
 from scenes.render.settings import RenderConfig
-from scenes.render.store import alone, damaged_renders, in_use, leftovers, stored_renders, trim_cache
 from scenes.sensor.camera import load_camera
 from scenes.target.thesis import ThesisTargetConfig
 from scenes.view import NoiseFreeView
@@ -71,10 +84,14 @@ def put_together(path: Path, parts: dict[str, bytes], kind: int = zipfile.ZIP_ST
             archive.writestr(name, content)
 
 
+ABSENT = object()
+
+
 def with_facts(path: Path, **changed: object) -> None:
     """The same file with other facts, and a checksum that fits them."""
     parts = parts_of(path)
     facts = {**json.loads(parts["facts.json"]), **changed}
+    facts = {name: value for name, value in facts.items() if value is not ABSENT}
     facts.pop("checksum")
     arrays = {name: np.load(io.BytesIO(parts[f"{name}.npy"])) for name in ARRAYS}
     parts["facts.json"] = json.dumps({**facts, "checksum": cache._checksum(facts, arrays)}).encode()
@@ -153,6 +170,9 @@ def test_a_file_of_another_version_is_absent(stored):
         {"region": {"row0": 0, "row1": -24, "col0": 0, "col1": -32}},
         {"region": {"row0": 0.0, "row1": 24.0, "col0": 0, "col1": 32}},
         {"region": None},
+        {"version": ABSENT},
+        {"seconds": ABSENT},
+        {"surface_names": ABSENT},
         {"frequencies_hz": [1e8] * 4},
         {"frequencies_hz": 3},
         {"types": {}},

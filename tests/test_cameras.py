@@ -57,6 +57,13 @@ def test_a_bad_camera_file_is_one_message_with_file_line_and_key(tmp_path, old, 
     assert str(path) in str(caught.value)
 
 
+def test_a_kind_that_is_a_list_is_refused(tmp_path):
+    path = tmp_path / "azure_kinect_nfov.yaml"
+    path.write_text(AZURE.replace("kind: amcw_imager", "kind: [amcw_imager]"))
+    with pytest.raises(UserError, match=r"`kind` is .*none of the legal values"):
+        read_camera(path)
+
+
 def test_impossible_frequencies_are_named(tmp_path):
     path = tmp_path / "azure_kinect_nfov.yaml"
     path.write_text(AZURE.replace("[198.0e+6", "[-198.0e+6", 1))

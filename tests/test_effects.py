@@ -14,8 +14,7 @@ from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.exposure import ambient_electrons, with_harmonics
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.camera import CameraConfig, camera_of, load_camera
-from scenes.sensor.effects import NONE, EffectsConfig
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import frame_errors_m, smooth_field
 
@@ -34,7 +33,7 @@ def config(camera: str = AZURE, numbers: dict | None = None, fine: bool = True, 
     """A camera with only the given effects on."""
     return CameraConfig(
         name=camera,
-        effects=NONE.model_copy(update=effects),
+        effects=NO_EFFECTS.model_copy(update=effects),
         numbers=(FINE if fine else {}) | (numbers or {}),
         minutes_since_power_on=5.0,
     )

@@ -26,7 +26,7 @@ from harness.engine.options import code_of
 from harness.engine.work import Ended, Job, Limits
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.sources import source_digest
-from scenes.render import store
+from scenes.render import cache
 
 FIRST, SECOND = "tcp://first:1", "tcp://second:1"
 CODE = code_of(["thesis"])
@@ -254,6 +254,6 @@ def test_the_probe_of_a_killed_driver_is_a_leftover(tmp_path, client):
     engine = engine_with(client, first=facts())
     engine.submit(render(tmp_path))
     assert len(list(tmp_path.iterdir())) == 1
-    assert [one.path for one in store.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())
+    assert [one.path for one in cache.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())
     engine.__exit__()
     assert not list(tmp_path.iterdir())

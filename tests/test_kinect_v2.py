@@ -16,15 +16,14 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m
-from scenes.sensor.camera import CameraConfig, camera_of, load_camera
-from scenes.sensor.effects import NONE
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32
 V2 = load_camera("kinect_v2")
 NEAR_AXIS = Region(170, 240, 210, 300)
-QUIET = CameraConfig(name="kinect_v2", effects=NONE.model_copy(update={"multipath": True}))
-NOISY = QUIET.model_copy(update={"effects": NONE.model_copy(update={"noise": True, "multipath": True})})
+QUIET = CameraConfig(name="kinect_v2", effects=NO_EFFECTS.model_copy(update={"multipath": True}))
+NOISY = QUIET.model_copy(update={"effects": NO_EFFECTS.model_copy(update={"noise": True, "multipath": True})})
 FINE = {"converter.knee_units": 10**6, "photons.electrons_per_unit": 0.1}
 """A converter whose rounding hides nothing."""
 WINDOW = np.exp(-(np.add.outer([1, 0, 1], [1, 0, 1])) / 18)
@@ -40,7 +39,8 @@ def test_gain_meets_the_calibration_point():
 
 def test_the_window_is_the_published_one():
     imager = AmcwImager(V2, QUIET, NEAR_AXIS, V2.nominal_lens.region_slopes(NEAR_AXIS))
-    assert imager._window / imager._window.sum() == pytest.approx(
+    space, _ = imager.filter_settings
+    assert space / space.sum() == pytest.approx(
         np.array([[0.1069973, 0.1131098, 0.1069973], [0.1131098, 0.1195716, 0.1131098]])[[0, 1, 0]], abs=1e-6
     )
 
@@ -85,7 +85,8 @@ def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, fl
     strength[:, 0] = amplitude
     unit = np.stack([np.cos(phases), np.sin(phases)]).astype(f4)
     filtered, edge = np.empty((3, 3, 3), f4), np.empty((3, 3), f4)
-    kernels.joint_bilateral(unit, strength, WINDOW.astype(f4), f4(3.6067), f4(3), True, True, filtered, edge)
+    settings = kernels.FilterSettings(f4(3.6067), f4(3), True, True)
+    kernels.filter_image(unit, strength, WINDOW.astype(f4), settings, filtered, edge)
     return complex(filtered[0, 1, 1], filtered[1, 1, 1]), float(edge[1, 1])
 
 
@@ -217,10 +218,20 @@ def test_unwrapping_is_right_over_the_whole_range_and_equals_the_published_one()
 
 def test_the_residual_that_is_allowed_falls_with_amplitude():
     """0.611 rad for dim pixels, 0.349 for bright ones, and A^-0.533 between."""
-    gates = AmcwImager(V2, QUIET, NEAR_AXIS, V2.nominal_lens.region_slopes(NEAR_AXIS))._gates
-    limit_rad = {a: 2 * np.pi * np.sqrt(ranging._residual_limit2(gates, f4(a))) for a in (10, 400, 800, 5000)}
-    assert limit_rad[10] == pytest.approx(0.6108653, rel=1e-5)
-    assert limit_rad[5000] == pytest.approx(0.3490659, rel=1e-5)
+    gates = AmcwImager(V2, QUIET, NEAR_AXIS, V2.nominal_lens.region_slopes(NEAR_AXIS)).engine.gates
+    turns = np.linspace(0.05, 0.11, 60_001)
+
+    def limit_of(amplitude: float) -> float:
+        each = dict.fromkeys(ranging.GateInputs._fields, np.full(turns.size, 1e3))
+        each |= {"edge": np.zeros(turns.size), "range_m": np.full(turns.size, 1e6), "low_m": np.ones(turns.size)}
+        each |= {"high_m": np.ones(turns.size), "residual2": turns**2, "brightest": np.full(turns.size, amplitude)}
+        codes = ranging.first_failed_each(gates, ranging.GateInputs(**each))
+        assert set(codes) == {ranging.VALID, ranging.UNWRAP}
+        return float(2 * np.pi * turns[codes == ranging.VALID].max())
+
+    limit_rad = {a: limit_of(a) for a in (10, 400, 800, 5000)}
+    assert limit_rad[10] == pytest.approx(0.6108653, rel=2e-5)
+    assert limit_rad[5000] == pytest.approx(0.3490659, rel=2e-5)
     assert limit_rad[400] == pytest.approx(
         np.exp(3.321928 * (0.7694894 - 0.5330578 * 0.301030 * np.log(400))), rel=1e-3
     )
@@ -228,7 +239,7 @@ def test_the_residual_that_is_allowed_falls_with_amplitude():
 
 
 def test_noise_free_range_is_exact_from_half_a_metre_on():
-    settings = CameraConfig(name="kinect_v2", effects=NONE, numbers=FINE)
+    settings = CameraConfig(name="kinect_v2", effects=NO_EFFECTS, numbers=FINE)
     camera = camera_of(settings)
     for distance_m, valid in ((0.49, False), (0.52, True), (2.0, True), (4.4, True), (4.6, False)):
         unit = SimulatedUnit(camera, settings, plane_view(camera, NEAR_AXIS, distance_m, 0.6, 0.01, 0.02))

@@ -11,9 +11,8 @@ from lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, UNIFORM, changed, comb_
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.closed_form import plane_view
-from scenes.sensor.camera import CameraConfig
-from scenes.sensor.effects import NONE
-from scenes.sensor.lidar.calibration import ONLY_NOISE, calibrated_numbers, temporal_sigma_m, unit_before_plane
+from scenes.sensor.calibration import ONLY_NOISE, calibrated_numbers, temporal_sigma_m, unit_before_plane
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig
 from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.scanner import LidarScanner
@@ -187,7 +186,7 @@ def test_ambient_light_adds_noise_and_its_switch_takes_it_away():
     view = plane_view(CAMERA, PATCH, 2.0, 0.5)
     noises = {}
     for key, on, level in (("off", False, 0.4), ("none", True, 0.0), ("window", True, 0.4)):
-        effects = NONE.model_copy(update={"noise": True, "ambient": on})
+        effects = NO_EFFECTS.model_copy(update={"noise": True, "ambient": on})
         config = CameraConfig(name=CAMERA.name, effects=effects, ambient_uw_cm2_nm=level)
         noises[key] = SimulatedUnit(CAMERA, config, view).exposure.noise
     assert np.array_equal(noises["off"], noises["none"])

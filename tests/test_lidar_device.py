@@ -16,9 +16,8 @@ from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import CameraConfig
-from scenes.sensor.effects import NONE, EffectsConfig
-from scenes.sensor.lidar.calibration import ONLY_NOISE
+from scenes.sensor.calibration import ONLY_NOISE
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.lidar.scanner import LidarScanner, overlap_taps, smear_weights
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
@@ -71,7 +70,7 @@ def test_multipath_lengthens_range_and_its_switch_takes_it_away():
     direct = plane_view(CAMERA, PATCH, 1.0, 0.6)
     late = plane_view(CAMERA, PATCH, 1.1, 0.6)
     view = replace(direct, phasor=direct.phasor + 0.1 * late.phasor, intensity=direct.intensity + 0.1 * late.intensity)
-    without = NONE.model_copy(update={"saturation": True})
+    without = NO_EFFECTS.model_copy(update={"saturation": True})
     on, off = (
         z_of(SimulatedUnit(CAMERA, QUIET.model_copy(update={"effects": e}), view)).mean()
         for e in (QUIET.effects, without)
@@ -143,7 +142,7 @@ def test_each_gate_names_its_reason():
     assert reasons_at(0.24, 0.5) == {Reason.OUT_OF_RANGE}
     assert reasons_at(0.24, 1.0) == {Reason.SATURATED}
     assert reasons_at(0.26, 0.95) == {Reason.VALID}
-    blind = QUIET.model_copy(update={"effects": NONE})
+    blind = QUIET.model_copy(update={"effects": NO_EFFECTS})
     assert reasons_at(0.24, 1.0, blind) == {Reason.OUT_OF_RANGE}
 
 
@@ -173,10 +172,10 @@ def test_dark_beams_rarely_pass_for_returns():
 
 def test_effects_that_are_off_are_absent():
     view = plane_view(CAMERA, PATCH, 0.8, 0.6, 0.05, 0.02)
-    z = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=NONE), view), 3)
+    z = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=NO_EFFECTS), view), 3)
     assert np.array_equal(z[0], z[1]) and np.array_equal(z[0], z[2])
     for name in EffectsConfig.model_fields:
-        effects = NONE.model_copy(update={name: True})
+        effects = NO_EFFECTS.model_copy(update={name: True})
         one = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=effects), view))
         # nothing to saturate, no other path, no noise to add to, no harmonics
         silent = name in ("multipath", "wiggling", "ambient", "saturation")
@@ -185,15 +184,16 @@ def test_effects_that_are_off_are_absent():
 
 def test_ripples_have_the_size_and_length_of_their_facts():
     lens = CAMERA.nominal_lens
-    config = CameraConfig(name=CAMERA.name, unit_seed=4)
-    ripples = LidarScanner(CAMERA, config, lens.whole, lens.region_slopes(lens.whole)).ripples_m
+    only = NO_EFFECTS.model_copy(update={"fixed_pattern": True})
+    config = CameraConfig(name=CAMERA.name, unit_seed=4, effects=only)
+    ripples = LidarScanner(CAMERA, config, lens.whole, lens.region_slopes(lens.whole)).static_error_m
     size, length = CAMERA.fixed_pattern.smooth_mm.value * 1e-3, CAMERA.fixed_pattern.smooth_length_px.value
     # some 2,700 independent patches: 1.4 % at one sigma
     assert ripples.std() == pytest.approx(size, rel=0.05)
     for lag in (6, 12, 24):
         expected = np.exp(-(lag**2) / (2 * length**2))
         assert (ripples[lag:] * ripples[:-lag]).mean() / ripples.var() == pytest.approx(expected, abs=0.05)
-    part = LidarScanner(CAMERA, config, PATCH, lens.region_slopes(PATCH)).ripples_m
+    part = LidarScanner(CAMERA, config, PATCH, lens.region_slopes(PATCH)).static_error_m
     assert np.array_equal(part, ripples[PATCH.within(lens.whole)])
 
 

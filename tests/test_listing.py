@@ -20,8 +20,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.versions import RESULTS_VERSION
 from scenes.closed_form import plane_view
-from scenes.render.cache import write_view
-from scenes.render.store import in_use
+from scenes.render.cache import in_use, write_view
 from scenes.sensor.camera import load_camera
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,11 +14,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.render import variant
 from scenes.render.cache import cached_view, read_view, render_key
-from scenes.render.direct import OffFace, cast, direct_light
-from scenes.render.face import face_triangles
-from scenes.render.footprint import Quadrilaterals, footprint_of
-from scenes.render.indirect import Work, gather_at_points, gather_in_pixels, range_change_m
-from scenes.render.phasors import phasor_sums
+from scenes.render.direct import OffFace, Quadrilaterals, cast, direct_light, footprint_of, phasor_sums
+from scenes.render.indirect import PathWork, face_triangles, gather_at_points, gather_in_pixels, range_change_m
 from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
@@ -151,7 +148,9 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
     floor = quad([[-1, 0.3, 0.2], [1, 0.3, 0.2], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "floor", 0.6)
     lit = scene_of(wall, floor)
     point = np.array([0.05, 0.2, 1.0])
-    light = gather_at_points(lit, point[None], np.array([[0.0, 0, -1]]), Work(CAMERA.frequencies_hz, 0, seed=3), 65536)
+    light = gather_at_points(
+        lit, point[None], np.array([[0.0, 0, -1]]), PathWork(CAMERA.frequencies_hz, 0, seed=3), 65536
+    )
     xs, zs = np.linspace(-1, 1, 1601), np.linspace(0.2, 1.0, 1601)
     xs, zs = (xs[1:] + xs[:-1]) / 2, (zs[1:] + zs[:-1]) / 2
     q = np.stack(np.broadcast_arrays(xs[None, :], 0.3, zs[:, None]), axis=-1)
@@ -168,7 +167,7 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
         assert abs(light.mean[f, 0] - expected) < 0.004 * abs(expected)
     slope = point[:2] / point[2]
     rays = OffFace(np.zeros(1, int), np.ones(1, int), np.ones(1), slope[None].astype(np.float32))
-    pixel = gather_in_pixels(lit, rays, Work(CAMERA.frequencies_hz, 4, seed=3), 8192)
+    pixel = gather_in_pixels(lit, rays, PathWork(CAMERA.frequencies_hz, 4, seed=3), 8192)
     hit = cast(lit, slope[None])
     direct = hit.amplitude * np.exp(1j * WAVE * hit.path_m)
     assert (np.angle((direct + pixel.mean[:3, 0]) / direct) > 0).all()
@@ -249,7 +248,7 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
     lit = scene_of(*target.parts)
     lens = CAMERA.nominal_lens
     rows, cols = (a.ravel() for a in np.meshgrid([22, 70], np.arange(30, 400, 4), indexing="ij"))
-    work = Work(CAMERA.frequencies_hz, QUICK.bounces, seed=9)
+    work = PathWork(CAMERA.frequencies_hz, QUICK.bounces, seed=9)
     traced = gather_in_pixels(lit, whole_pixels(lens, thesis_view.region, rows, cols), work, 2048)
     direct = thesis_view.phasor_direct[:, rows, cols]
     indirect = thesis_view.phasor[:, rows, cols] - direct

@@ -15,16 +15,15 @@ from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.unwrap import unwrap_table
-from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m, with_signal
-from scenes.sensor.camera import CameraConfig, load_camera
-from scenes.sensor.effects import NONE
+from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m, with_number
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
 from scenes.sensor.normals import normals_from_bits
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32
 CAMERA = load_camera("azure_kinect_nfov")
 NEAR_AXIS = Region(300, 360, 280, 360)
-QUIET = CameraConfig(effects=NONE.model_copy(update={"multipath": True, "saturation": True}))
+QUIET = CameraConfig(effects=NO_EFFECTS.model_copy(update={"multipath": True, "saturation": True}))
 CLEAN = CameraConfig(effects=QUIET.effects.model_copy(update={"noise": True, "ambient": True}))
 
 
@@ -157,8 +156,8 @@ def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, b
     offset = np.arange(-half, half + 1)
     space = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma_px**2))
     filtered, edge = np.empty((3, h, w), f4), np.empty((h, w), f4)
-    switches = f4(3.6067), f4(24), drop_dim, by_amplitude
-    kernels.joint_bilateral(unit, amplitude, space.astype(f4), *switches, filtered, edge)
+    settings = kernels.FilterSettings(f4(3.6067), f4(24), drop_dim, by_amplitude)
+    kernels.filter_image(unit, amplitude, space.astype(f4), settings, filtered, edge)
     phasor = unit[0] + 1j * unit[1]
     for y in range(h):
         for x in range(w):
@@ -251,7 +250,7 @@ def test_fixed_pattern_belongs_to_the_unit_not_to_the_region():
     small, large = Region(300, 340, 300, 360), Region(290, 350, 280, 380)
     views = [plane_view(CAMERA, region, 0.8, 0.6, 0.05, 0.02) for region in (small, large)]
     a, b = (
-        SimulatedUnit(CAMERA, CameraConfig(effects=NONE.model_copy(update={"fixed_pattern": True})), view)
+        SimulatedUnit(CAMERA, CameraConfig(effects=NO_EFFECTS.model_copy(update={"fixed_pattern": True})), view)
         for view in views
     )
     assert np.array_equal(stack(a, 1)[0], stack(b, 1)[0][a.region.within(b.region)])
@@ -299,5 +298,7 @@ def test_mixed_phasors_are_told_by_residual_ratio_or_edge():
 
 def test_more_light_less_noise():
     """Shot-limited: four times the light halves the deviation (rounding and read noise allow 10 %)."""
-    dim, bright = (temporal_sigma_m(with_signal(CAMERA, e), 2.5, 0.5, 60, 1) for e in (1000, 4000))
+    dim, bright = (
+        temporal_sigma_m(with_number(CAMERA, "photons", "signal_electrons", e), 2.5, 0.5, 60, 1) for e in (1000, 4000)
+    )
     assert dim / bright == pytest.approx(2, rel=0.1)

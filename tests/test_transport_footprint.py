@@ -15,9 +15,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
-from scenes.render.direct import direct_light
-from scenes.render.footprint import Beams, footprint_of
-from scenes.render.phasors import comb_step, phasor_sums
+from scenes.render.direct import Beams, comb_step, direct_light, footprint_of, phasor_sums
 from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba

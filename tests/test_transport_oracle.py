@@ -11,9 +11,8 @@ import trimesh
 
 from harness.vocabulary.lens import Lens
 from scenes.optics import Optics
-from scenes.render.direct import direct_light
-from scenes.render.footprint import footprint_of
-from scenes.render.indirect import Work, gather_in_pixels
+from scenes.render.direct import direct_light, footprint_of
+from scenes.render.indirect import PathWork, gather_in_pixels
 from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
@@ -73,7 +72,7 @@ def test_a_corner(histogram):
     region = optics.lens.whole
     slopes = optics.lens.region_slopes(region)
     direct = direct_light(lit, slopes, footprint_of(optics.lens, region, optics.footprint), FREQUENCIES)
-    light = gather_in_pixels(lit, direct.off_face, Work(FREQUENCIES, BOUNCES, seed=1), 512)
+    light = gather_in_pixels(lit, direct.off_face, PathWork(FREQUENCIES, BOUNCES, seed=1), 512)
     ours = direct.phasor.reshape(3, -1).copy()
     ours[:, direct.off_face.pixel] += direct.off_face.share * light.mean[:-1]
     ours = ours.reshape(3, *region.shape)

@@ -24,9 +24,9 @@ from detectors.average import (
 )
 from harness.vocabulary.capture import Cloud, LeftOut
 from harness.vocabulary.units import MM
-from scenes.sensor.model import FrameSummer
+from scenes.sensor.amcw.at_once import AtOnce
+from scenes.sensor.frames import FrameTotals
 from scenes.sensor.source import SimulatedCapture
-from scenes.sensor.totals import FrameTotals
 
 FEWEST_FRAMES = 20
 """Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
@@ -96,7 +96,7 @@ class _Verdict:
     left_out: tuple[LeftOut, ...]
 
 
-def _verdict(capture: SimulatedCapture, summer: FrameSummer, n: int, config: AverageConfig) -> _Verdict | None:
+def _verdict(capture: SimulatedCapture, summer: AtOnce, n: int, config: AverageConfig) -> _Verdict | None:
     """The judgement of `detectors.average` on the first n frames; None where the pixels' noise might decide."""
     shift_m = summer.z_by_error * capture.errors_m[:n]
     if not config.judge_frames:
@@ -139,7 +139,7 @@ def _reference(shift_m: np.ndarray, limit_m: float, slack_m: float) -> float | N
     return float(np.median(agreeing)) if len(agreeing) > 2 else float(shift_m[nearest])
 
 
-def _frame_noise_m(capture: SimulatedCapture, summer: FrameSummer) -> float:
+def _frame_noise_m(capture: SimulatedCapture, summer: AtOnce) -> float:
     """One frame's noise as the judge finds it: with its rounding."""
     return float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
 

@@ -410,7 +410,7 @@ class ClusterEngine:
     # ---------------------------------------------------------------- the cache
 
     def _place_probe(self, folder: Path) -> None:
-        """Write a file that tells whether a node sees the driver's cache of renders; to `scenes.render.store` it is a
+        """Write a file that tells whether a node sees the driver's cache of renders; to `scenes.render.cache` it is a
         leftover, where this process is killed."""
         self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
         write_text(self._probe, self._nonce)

@@ -36,8 +36,7 @@ from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
 from harness.vocabulary.provenance import record
 from harness.vocabulary.units import INCH, MM
 from harness.vocabulary.versions import RESULTS_VERSION, check_version
-from scenes.render.cache import read_view
-from scenes.render.store import in_use, trim_cache
+from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
 from scenes.view import NoiseFreeView

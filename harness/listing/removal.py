@@ -14,7 +14,7 @@ from harness.listing.latest import DIGEST_NAME, repoint
 from harness.listing.results import ENTRY_NAME, EXPERIMENT_NAME, POINT_NAME, described, files_below, folders_in
 from harness.tables.outputs import EXPERIMENT, JOURNAL, LOCK_NAME, is_output
 from harness.vocabulary.errors import UserError
-from scenes.render.store import StoredFile, damaged_renders, leftovers, longest_unused, stored_renders
+from scenes.render.cache import StoredFile, damaged_renders, leftovers, longest_unused, stored_renders
 
 OURS = b"# tofpod experiment "
 """First words of an experiment.yaml that a sweep wrote."""

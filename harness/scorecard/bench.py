@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike
 
 from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval, mean_t, wilson
 from harness.vocabulary.geometry import Region
-from scenes.sensor.camera import AnyCamera, CameraConfig, load_camera
-from scenes.sensor.effects import NONE, EffectsConfig
+from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, EffectsConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
 
 SEED = 1
 """Seed of all noise on the bench; streams differ by camera and scene."""
-NOISE = NONE.model_copy(update={"noise": True, "ambient": True, "saturation": True})
+NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
 """The noise of each pixel, which the calibration point speaks of, without traits of a unit or of a frame."""
 WHOLE = EffectsConfig()
 """All effects of the camera."""

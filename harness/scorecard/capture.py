@@ -29,8 +29,7 @@ from harness.vocabulary.lens import Lens
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import AnyCamera, CameraConfig, camera_of, load_camera
-from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.view import NoiseFreeView
 

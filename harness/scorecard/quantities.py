@@ -38,7 +38,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
-from scenes.sensor.effects import NONE, EffectsConfig
+from scenes.sensor.camera import NO_EFFECTS, EffectsConfig
 from scenes.view import NoiseFreeView
 
 PATCH = (40, 24)
@@ -394,7 +394,7 @@ def _room_errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.nda
         pose=PoseConfig(distance_m=c.distance_m, tilt_x_deg=3.0, tilt_y_deg=4.0),
     )
     view, _ = cached_view(target, bench.camera.optics, RenderConfig(), bench.renders)
-    unit = bench.unit(view, NONE.model_copy(update={"multipath": c.multipath}))
+    unit = bench.unit(view, NO_EFFECTS.model_copy(update={"multipath": c.multipath}))
     stack = taken(unit, 1, bench.camera_name, "room")
     board = view.surface == view.surface_names.index("board")
     rim = 2 * (2 * bench.camera.optics.margin_px + 1)

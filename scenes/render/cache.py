@@ -1,4 +1,8 @@
-"""Renders kept by content: the key is everything that can change a number, the file carries its own checksum."""
+"""Renders kept by content: the key is everything that can change a number, the file carries its own checksum.
+
+At the end stands the folder of stored renders as a whole: what is in it, who uses it, and what goes when it grows too
+large.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,13 @@ import hashlib
 import io
 import json
 import os
+import re
 import stat
 import struct
+import time
 import zipfile
-from dataclasses import asdict, fields
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
 from math import prod
 from operator import index
 from pathlib import Path
@@ -18,9 +25,10 @@ from typing import IO, Any
 
 import numpy as np
 
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import Region
-from harness.vocabulary.locks import one_at_a_time
+from harness.vocabulary.locks import lock, one_at_a_time, opened_lock
 from harness.vocabulary.seeds import digest
 from harness.vocabulary.sources import source_digest
 from scenes.optics import Optics
@@ -44,10 +52,17 @@ MOST_FACTS_BYTES = 1 << 20
 """They take some 500 bytes; names of ten thousand surfaces would take 200 kB."""
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 AXES = {"phasor": "fhw", "phasor_direct": "fhw", "slopes": "hw2", "rgb": "hw3"}
-"""Of the arrays: frequencies, rows and columns of the region; those not named have "hw"."""
+"""Axes of the arrays: frequencies, rows and columns of the region; those not named have "hw"."""
 TYPES = {np.dtype(name).str: np.dtype(name) for name in ("c8", "c16", "f4", "f8", "i2", "i4", "i8")}
 MOST_PIXELS = 1 << 16
-"""Across a region or down: ten times the largest sensor."""
+"""Most pixels across a region or down: ten times the largest sensor."""
+RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
+LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")
+"""Names that `harness.vocabulary.files.atomic_path` gives a render that is being written: left behind by killed
+processes."""
+LEFTOVER_AFTER_S = 86_400.0
+"""A render is written in less than a second; a day is far from any that is still being written, on any file system."""
+LOCK = ".lock"
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
@@ -109,7 +124,7 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
 
 def read_view(path: Path) -> NoiseFreeView | None:
     """A stored view, or None where the file is absent, truncated, damaged or of another version. A view that was read
-    has been used: its file's time says so, for `scenes.render.store.trim_cache`."""
+    has been used: its file's time says so, for `trim_cache`."""
     view = stored_view(path)
     if view is not None:
         with contextlib.suppress(OSError):  # a cache that may only be read serves as well
@@ -118,9 +133,9 @@ def read_view(path: Path) -> NoiseFreeView | None:
 
 
 def stored_view(path: Path) -> NoiseFreeView | None:
-    """As `read_view`, without a trace. Nothing of a file is believed before it is checked: a part is read only if it is
-    not compressed, lies in the file and has just the size that its array takes, so that memory is bounded by the file's
-    size; nothing is unpickled, and nothing parsed but the facts."""
+    """Read a view as `read_view` does, without a trace. Nothing of a file is believed before it is checked: a part is
+    read only if it is not compressed, lies in the file and has just the size that its array takes, so that memory is
+    bounded by the file's size; nothing is unpickled, and nothing parsed but the facts."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             return None  # reading a pipe would wait for ever
@@ -128,23 +143,23 @@ def stored_view(path: Path) -> NoiseFreeView | None:
             length = archive.getinfo(FACTS).file_size
             facts = json.loads(_part(archive, file, FACTS, min(length, MOST_FACTS_BYTES)))
             arrays = {name: _array(archive, file, name, facts) for name in ARRAYS}
-            told, version = facts.pop("checksum"), facts["version"]
+        checksum = facts.pop("checksum")
+        if facts["version"] != VIEW_VERSION or checksum != _checksum(facts, arrays):
+            return None
+        return NoiseFreeView(
+            region=_region(facts),
+            frequencies_hz=tuple(facts["frequencies_hz"]),
+            surface_names=tuple(facts["surface_names"]),
+            seconds=facts["seconds"],
+            variant=facts["variant"],
+            **arrays,
+        )
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, struct.error, zipfile.BadZipFile):
         return None  # RuntimeError: what zipfile cannot do, and JSON that is nested too deeply
-    if version != VIEW_VERSION or told != _checksum(facts, arrays):
-        return None
-    return NoiseFreeView(
-        region=_region(facts),
-        frequencies_hz=tuple(facts["frequencies_hz"]),
-        surface_names=tuple(facts["surface_names"]),
-        seconds=facts["seconds"],
-        variant=facts["variant"],
-        **arrays,
-    )
 
 
 def view_bytes(region: Region, frequencies: int) -> int:
-    """What a render takes on the disk, within 1 %, before it is made."""
+    """Return the size of a render on the disk, within 1 %, before it is made."""
     h, w = region.shape
     return h * w * (2 * 8 * frequencies + 3 * 8 + 2 + 4 + 3 * 4 + 2 * 8) + 4096
 
@@ -179,7 +194,7 @@ def _part(archive: zipfile.ZipFile, file: IO[bytes], name: str, size: int) -> by
 
 
 def _header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    """What stands before an array in a .npy file."""
+    """Return what stands before an array in a .npy file."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": dtype.str, "fortran_order": False, "shape": shape})
     return header.getvalue()
@@ -192,3 +207,139 @@ def _checksum(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
         state.update(f"{name}{arrays[name].shape}{arrays[name].dtype}".encode())
         state.update(arrays[name].data)
     return state.hexdigest()
+
+
+# ---- the folder of stored renders
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file of the cache. ``used_s``: when it was last read or written, seconds since 1970 by the file system's
+    clock; how far it can be trusted is that clock's matter, and only the order in which renders go rests on it."""
+
+    path: Path
+    size_bytes: int
+    used_s: float
+
+
+@dataclass(frozen=True)
+class Removed:
+    """Count and size of removed files and of those left."""
+
+    renders: int = 0
+    leftovers: int = 0
+    freed_bytes: int = 0
+    left: int = 0
+    left_bytes: int = 0
+
+
+def stored_renders(folder: Path) -> list[StoredFile]:
+    """All renders of a folder, the longest unused first; links and anything else are passed over."""
+    return sorted(_files(folder, RENDER_NAME), key=lambda file: (file.used_s, file.path.name))
+
+
+def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[StoredFile]:
+    """Temporary files of renders that were never finished, not touched for so long."""
+    before_s = time.time() - older_than_s
+    return sorted((f for f in _files(folder, LEFTOVER_NAME) if f.used_s < before_s), key=lambda f: f.path)
+
+
+def damaged_renders(renders: Iterable[StoredFile]) -> list[StoredFile]:
+    """Those that cannot be read: truncated, altered, or of another version. Reads them whole, 5 ms each."""
+    return [file for file in renders if stored_view(file.path) is None]
+
+
+def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
+    """Remove files; returns those that are gone. One that cannot be removed, or is gone already, is passed over."""
+    gone = []
+    for file in files:
+        with contextlib.suppress(OSError):
+            file.path.unlink()
+            gone.append(file)
+    return gone
+
+
+def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]) -> list[StoredFile]:
+    """Choose the renders that go so that all fit into ``limit_bytes``: the longest unused first, never those of
+    ``keep`` (by name), so that the limit may still be exceeded."""
+    kept = {path.name for path in keep}
+    renders = sorted(renders, key=lambda file: (file.used_s, file.path.name))
+    excess = sum(file.size_bytes for file in renders) - limit_bytes
+    going = []
+    for file in renders:
+        if excess <= 0:
+            break
+        if file.path.name not in kept:
+            going.append(file)
+            excess -= file.size_bytes
+    return going
+
+
+def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> Removed:
+    """Remove the longest unused renders until the rest fits into ``limit_bytes``, never those of ``keep``; and what
+    killed processes left, when it is older than a day.
+
+    Does nothing where another process uses the folder (`in_use`): its trials may need any of them.
+    """
+    try:
+        with alone(folder):
+            renders = stored_renders(folder)
+            gone = removed(longest_unused(renders, limit_bytes, keep))
+            left_behind = removed(leftovers(folder))
+    except UserError:
+        gone, left_behind, renders = [], [], stored_renders(folder)
+    freed = sum(file.size_bytes for file in gone)
+    return Removed(
+        renders=len(gone),
+        leftovers=len(left_behind),
+        freed_bytes=freed + sum(file.size_bytes for file in left_behind),
+        left=len(renders) - len(gone),
+        left_bytes=sum(file.size_bytes for file in renders) - freed,
+    )
+
+
+@contextlib.contextmanager
+def in_use(folder: Path) -> Iterator[None]:
+    """While a sweep runs: nobody removes renders of this folder. Any number of sweeps may use it at once.
+
+    A process that dies gives it back. On systems without such locks nothing is held. Raises nothing where the folder
+    cannot be written: who cannot write a lock cannot be kept from reading.
+    """
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            lock(held.enter_context(opened_lock(folder / LOCK)), shared=True, wait=True)
+        yield
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """While renders are removed: no sweep uses this folder. Raises UserError where one does, or where the folder cannot
+    be written."""
+    with contextlib.ExitStack() as held:
+        try:
+            file = held.enter_context(opened_lock(folder / LOCK))
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
+        if lock(file, shared=False, wait=False) == "busy":
+            raise UserError(
+                f"{folder}: a sweep that is running uses these renders",
+                fix="wait until it has ended; nothing was removed",
+            )
+        yield
+
+
+def _files(folder: Path, names: re.Pattern[str]) -> Iterator[StoredFile]:
+    """Regular files of a folder by their names; one that vanishes meanwhile is passed over."""
+    try:
+        entries = os.scandir(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    with entries:
+        for entry in entries:
+            if names.fullmatch(entry.name) is None:
+                continue
+            with contextlib.suppress(OSError):
+                found = entry.stat(follow_symlinks=False)
+                if stat.S_ISREG(found.st_mode):
+                    yield StoredFile(Path(entry.path), found.st_size, found.st_mtime)

@@ -12,8 +12,8 @@ from scenes.optics import Optics
 from scenes.target.mesh import TargetPart
 
 LIFT_M = 1e-5
-"""How far off a surface a ray starts. float32 places hits within 1e-6 m in a room of metres; Mitsuba's own lift,
-0.15 mm at 0.7 m, is a tenth of the smallest hole."""
+"""Distance from a surface at which a ray starts. float32 places hits within 1e-6 m in a room of metres; Mitsuba's own
+lift, 0.15 mm at 0.7 m, is a tenth of the smallest hole."""
 
 
 def facing(interaction: Any) -> Any:
@@ -49,7 +49,7 @@ class LitScene:
         return dr.gather(self.mi.UInt32, self._identity, number)
 
     def on_face(self, interaction: Any, active: Any) -> Any:
-        """Whether each hit lies on a triangle that was said to belong to the undamaged face."""
+        """Tell whether each hit lies on a triangle that was said to belong to the undamaged face."""
         import drjit as dr
 
         mi = self.mi
@@ -76,7 +76,8 @@ class LitScene:
         return dr.select(lit, cone * cosine / squared, 0), distance
 
     def blocked(self, point: Any, normal: Any, target: Any, active: Any) -> Any:
-        """Whether something stands between a surface's point, on the side of ``normal``, and a point in front of it."""
+        """Tell whether something stands between a surface's point, on the side of ``normal``, and a point in front of
+        it."""
         import drjit as dr
 
         mi = self.mi

@@ -1,4 +1,4 @@
-"""How much work goes into a render: the declaration that an experiment may hold."""
+"""Work that goes into a render: the declaration that an experiment may hold."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from harness.vocabulary.config import Config
 
 
 class RenderConfig(Config):
-    """How much work goes into the indirect light. ``bounces`` 0 leaves direct light only."""
+    """Work that goes into the indirect light. ``bounces`` 0 leaves direct light only."""
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
     face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")

@@ -43,7 +43,7 @@ def load_mitsuba() -> Any:
 
 
 def _works(mi: Any, name: str) -> bool:
-    """Whether a small kernel runs in the variant."""
+    """Tell whether a small kernel runs in the variant."""
     if name not in mi.variants() or (name.startswith("cuda") and not _has_nvidia_driver()):
         return False
     with warnings.catch_warnings():

@@ -9,14 +9,19 @@ import cv2
 import numpy as np
 
 from harness.vocabulary.geometry import Region, transform_points
-from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.field_of_view import seen_region
 from scenes.optics import Optics
-from scenes.render.direct import DirectLight, OffFace, direct_light, surface_rgb
-from scenes.render.face import face_light, face_triangles
-from scenes.render.footprint import footprint_of
-from scenes.render.indirect import Gathered, Work, gather_in_pixels, noise_lines, range_noise_m
+from scenes.render.direct import DirectLight, OffFace, direct_light, footprint_of, surface_rgb
+from scenes.render.indirect import (
+    Gathered,
+    PathWork,
+    face_light,
+    face_triangles,
+    gather_in_pixels,
+    noise_lines,
+    range_noise_m,
+)
 from scenes.render.scene import LitScene, lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
@@ -29,17 +34,17 @@ HOLE_RIM_PX = 1
 PILOT_SAMPLES = 128
 """Paths that tell a pixel's noise, within a third."""
 PILOT_SEED = 1 << 20
-"""Keeps those apart from the ones that count."""
+"""Offset that keeps those apart from the ones that count."""
 
 
 def target_region(target: Target, optics: Optics) -> Region:
-    """The region of the sensor that a render of the target covers. Raises UserError as `seen_region` does."""
+    """Return the region of the sensor that a render of the target covers. Raises UserError as `seen_region` does."""
     tight = seen_region(transform_points(target.T_camera_board, target.outline_board_m), optics)
     return tight.grown(RIM_PX + optics.margin_px, optics.lens.height, optics.lens.width)
 
 
 def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFreeView:
-    """The noise-free view of a target by a camera. Raises UserError as `target_region` and `load_mitsuba` do."""
+    """Render the noise-free view of a target by a camera. Raises UserError as `target_region` and `load_mitsuba` do."""
     began = time.perf_counter()
     mi = load_mitsuba()
     region = target_region(target, optics)
@@ -50,7 +55,10 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     direct = direct_light(lit, slopes, footprint, optics.frequencies_hz, _at_holes(target, optics, slopes))
     phasor, intensity, noise_m = direct.phasor, direct.intensity, np.zeros(region.shape)
     if config.bounces > 0:
-        inside = _inside_outline(target, lens, region)
+        # pixels within the face's outline as the camera sees it
+        uv = lens.project(transform_points(target.T_camera_board, target.outline_board_m))
+        polygon = np.round(uv - [region.col0, region.row0]).astype(np.int32)
+        inside = cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)
         indirect, noise_m = indirect_light(lit, target, optics, slopes, direct, inside, config)
         phasor = phasor + indirect[:-1]
         intensity = intensity + indirect[-1].real
@@ -81,7 +89,7 @@ def indirect_light(
     inside: np.ndarray,
     config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Indirect phasors (f + 1, h, w) and their noise in metres of range (h, w).
+    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w).
 
     By way of the face from its nodes; by way of all else by paths through the pixel's own sub-rays, ``inside`` (h, w)
     the board's outline with as many as their noise asks for.
@@ -92,17 +100,20 @@ def indirect_light(
     total = direct.phasor.reshape(len(frequencies), -1).copy()
     seen = np.flatnonzero(direct.face[-1].real)
     if seen.size:
-        work = Work(frequencies, config.bounces - 1, config.seed)
+        work = PathWork(frequencies, config.bounces - 1, config.seed)
         samples, spacing_m = config.face_samples, config.face_spacing_mm * MM
         mean, batches = face_light(lit, target, direct, slopes, work, spacing_m, samples)
         indirect[:, seen] = mean
         total[:, seen] += mean[:-1]
         variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2
-    work = Work(frequencies, config.bounces, config.seed)
+    work = PathWork(frequencies, config.bounces, config.seed)
     off_face, within = direct.off_face, inside.ravel()[direct.off_face.pixel]
-    for rays, gather in ((off_face.chosen(within), _gather_inside), (off_face.chosen(~within), _gather_around)):
+    for rays, inner in ((off_face.chosen(within), True), (off_face.chosen(~within), False)):
         if rays.pixel.size:
-            light = gather(lit, rays, total[:, rays.pixel], work, config)
+            if inner:
+                light = _gather_inside(lit, rays, total[:, rays.pixel], work, config)
+            else:
+                light = gather_in_pixels(lit, rays, work, config.rest_samples)
             indirect[:, rays.pixel] += rays.share * light.mean
             total[:, rays.pixel] += rays.share * light.mean[:-1]
             batches = rays.share * light.sums[:, noise_lines(frequencies)]
@@ -110,8 +121,9 @@ def indirect_light(
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
-def _gather_inside(lit: LitScene, rays: OffFace, total: np.ndarray, work: Work, config: RenderConfig) -> Gathered:
-    """Inside the outline: a few paths a pixel tell its noise, then as many as bring it down to ``hole_noise_mm``.
+def _gather_inside(lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig) -> Gathered:
+    """Gather inside the outline: a few paths a pixel tell its noise, then as many as bring it down to
+    ``hole_noise_mm``.
 
     The few are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean.
     """
@@ -126,13 +138,8 @@ def _gather_inside(lit: LitScene, rays: OffFace, total: np.ndarray, work: Work, 
     return gather_in_pixels(lit, rays, work, samples.astype(np.int64))
 
 
-def _gather_around(lit: LitScene, rays: OffFace, total: np.ndarray, work: Work, config: RenderConfig) -> Gathered:
-    """Around the board: the same number of paths in each pixel."""
-    return gather_in_pixels(lit, rays, work, config.rest_samples)
-
-
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """(h, w) bool: pixels whose central ray goes through a hole's mouth, or HOLE_RIM_PX beside it."""
+    """Find pixels (h, w) bool whose central ray goes through a hole's mouth, or HOLE_RIM_PX beside it."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     found = np.zeros(slopes.shape[:2], bool)
     for hole in target.truth:
@@ -143,10 +150,3 @@ def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
                 on_plane = rays * ((centre @ hole.axis_camera) / (rays @ hole.axis_camera))[..., None]
             found |= np.linalg.norm(on_plane - centre, axis=-1) < hole.diameter_m / 2 + rim_m
     return found
-
-
-def _inside_outline(target: Target, lens: Lens, region: Region) -> np.ndarray:
-    """(h, w) bool: pixels within the face's outline as the camera sees it."""
-    uv = lens.project(transform_points(target.T_camera_board, target.outline_board_m))
-    polygon = np.round(uv - [region.col0, region.row0]).astype(np.int32)
-    return cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)

@@ -1,75 +1,110 @@
-"""The one gain of a camera: signal electrons such that the output's temporal deviation is the published one.
+"""Fitted numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
 
-Run ``python -m scenes.sensor.calibration azure_kinect_nfov`` (or kinect_v2) after a change to the sensor model and
-write the number into the camera's file; a test compares the two. The published deviation is that of single pixels of a
-real unit, so it contains the small jitter of whole frames, which is taken off in squares; frames that jump are left
-out, as whoever measures a deviation leaves them out. Ambient light is that of `CameraConfig`'s default, indoors.
+Run ``python -m scenes.sensor.calibration azure_kinect_nfov`` (or another camera) after a change to the sensor model and
+write the numbers into the camera's file; a test compares the two. The gain is the signal electrons with which the
+output's temporal deviation is the published one: of single pixels of a real unit, so with the small jitter of whole
+frames, which is taken off in squares; frames that jump are left out, as whoever measures a deviation leaves them out.
+Ambient light is that of `CameraConfig`'s default, indoors. The threshold gives the published reach.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from typing import TypeVar
 
 import numpy as np
 from scipy import optimize
 
+from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import exit_code_of
 from harness.vocabulary.geometry import Region
+from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.camera import CameraConfig, load_camera
-from scenes.sensor.effects import NONE
-from scenes.sensor.lidar.calibration import calibrated_numbers
+from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, load_camera
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 
-NOISE = NONE.model_copy(update={"noise": True, "ambient": True})
+ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
+HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32)}
+"""Half height and width of the plane in pixels, by kind of camera."""
+RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
+FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}
+"""Frames of some 3,000 pixels with common noise, which give a gain to 0.5 %."""
+
+Camera = TypeVar("Camera", bound=AmcwCamera | ScannedLidar)
 
 
-def with_signal(camera: AmcwCamera, electrons: float) -> AmcwCamera:
-    """The same camera with another gain."""
-    photons = camera.photons.model_copy(
-        update={"signal_electrons": camera.photons.signal_electrons.model_copy(update={"value": electrons})}
-    )
-    return camera.model_copy(update={"photons": photons})
+def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
+    """Return the same camera with another value of one number."""
+    part = getattr(camera, section)
+    fact = getattr(part, key).model_copy(update={"value": value})
+    return camera.model_copy(update={section: part.model_copy(update={key: fact})})  # type: ignore[return-value]
 
 
-def temporal_sigma_m(camera: AmcwCamera, distance_m: float, albedo: float, frames: int, seed: int) -> float:
-    """Temporal standard deviation of the output's z (rms over pixels) on a frontal plane near the axis, metres.
+def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> SimulatedUnit:
+    """Return a unit with noise only before a plane near the axis; its tilt of 3 degrees meets every phase of rounding.
 
-    NaN where pixels are invalid in any frame. Without what a frame's pixels have in common (jitter, jumps);
-    `with_jitter_m` adds the jitter. The plane is tilted by 3 degrees, so that the rounding meets every phase of its
-    step.
+    Without what a frame's pixels have in common (jitter, jumps).
     """
-    lens = camera.nominal_lens
+    lens, (half_h, half_w) = camera.nominal_lens, HALF_PX[camera.kind]
     row, col = int(lens.cy), int(lens.cx)
-    view = plane_view(camera, Region(row - 24, row + 24, col - 40, col + 40), distance_m, albedo, 0.05, 0.02)
-    unit = SimulatedUnit(camera, CameraConfig(name=camera.name, effects=NOISE), view)
+    region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
+    view = plane_view(camera, region, distance_m, albedo, 0.05, 0.02)
+    return SimulatedUnit(camera, ONLY_NOISE.model_copy(update={"name": camera.name}), view)
+
+
+def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int) -> float:
+    """Return the temporal standard deviation of the output's z (rms over pixels) on a plane near the axis, metres.
+
+    NaN where an imager's pixel is invalid in any frame; a lidar's invalid samples are left out.
+    """
+    unit = unit_before_plane(camera, distance_m, albedo)
     z = np.stack([frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]).astype(float)
-    return float(np.sqrt(z.var(axis=0, ddof=1).mean()))
+    variance = np.nanvar(z, axis=0, ddof=1) if isinstance(camera, ScannedLidar) else z.var(axis=0, ddof=1)
+    return float(np.sqrt(variance.mean()))
 
 
-def with_jitter_m(camera: AmcwCamera, sigma_m: float) -> float:
-    """The deviation of single pixels with the jitter of whole frames, from that without it, metres."""
+def with_jitter_m(camera: AnyCamera, sigma_m: float) -> float:
+    """Return the deviation of single pixels with the jitter of whole frames, from that without it, metres."""
     return float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
 
 
-def calibrated_signal_electrons(camera: AmcwCamera, frames: int = 200, seed: int = 1) -> float:
-    """The gain that meets the camera's calibration point, to 0.5 % (200 frames of 3,000 pixels, common noise)."""
-    photons = camera.photons
+def calibrated_signal_electrons(camera: AnyCamera, frames: int | None = None, seed: int = 1) -> float:
+    """Return the gain that meets the camera's calibration point, to 0.5 %."""
+    photons, count = camera.photons, frames or FRAMES[camera.kind]
     wanted = photons.calibration_sigma_mm.value * MM
+    distance_m, albedo = photons.calibration_distance_m.value, photons.calibration_albedo.value
 
     def excess(log_electrons: float) -> float:
-        trial = with_signal(camera, float(np.exp(log_electrons)))
-        sigma = temporal_sigma_m(
-            trial, photons.calibration_distance_m.value, photons.calibration_albedo.value, frames, seed
-        )
+        trial: AnyCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
+        sigma_m = temporal_sigma_m(trial, distance_m, albedo, count, seed)
         # a camera too dim to see the wall at all is as far too noisy as any
-        return with_jitter_m(trial, sigma) / wanted - 1 if np.isfinite(sigma) else 100.0
+        return with_jitter_m(trial, sigma_m) / wanted - 1 if np.isfinite(sigma_m) else 100.0
 
-    return float(np.exp(optimize.brentq(excess, np.log(50.0), np.log(200_000.0), xtol=1e-3)))
+    return float(np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3)))
+
+
+def calibrated_confidence_electrons(camera: ScannedLidar, frames: int = 100, seed: int = 1) -> float:
+    """Return the confidence threshold at which half of the pixels are valid at the published reach."""
+    photons = camera.photons
+    open_gate = with_number(camera, "engine", "confidence_electrons", 0.0)
+    unit = unit_before_plane(open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value)
+    rng = random_stream(seed, "calibration")
+    decoded = [unit.model.frame(unit.exposure, rng) for _ in range(frames)]
+    return float(np.median([np.where(d.reason == Reason.VALID, d.amplitude, 0.0)[unit.cut] for d in decoded]))
+
+
+def calibrated_numbers(camera: AnyCamera) -> dict[str, float]:
+    """Return the fitted numbers by their keys in the camera's file: the gain first, then the threshold with it."""
+    electrons = calibrated_signal_electrons(camera)
+    numbers = {"photons.signal_electrons": electrons}
+    if isinstance(camera, ScannedLidar):
+        fitted = with_number(camera, "photons", "signal_electrons", electrons)
+        numbers["engine.confidence_electrons"] = calibrated_confidence_electrons(fitted)
+    return numbers
 
 
 def _main(arguments: list[str]) -> int:
@@ -78,17 +113,13 @@ def _main(arguments: list[str]) -> int:
     )
     parser.add_argument("camera", help="a file of scenes/cameras/ without its ending")
     options = parser.parse_args(arguments)
-    return exit_code_of(lambda: _print_numbers(options.camera))
 
-
-def _print_numbers(name: str) -> int:
-    camera = load_camera(name)
-    if isinstance(camera, ScannedLidar):
-        for key, value in calibrated_numbers(camera).items():
-            print(f"{camera.name}: {key} = {value:.4g}")
+    def print_numbers() -> int:
+        for key, value in calibrated_numbers(load_camera(options.camera)).items():
+            print(f"{options.camera}: {key} = {value:.5g}")
         return 0
-    print(f"{camera.name}: signal_electrons = {calibrated_signal_electrons(camera):.0f}")
-    return 0
+
+    return exit_code_of(print_numbers)
 
 
 if __name__ == "__main__":

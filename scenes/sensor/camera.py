@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field, ValidationError
-from pydantic_core import ErrorDetails
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as
@@ -25,7 +24,6 @@ from harness.vocabulary.lens import OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.effects import EffectsConfig
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
@@ -52,8 +50,34 @@ AnyCamera = AmcwCamera | ScannedLidar
 KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar]] = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar}
 
 
+class EffectsConfig(Config):
+    """Effects of a real unit, as switches. All on is the camera as it is; all off is a noise-free camera that sees
+    direct light only.
+
+    Albedo and wood grain are no effects: they act through the photons.
+    """
+
+    noise: bool = Field(True, description="shot and read noise on what the camera samples")
+    multipath: bool = Field(True, description="light that met more than one surface")
+    wiggling: bool = Field(True, description="what factory calibration leaves of the modulation's harmonics")
+    fixed_pattern: bool = Field(True, description="the unit's own error of range in each pixel")
+    unit_offset: bool = Field(True, description="the unit's own constant error of range")
+    warm_up_drift: bool = Field(True, description="error of range that decays after power-on")
+    ambient: bool = Field(
+        True, description="light of the surroundings, as much as `ambient_uw_cm2_nm`: its noise, and the room it takes"
+    )
+    saturation: bool = Field(
+        True, description="what exceeds a pixel's or its converter's full scale is cut off and invalid"
+    )
+    frame_jumps: bool = Field(True, description="whole frames displaced: rare jumps, and a small jitter")
+
+
+NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))
+"""Every effect off."""
+
+
 class CameraConfig(Config):
-    """Which camera an experiment uses, which unit of it, and which of its effects are on."""
+    """Camera of an experiment: its name, the unit and the effects that are on."""
 
     name: str = Field(
         "azure_kinect_nfov",
@@ -87,12 +111,12 @@ class CameraConfig(Config):
 
 
 def camera_names() -> tuple[str, ...]:
-    """The cameras that come with tofpod and those of installed packages."""
+    """Return the cameras that come with tofpod and those of installed packages."""
     return CAMERAS.names()
 
 
 def camera_file(name: str) -> Path:
-    """The file of the camera of that name.
+    """Return the file of the camera of that name.
 
     Raises UserError for an unknown name, for one that is taken twice, and where a package offers no file.
     """
@@ -111,12 +135,14 @@ def camera_file(name: str) -> Path:
 
 
 def load_camera(name: str) -> AnyCamera:
-    """The camera of that name. Raises UserError as `camera_file`, and for a file that does not describe a camera."""
+    """Return the camera of that name. Raises UserError as `camera_file`, and for a file that does not describe a
+    camera."""
     return _camera_at(camera_file(name))
 
 
 def lens_names() -> dict[str, str]:
-    """The names under which `lens_named` knows a lens: cameras and their further depth modes, each with its camera."""
+    """Return the names under which `lens_named` knows a lens: cameras and their further depth modes, each with its
+    camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
         names |= dict.fromkeys((camera, *load_camera(camera).modes), camera)
@@ -124,7 +150,8 @@ def lens_names() -> dict[str, str]:
 
 
 def lens_named(name: str) -> OtherLens:
-    """The nominal lens of a camera or depth mode, with those of the camera's other modes; UserError for other names."""
+    """Return the nominal lens of a camera or depth mode, with those of the camera's other modes; UserError for other
+    names."""
     camera_name = lens_names().get(name, name)
     camera = load_camera(camera_name)
     plain = {camera_name: camera.nominal_lens}
@@ -137,7 +164,7 @@ def lens_named(name: str) -> OtherLens:
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
-    """The camera that an experiment declares: its file, with the numbers that the experiment replaces.
+    """Return the camera that an experiment declares: its file, with the numbers that the experiment replaces.
 
     Raises UserError as `load_camera` does, and naming each replaced number that does not exist or is impossible.
     """
@@ -155,33 +182,36 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             at = at.get(key) if isinstance(at, dict) else None
         if not (isinstance(at, dict) and "value" in at):
             known = number_paths(data)
-            near = [one for one in known if one.startswith(path)] or difflib.get_close_matches(path, known, n=1)
+            near = [number for number in known if number.startswith(path)] or difflib.get_close_matches(
+                path, known, n=1
+            )
             hint = f"; did you mean {near[0]!r}?" if near else ""
+            file = camera_file(name)
+            told = f"scenes/cameras/{file.name}" if file.parent == CAMERA_FOLDER else str(file)
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}",
-                legal=f"a number of {_told(camera_file(name))}, such as lens.fx_px",
+                legal=f"a number of {told}, such as lens.fx_px",
             )
         at.update(value=value, tag="U", source="set by the experiment")
-    return _validated(data, f"source.camera.numbers, put into {name},")
-
-
-def _told(path: Path) -> str:
-    """A camera's file as messages name it: tofpod's own from the project's root."""
-    return f"scenes/cameras/{path.name}" if path.parent == CAMERA_FOLDER else str(path)
+    try:
+        return KINDS[data["kind"]].from_data(data)
+    except ValidationError as error:
+        lines = []
+        for mistake in error.errors():
+            where = ".".join(map(str, mistake["loc"])).replace(".value", "")
+            what = str(mistake.get("ctx", {}).get("error", mistake["msg"])).replace("Input should be", "should be")
+            lines.append(f"  {where}: {what}" if where else f"  {what}")
+        message = f"source.camera.numbers, put into {name}, does not describe a camera:\n" + "\n".join(lines)
+        raise UserError(message) from error
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Dotted paths of all numbers of a camera's plain data."""
+    """Return dotted paths of all numbers of a camera's plain data."""
     paths: list[str] = []
     for key, value in data.items():
         if isinstance(value, dict):
             paths += [prefix + key] if "value" in value else number_paths(value, f"{prefix}{key}.")
     return paths
-
-
-@lru_cache
-def _camera_at(path: Path) -> AnyCamera:
-    return read_camera(path)
 
 
 def read_camera(path: Path) -> AnyCamera:
@@ -194,21 +224,9 @@ def read_camera(path: Path) -> AnyCamera:
     return camera
 
 
-def _validated(data: Any, where: str) -> AnyCamera:
-    try:
-        return KINDS[data["kind"]].from_data(data)
-    except ValidationError as error:
-        lines = [f"  {_in_words(one)}" for one in error.errors()]
-        raise UserError(f"{where} does not describe a camera:\n" + "\n".join(lines)) from error
-
-
-def _in_words(error: ErrorDetails) -> str:
-    """One of pydantic's errors with the number's path, as it is written in ``source.camera.numbers``."""
-    path = ".".join(map(str, error["loc"])).replace(".value", "")
-    what = str(error.get("ctx", {}).get("error", error["msg"])).replace("Input should be", "should be")
-    return f"{path}: {what}" if path else what
+_camera_at = lru_cache(read_camera)
 
 
 def camera_digest(camera: AnyCamera) -> str:
-    """Digest of a camera's numbers, tags and sources."""
+    """Return the digest of a camera's numbers, tags and sources."""
     return digest(camera.to_data())

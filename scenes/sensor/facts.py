@@ -1,4 +1,4 @@
-"""What every camera's file holds, whatever its kind: numbers with their sources, the lens, the traits of a unit."""
+"""Contents of every camera's file, whatever its kind: numbers with their sources, the lens, the traits of a unit."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from harness.vocabulary.lens import Lens
 T = TypeVar("T")
 
 TERMS = (0, 4, 5, 8)
-"""How many distortion terms OpenCV's models have."""
+"""Numbers of distortion terms that OpenCV's models have."""
 WORST_PX = 0.01
-"""How far a pixel may come back from its direction; good lenses do to 1e-6."""
+"""Largest distance at which a pixel may come back from its direction; good lenses do to 1e-6."""
 STEEPEST = 6.0
 """Slope from the axis up to which distortion is examined: 80 degrees."""
 
@@ -133,7 +133,7 @@ class ModeFacts(Config):
 
 
 class UnitFacts(Config):
-    """How one unit differs from the nominal camera as a whole, and its frames from each other; any kind of camera.
+    """Differences of a unit from the nominal camera as a whole, and of its frames from each other; any kind of camera.
 
     ``offset_mm``: standard deviation between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``):
     error of range after power-on, greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames
@@ -152,7 +152,7 @@ class UnitFacts(Config):
 
 
 class CameraFacts(Config):
-    """What every camera's file holds, whatever its kind."""
+    """Contents of every camera's file, whatever its kind."""
 
     name: str
     title: str

@@ -14,34 +14,39 @@ from harness.vocabulary.capture import Frame
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.seeds import random_stream
+from scenes.sensor.amcw.at_once import AtOnce
+from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera, CameraConfig
-from scenes.sensor.model import FrameSummer, SensorModel, model_of
-from scenes.sensor.totals import FrameTotals
+from scenes.sensor.frames import FrameTotals
+from scenes.sensor.lidar.facts import ScannedLidar
+from scenes.sensor.lidar.scanner import LidarScanner
 from scenes.sensor.unit import frame_errors_m
 from scenes.view import NoiseFreeView
 
 
 @dataclass(frozen=True)
 class SimulatedUnit:
-    """One unit of a camera before one view: everything that frames share. Build once, then `capture` many times."""
+    """A unit of a camera before a view: everything that frames share. Build once, then `capture` many times."""
 
     camera: AnyCamera
     config: CameraConfig
     view: NoiseFreeView
 
     @cached_property
-    def model(self) -> SensorModel:
-        """The camera's model on the view's region."""
-        return model_of(self.camera, self.config, self.view.region, self.view.slopes)
+    def model(self) -> AmcwImager | LidarScanner:
+        """The model of the camera's kind on the view's region: `expose` once per view, `frame` for each exposure, and
+        `at_once` for what sums frames without drawing each."""
+        kind = LidarScanner if isinstance(self.camera, ScannedLidar) else AmcwImager
+        return kind(self.camera, self.config, self.view.region, self.view.slopes)  # type: ignore[arg-type]
 
     @cached_property
     def exposure(self) -> Any:
-        """What the model keeps of the view for all frames."""
+        """Everything of the view that its frames share; only the model knows what is in it."""
         return self.model.expose(self.view)
 
     @cached_property
-    def at_once(self) -> FrameSummer | None:
-        """What sums frames of the view without drawing each; None where only frames will do."""
+    def at_once(self) -> AtOnce | None:
+        """Sums of frames of the view without drawing each; None where only frames will do."""
         asked = np.zeros(self.view.range_m.shape, bool)
         asked[self.cut] = True
         return self.model.at_once(self.exposure, asked)
@@ -68,7 +73,8 @@ class SimulatedUnit:
         return self.region.within(self.view.region)
 
     def capture(self, frames: int, seed: int, *labels: str | int) -> SimulatedCapture:
-        """``frames`` exposures whose noise is the stream of (seed, labels): prefixes of longer captures are equal."""
+        """Return ``frames`` exposures whose noise is the stream of (seed, labels): prefixes of longer captures are
+        equal."""
         return SimulatedCapture(self, frames, seed, labels)
 
 
@@ -83,7 +89,7 @@ class SimulatedCapture:
 
     @property
     def name(self) -> str:
-        """What messages call this source."""
+        """Name of this source in messages."""
         return f"simulated {self.unit.camera.name}"
 
     @property
@@ -98,12 +104,12 @@ class SimulatedCapture:
 
     @property
     def slopes(self) -> np.ndarray:
-        """(h, w, 2) x/z and y/z."""
+        """Slopes (h, w, 2): x/z and y/z."""
         return self.unit.view.slopes[self.unit.cut]
 
     @property
     def organised(self) -> bool:
-        """Always: an imager has a pixel grid."""
+        """True: an imager has a pixel grid."""
         return True
 
     @property
@@ -113,16 +119,16 @@ class SimulatedCapture:
 
     @cached_property
     def errors_m(self) -> np.ndarray:
-        """(n_frames,): by how much each frame is displaced as a whole, metres of half path."""
+        """Displacements (n_frames,) of each frame as a whole, metres of half path."""
         camera, config = self.unit.camera, self.unit.config
         stream = random_stream(self.seed, "frame errors", *self.labels)
         errors_m = frame_errors_m(camera.unit, config.effects, config.minutes_since_power_on, stream)
         return np.array(list(islice(errors_m, self.n_frames)))
 
     def totals(self, frames: np.ndarray) -> FrameTotals | None:
-        """Sums over the frames of these numbers (t,), drawn at once: not those that `frames` yields, but equal to them
-        in distribution, and independent of the sums over other frames. The same frames give the same sums, whichever
-        others are asked for. None where only frames will do."""
+        """Return sums over the frames of these numbers (t,), drawn at once: not those that `frames` yields, but equal
+        to them in distribution, and independent of the sums over other frames. The same frames give the same sums,
+        whichever others are asked for. None where only frames will do."""
         summer, errors_m = self.unit.at_once, self.errors_m[frames]
         if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
             return None

@@ -96,7 +96,7 @@ class BoardConfig(Config):
 
 
 class DamageConfig(Config):
-    """What holes and dents have in common."""
+    """Declaration that holes and dents have in common."""
 
     id: DamageId
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]

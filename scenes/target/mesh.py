@@ -1,4 +1,4 @@
-"""From a declaration to a renderer's input: parts with meshes and reflectances, and the truth beside them.
+"""Built targets, a renderer's input: parts with meshes and reflectances, and the truth beside them.
 
 Textures. A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x),
 v = 1/2 - y / height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is

@@ -13,9 +13,8 @@ import pytest
 
 from harness.vocabulary.lens import Lens
 from scenes.optics import BeamFootprint, Optics
-from scenes.render.direct import direct_light
-from scenes.render.face import face_triangles
-from scenes.render.footprint import footprint_of
+from scenes.render.direct import direct_light, footprint_of
+from scenes.render.indirect import face_triangles
 from scenes.render.scene import lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba

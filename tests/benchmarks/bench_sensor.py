@@ -19,7 +19,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.exposure import Exposure
+from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import CameraConfig, load_camera
@@ -42,7 +42,7 @@ class Stages:
     """One frame's arrays at every stage."""
 
     imager: AmcwImager
-    exposure: Exposure
+    exposure: AmcwExposure
     unit: np.ndarray
     amplitude: np.ndarray
     saturated: np.ndarray
@@ -52,10 +52,7 @@ class Stages:
     def filter_one(self) -> None:
         """The filter of the first frequency."""
         planes, amplitude = filter_inputs(self)
-        window = self.imager._window
-        kernels.joint_bilateral(
-            planes, amplitude, window, CONCENTRATION, DIM, False, False, self.filtered[0], self.edge[0]
-        )
+        kernels.filter_image(planes, amplitude, *self.imager.filter_settings, self.filtered[0], self.edge[0])
 
 
 def unit_on(region: Region, camera: AmcwCamera = CAMERA) -> SimulatedUnit:
@@ -191,7 +188,7 @@ def test_range_and_gates(benchmark: Any, stages: Stages) -> None:
 
 
 def numpy_filter(unit: np.ndarray, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`kernels.joint_bilateral` in NumPy: (filtered (3, h, w), edge (h, w)), the same formulas on shifted planes."""
+    """`kernels.filter_image` in NumPy: (filtered (3, h, w), edge (h, w)), the same formulas on shifted planes."""
     h, w = amplitude.shape
     pad = ((HALF, HALF), (HALF, HALF))
     re, im, amp, inside = (np.pad(plane, pad) for plane in (*unit, amplitude, np.ones_like(amplitude)))
@@ -211,7 +208,7 @@ def numpy_filter(unit: np.ndarray, amplitude: np.ndarray) -> tuple[np.ndarray, n
 
 
 class DrjitFilter:
-    """`kernels.joint_bilateral` in Dr.Jit: one kernel, 25 neighbours gathered from planes that stay on the device."""
+    """`kernels.filter_image` in Dr.Jit: one kernel, 25 neighbours gathered from planes that stay on the device."""
 
     def __init__(self, unit: np.ndarray, amplitude: np.ndarray, frozen: bool) -> None:
         from scenes.render.variant import load_mitsuba

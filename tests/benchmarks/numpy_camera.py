@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.vocabulary.capture import Reason
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.exposure import Exposure
+from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.imager import AmcwImager
 
 f4 = np.float32
@@ -26,15 +26,16 @@ class NumpyCamera:
     Raises ValueError for a camera whose engine does more than the Azure Kinect's.
     """
 
-    def __init__(self, imager: AmcwImager, exposure: Exposure) -> None:
+    def __init__(self, imager: AmcwImager, exposure: AmcwExposure) -> None:
         engine = imager.camera.engine
-        if imager._flying_gate or engine.filter_on.value == "phasors" or engine.drop_dim_neighbours.value:
+        if imager.engine.flying or engine.filter_on.value == "phasors" or engine.drop_dim_neighbours.value:
             raise ValueError(f"{imager.camera.name}: its engine has parts that this loop leaves out")
-        self.exposure, self.gates = exposure, imager._gates
+        self.exposure, self.gates = exposure, imager.engine.gates
         self.knee, self.step_m = f4(imager.camera.converter.knee_units.value), f4(imager.camera.z_step_m)
         self.dim, self.concentration = f4(engine.dim_amplitude_units.value), f4(engine.concentration.value)
-        self.cosines, self.sines, self.gains = imager._cosines, imager._sines, imager._gains
-        self.window, self.geometry, self.outside = imager._window, imager._geometry, imager.outside_mask.ravel()
+        self.cosines, self.sines, self.gains = imager._cosines, imager._sines, imager.gains
+        self.window, self.geometry = imager.filter_settings[0], imager.engine.geometry
+        self.outside = imager.outside_mask.ravel()
         self.unwrap = imager.unwrap
         h, w = exposure.shape
         half = len(self.window) // 2
@@ -91,7 +92,7 @@ class NumpyCamera:
         return unit, amplitude, np.asarray(saturated)
 
     def filter(self, unit: np.ndarray, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Filtered phasors and amplitudes (f, 3, n) and edge sums (f, n), as `kernels.joint_bilateral`."""
+        """Filtered phasors and amplitudes (f, 3, n) and edge sums (f, n), as `kernels.filter_image`."""
         shape = self.exposure.shape
         filtered, edge = np.empty((len(amplitude), 3, *shape), f4), np.empty((len(amplitude), *shape), f4)
         for f in range(len(amplitude)):

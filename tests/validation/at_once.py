@@ -21,8 +21,7 @@ from scenes.render.settings import RenderConfig
 from scenes.render.view import render_view
 from scenes.sensor.amcw.at_once import AtOnce
 from scenes.sensor.amcw.linear_frames import EVEN, UNEVEN
-from scenes.sensor.camera import CameraConfig, camera_of
-from scenes.sensor.effects import EffectsConfig
+from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.mesh import build_target
 from scenes.target.thesis import ThesisTargetConfig

@@ -29,8 +29,7 @@ from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.camera import CameraConfig, load_camera
-from scenes.sensor.effects import NONE
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 
 LENS_CENTRE_PX = (332.0, 326.0)
@@ -42,7 +41,7 @@ FIELD_DEG = 32.5
 BIN_M = 0.1
 LEAST_PIXELS = 300
 """Some 12 independent windows: the deviation of 22 frames is then known to 5 %."""
-NOISE_ONLY = NONE.model_copy(update={"noise": True, "ambient": True, "frame_jumps": True})
+NOISE_ONLY = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "frame_jumps": True})
 """With the jitter of whole frames; `walls_camera` takes out their rare jumps, which these captures do not hold."""
 PATTERNED = NOISE_ONLY.model_copy(update={"fixed_pattern": True})
 UNIT_SEEDS = (1, 2, 3, 4, 5)

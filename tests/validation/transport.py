@@ -27,10 +27,8 @@ if __name__ == "__main__":
 from harness.vocabulary.lens import Lens
 from harness.vocabulary.units import MM
 from scenes.optics import Optics
-from scenes.render.direct import OffFace, cast
-from scenes.render.footprint import Quadrilaterals
-from scenes.render.indirect import Work, gather_in_pixels, range_change_m, range_noise_m
-from scenes.render.phasors import phasor_sums
+from scenes.render.direct import OffFace, Quadrilaterals, cast, phasor_sums
+from scenes.render.indirect import PathWork, gather_in_pixels, range_change_m, range_noise_m
 from scenes.render.scene import LitScene, lit_scene
 from scenes.render.settings import RenderConfig
 from scenes.render.variant import load_mitsuba
@@ -106,7 +104,7 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     direct = phasor_sums(hits.amplitude.reshape(-1, SIDE**2), hits.path_m.reshape(-1, SIDE**2), frequencies)
     count = np.full(len(rows), SIDE**2)
     rays = OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
-    light = gather_in_pixels(scene.lit, rays, Work(frequencies, LONGEST, seed=777), paths)
+    light = gather_in_pixels(scene.lit, rays, PathWork(frequencies, LONGEST, seed=777), paths)
     total = direct + light.mean[:-1]
     reference_m = range_noise_m(light.sums[:, :-1], total, frequencies)
     error_m = range_change_m(scene.view.phasor[:, rows, cols].astype(complex) - total, total, frequencies)

@@ -1,4 +1,4 @@
-"""Pixels whose window holds one even surface, nearly all of a view: what noise does there, by few numbers a pixel.
+"""Pixels whose window holds one even surface, nearly all of a view: the effect of noise there, by few numbers a pixel.
 
 There the filter weighs neighbours by distance (and amplitude) alone, but for noise: it takes the same share off the
 weight of each and gives it to the centre. That share hangs on the phase noise only and is read from a table, which
@@ -12,9 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from scenes.sensor.amcw.filtered import DEVIATIONS, Filtered, unknown_filtered
-from scenes.sensor.amcw.light_noise import Light
-from scenes.sensor.amcw.linear import Window, linearised
+from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, FilterWindow, Light, linearised, unknown_filtered
 
 MOST_EDGE = 0.004
 """Edge sum up to which a window is even: one neighbour 0.13 rad off (15 mm at 200 MHz) changes its weight by 3 %."""
@@ -26,15 +24,15 @@ NOISES = np.linspace(0.0, MOST_NOISE, 33)
 
 
 class Shares(NamedTuple):
-    """By phase noise `NOISES`: ``neighbours``, times what the weights alone would give, and ``rest``, the variance
-    that is not of first order, over the noise's."""
+    """Table by phase noise `NOISES`: ``neighbours``, times what the weights alone would give, and ``rest``, the
+    variance that is not of first order, over the noise's."""
 
     neighbours: np.ndarray
     rest: np.ndarray
 
 
-def shares_of(window: Window) -> Shares:
-    """What the noise of an even surface does to the shares of its own."""
+def shares_of(window: FilterWindow) -> Shares:
+    """Return what the noise of an even surface does to the shares of its own."""
     side = window.space.shape[0]
     k, middle = side * side, side * side // 2
     weights = window.space.ravel() / window.space.sum()
@@ -52,10 +50,10 @@ def shares_of(window: Window) -> Shares:
 
 
 def even_pixels(
-    edge: np.ndarray, light: Light, window: Window, shape: tuple[int, int], unsure: np.ndarray
+    edge: np.ndarray, light: Light, window: FilterWindow, shape: tuple[int, int], unsure: np.ndarray
 ) -> np.ndarray:
-    """(n,) bool: pixels before one even surface. ``edge`` (f, n): the noise-free edge sum; ``unsure`` (n,) bool: pixels
-    that saturate or may."""
+    """Find pixels (n,) bool before one even surface. ``edge`` (f, n): the noise-free edge sum; ``unsure`` (n,) bool:
+    pixels that saturate or may."""
     half = window.space.shape[0] // 2
     unlike = unsure | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
     unlike |= (light.turn > MOST_NOISE).any(axis=0)
@@ -74,14 +72,14 @@ def fill_even(
     filtered: np.ndarray,
     edge: np.ndarray,
     light: Light,
-    window: Window,
+    window: FilterWindow,
     shape: tuple[int, int],
     shares: Shares,
     out: Filtered,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n) and ``edge`` (f, n).
 
-    Also (f, m) each: what one deviation of a neighbour's noise at weight 1 and amplitude 1 moves the phase by, over
+    Return (f, m) each: what one deviation of a neighbour's noise at weight 1 and amplitude 1 moves the phase by, over
     that deviation, and what one of the centre's does in all.
     """
     own = light.turn[:, even]

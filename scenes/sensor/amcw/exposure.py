@@ -1,4 +1,4 @@
-"""From the light of a view to what the pixels of a continuous-wave imager collect, before noise.
+"""The light of a view as the pixels of a continuous-wave imager collect it, before noise.
 
 Modelled: the fundamental of each modulation frequency with its contrast, the harmonics that the number of phases
 aliases onto it, the lens' gathering of light, light of the surroundings, the wells' and the converter's full scale.
@@ -17,8 +17,7 @@ from scipy import ndimage
 from harness.vocabulary.units import SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.effects import EffectsConfig
-from scenes.sensor.light import light_of
+from scenes.sensor.unit import light_of
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
@@ -28,8 +27,8 @@ HIGHEST_HARMONIC = 31
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """What the converter sees of one view before noise, in converter units, flat over n = h w pixels.
+class AmcwExposure:
+    """Light of a view as the converter sees it before noise, in converter units, flat over n = h w pixels.
 
     ``means`` (f, k, n): noise-free samples; ``sigma`` (n,): deviation of each sample; ``limit`` (n,): the largest
     sample that wells and converter hold, infinite where saturation is off; ``shape``: (h, w).
@@ -43,8 +42,8 @@ class Exposure:
 
 def exposure_of(
     camera: AmcwCamera, config: CameraConfig, view: NoiseFreeView, gathered: np.ndarray, error_m: np.ndarray
-) -> Exposure:
-    """The noise-free samples of a view.
+) -> AmcwExposure:
+    """Return the noise-free samples of a view.
 
     ``gathered`` (h, w): light that each pixel's optics gather, 1 on the axis; ``error_m`` (h, w): errors of range that
     all frames share, put in as a delay of the light.
@@ -61,22 +60,30 @@ def exposure_of(
     variance = both_wells + 2 * photons.read_noise_electrons.value**2
     sigma = np.sqrt(variance) if config.effects.noise else np.zeros_like(variance)
     samples = sampled(signal, modulation.phases.value)
-    return Exposure(
+    # the largest sample that fits: the fuller well holds half of both wells' electrons and half the sample
+    limit = np.full(both_wells.shape, np.inf)
+    if config.effects.saturation:
+        limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
+        if photons.full_well_electrons is not None:
+            room = 2 * photons.full_well_electrons.value - both_wells
+            limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
+    return AmcwExposure(
         (samples / photons.electrons_per_unit.value).reshape(*samples.shape[:2], -1).astype(f4),
         (sigma / photons.electrons_per_unit.value).ravel().astype(f4),
-        _limit_units(camera, config.effects, both_wells).ravel().astype(f4),
+        limit.ravel().astype(f4),
         intensity.shape,
     )
 
 
 def sampled(signal: np.ndarray, phases: int) -> np.ndarray:
-    """(f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of a demodulated signal S (f, h, w) at N phases."""
+    """Return (f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of a demodulated signal S (f, h, w) at N phases."""
     steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
     return np.asarray(signal.real[:, None] * np.cos(steps) + signal.imag[:, None] * np.sin(steps))
 
 
 def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.ndarray:
-    """The signal (f, h, w) with the harmonics that N ``phases`` alias onto the fundamental, times ``residual`` (f,).
+    """Return the signal (f, h, w) with the harmonics that N ``phases`` alias onto the fundamental, times ``residual``
+    (f,).
 
     Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant samples
     see the n-th as the fundamental where n = +1 mod N, as its conjugate where n = -1: for N = 3 the 5th and 7th, 11th
@@ -97,7 +104,7 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
 def ambient_electrons(
     camera: AmcwCamera, config: CameraConfig, view: NoiseFreeView, gathered: np.ndarray
 ) -> np.ndarray:
-    """(h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
+    """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
 
     As many as the emitter's own, times the ratio of irradiances within the filter's band, for light that falls on the
     surface as the camera's own does: a bright sky behind the camera. A pixel that sees several surfaces is taken to get
@@ -112,14 +119,3 @@ def ambient_electrons(
     nearest_m = ndimage.minimum_filter(np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest")
     range_m = np.where(view.coverage < 1, np.where(np.isfinite(nearest_m), nearest_m, 0.0), np.nan_to_num(view.range_m))
     return np.asarray(one_metre * gathered * intensity * range_m**2)
-
-
-def _limit_units(camera: AmcwCamera, effects: EffectsConfig, both_wells: np.ndarray) -> np.ndarray:
-    """(h, w): the largest sample that fits. The fuller well holds half of both wells' electrons and half the sample."""
-    if not effects.saturation:
-        return np.full(both_wells.shape, np.inf)
-    limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
-    if camera.photons.full_well_electrons is None:
-        return limit
-    room = 2 * camera.photons.full_well_electrons.value - both_wells
-    return np.clip(room / camera.photons.electrons_per_unit.value, 0, limit)

@@ -37,7 +37,8 @@ WIDEST_PX = 2128
 
 
 def _turns_one_way(corners: np.ndarray) -> bool:
-    """Whether corners (n, 2) go round a convex area counter-clockwise in axes x right, y down as the file has them."""
+    """Tell whether corners (n, 2) go round a convex area counter-clockwise in axes x right, y down as the file has
+    them."""
     if len(corners) < 3:
         return False
     sides = np.roll(corners, -1, axis=0) - corners
@@ -127,7 +128,7 @@ class ConverterFacts(Config):
 
 
 class FixedPatternFacts(Config):
-    """What is the same in every frame of one unit: a smooth and a per-pixel error of range."""
+    """Fixed pattern, the same in every frame of a unit: a smooth and a per-pixel error of range."""
 
     smooth_mm: NonNegative
     smooth_length_px: LengthPx
@@ -237,7 +238,7 @@ class AmcwCamera(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """What the render needs of this camera."""
+        """Optics of this camera for the render."""
         return Optics(
             title=self.title,
             lens=self.nominal_lens,

@@ -20,23 +20,23 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.sensor.amcw import kernels, ranging
-from scenes.sensor.amcw.at_once import AtOnce
-from scenes.sensor.amcw.certainty import Engine
-from scenes.sensor.amcw.exposure import Exposure, exposure_of
+from scenes.sensor.amcw.at_once import AtOnce, at_once, windows_of
+from scenes.sensor.amcw.certainty import DepthEngine
+from scenes.sensor.amcw.exposure import AmcwExposure, exposure_of
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.amcw.linear import Window
+from scenes.sensor.amcw.linear import FilterWindow
 from scenes.sensor.amcw.unwrap import UnwrapTable, unwrap_table
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.decoded import Decoded
+from scenes.sensor.frames import DecodedFrame
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import drift_m, smooth_field, static_error_m
+from scenes.sensor.unit import smooth_field, unit_error_m
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
 
 
 class AmcwImager:
-    """A camera of this kind on one region of its sensor: `expose` once per view, then `frame` for each exposure."""
+    """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: AmcwCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
         self.camera = camera
@@ -46,7 +46,7 @@ class AmcwImager:
         phases = 2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
         self._cosines = np.cos(phases).astype(f4)
         self._sines = np.sin(phases).astype(f4)
-        self._gains = np.array(camera.engine.amplitude_gains.value, f4)
+        self.gains = np.array(camera.engine.amplitude_gains.value, f4)
 
     @cached_property
     def unwrap(self) -> UnwrapTable:
@@ -94,152 +94,119 @@ class AmcwImager:
     @cached_property
     def static_error_m(self) -> np.ndarray:
         """(h, w): all errors of range that frames of this unit share before the filter, as far as they are on."""
-        camera, config = self.camera, self.config
-        error = drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
-        error = error + static_error_m(camera.unit, config.effects, camera.name, config.unit_seed)
-        return np.asarray(error + self.fixed_pattern_m if config.effects.fixed_pattern else error)
+        error = unit_error_m(self.camera, self.config, self.slopes[..., 0])
+        return np.asarray(error + self.fixed_pattern_m if self.config.effects.fixed_pattern else error)
 
-    def expose(self, view: NoiseFreeView) -> Exposure:
-        """The noise-free samples of a view that covers this imager's region."""
+    def expose(self, view: NoiseFreeView) -> AmcwExposure:
+        """Return the noise-free samples of a view that covers this imager's region."""
         return exposure_of(self.camera, self.config, view, self.gathered, self.static_error_m)
 
-    def frame(self, exposure: Exposure, rng: np.random.Generator, error_m: float = 0.0) -> Decoded:
-        """One frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
+    def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
+        """Draw a frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
         unit, amplitude, saturated = self.phasors(exposure, rng)
         return self._decode(*self.filter(unit, amplitude, exposure.shape), saturated, error_m)
 
-    def phasors(self, exposure: Exposure, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One noisy reading: unit phasors (2, f, n), amplitudes (f, n) times the gains, saturated (n,) uint8."""
+    def phasors(self, exposure: AmcwExposure, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draw a noisy reading: unit phasors (2, f, n), amplitudes (f, n) times the gains, saturated (n,) uint8."""
         n_frequencies, _, n = exposure.means.shape
         unit = np.empty((2, n_frequencies, n), f4)
         amplitude = np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
+        normals, knee = standard_normals(rng, exposure.means.shape), f4(self.camera.converter.knee_units.value)
         kernels.expose(
-            exposure.means,
-            exposure.sigma,
-            exposure.limit,
-            standard_normals(rng, exposure.means.shape),
-            f4(self.camera.converter.knee_units.value),
-            self._gains,
-            self._cosines,
-            self._sines,
-            unit,
-            amplitude,
-            saturated,
-        )
+            exposure.means, exposure.sigma, exposure.limit, normals, knee, self.gains, self._cosines, self._sines,
+            unit, amplitude, saturated,
+        )  # fmt: skip
         return unit, amplitude, saturated
 
     def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """The engine's joint bilateral filter: phasors and amplitudes (f, 3, h, w), and edge sums (f, h, w)."""
+        """Filter by the engine's joint bilateral filter: phasors and amplitudes (f, 3, h, w), and edge sums (f, h,
+        w)."""
         filtered = np.empty((len(amplitude), 3, *shape), f4)
         edge = np.empty((len(amplitude), *shape), f4)
+        space, settings = self.filter_settings
         for f in range(len(amplitude)):
-            kernels.joint_bilateral(
-                unit[:, f].reshape(2, *shape),
-                amplitude[f].reshape(shape),
-                *self.filter_settings,
-                filtered[f],
-                edge[f],
-            )
+            planes, strength = unit[:, f].reshape(2, *shape), amplitude[f].reshape(shape)
+            kernels.filter_image(planes, strength, space, settings, filtered[f], edge[f])
         return filtered, edge
 
-    def _decode(self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float) -> Decoded:
-        """The rest of the depth engine: unwrap, correct, gate, round."""
-        n_frequencies, _, *shape = filtered.shape
-        z_m, total, reason = np.empty(shape, f4), np.empty(shape, f4), np.empty(shape, np.uint8)
+    def _decode(self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float) -> DecodedFrame:
+        """Unwrap, correct, gate and round: the rest of the depth engine."""
+        (n_frequencies, _, *shape), n, engine = filtered.shape, saturated.size, self.engine
+        z_m, total, reason = np.empty((n, 1), f4), np.empty((n, 1), f4), np.empty((n, 1), np.uint8)
         ranging.range_and_gates(
-            filtered.reshape(n_frequencies, 3, -1),
-            edge.reshape(n_frequencies, -1),
-            saturated,
-            self.engine.geometry,
-            self.engine.outside_mask,
-            self.engine.lattice,
-            self.engine.gates,
-            np.full(saturated.size, error_m, f4),
-            z_m.reshape(-1),
-            reason.reshape(-1),
-            total.reshape(-1),
-        )
-        if self.engine.flying:
-            ranging.gate_flying_pixels(z_m, total, reason, self.engine.flying)
-        ranging.round_valid(z_m.reshape(-1), reason.reshape(-1), f4(self.camera.z_step_m))
-        return Decoded(z_m, reason, total / f4(n_frequencies))
+            filtered.reshape(n_frequencies, 3, -1), edge.reshape(n_frequencies, -1), saturated, engine.geometry,
+            engine.outside_mask, engine.lattice, engine.gates, np.full(n, error_m, f4), z_m[:, 0], reason[:, 0],
+            total[:, 0],
+        )  # fmt: skip
+        if engine.flying:
+            flying = np.empty((n, 1), bool)
+            ranging.find_flying(z_m, total, reason, np.arange(n), self._near, engine.flying, flying)
+            reason[flying] = ranging.EDGE
+        ranging.round_valid(z_m[:, 0], reason[:, 0], f4(self.camera.z_step_m))
+        return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), total.reshape(shape) / f4(n_frequencies))
 
     @cached_property
-    def filter_settings(self) -> tuple[np.ndarray, np.float32, np.float32, bool, bool]:
-        """`kernels.joint_bilateral`'s window, concentration, dim, drop_dim and by_amplitude."""
-        facts = self.camera.engine
-        return (
-            self._window,
-            f4(facts.concentration.value),
-            f4(facts.dim_amplitude_units.value),
-            facts.drop_dim_neighbours.value,
-            facts.filter_on.value == "phasors",
-        )
+    def _near(self) -> np.ndarray:
+        """(n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
+        h, w = self.region.shape
+        return np.ascontiguousarray(windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1))
 
     @cached_property
-    def _window(self) -> np.ndarray:
-        """(k, k) float32: the filter's weights by distance."""
+    def filter_settings(self) -> tuple[np.ndarray, kernels.FilterSettings]:
+        """The filter's weights by distance (k, k) float32, and its settings."""
         engine = self.camera.engine
         half = engine.window_px.value // 2
-        if engine.spatial_sigma_px is None:
-            return np.ones((2 * half + 1, 2 * half + 1), f4)
-        squared = np.arange(-half, half + 1) ** 2
-        gauss = np.exp(-squared / (2 * engine.spatial_sigma_px.value**2))
-        return np.asarray(np.outer(gauss, gauss), f4)
-
-    @cached_property
-    def engine(self) -> Engine:
-        """All that decides after the filter."""
-        return Engine(
-            self._geometry, self.outside_mask.reshape(-1), self.unwrap.for_kernel, self._gates, self._flying_gate
+        space = np.ones((2 * half + 1, 2 * half + 1), f4)
+        if engine.spatial_sigma_px is not None:
+            gauss = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * engine.spatial_sigma_px.value**2))
+            space = np.outer(gauss, gauss).astype(f4)
+        return space, kernels.FilterSettings(
+            f4(engine.concentration.value),
+            f4(engine.dim_amplitude_units.value),
+            engine.drop_dim_neighbours.value,
+            engine.filter_on.value == "phasors",
         )
 
     @cached_property
-    def linear_window(self) -> Window:
-        """The filter, as `scenes.sensor.amcw.linear` takes it."""
-        window, concentration, dim, drop_dim, by_amplitude = self.filter_settings
-        space = window.astype(float)
-        return Window(space, space.ravel(), float(concentration), float(dim), drop_dim, by_amplitude)
-
-    def at_once(self, exposure: Exposure, asked: np.ndarray) -> AtOnce | None:
-        """What sums frames of an exposure without drawing each, at the pixels ``asked`` (h, w) bool; None where only
-        frames will do."""
-        return AtOnce.of(self, exposure, asked)
-
-    @cached_property
-    def _geometry(self) -> np.ndarray:
-        """(3, n) float32: emitter offset along the ray (m), emitter offset squared (m^2), cosine to the axis."""
-        emitter = self.camera.emitter_position_m
+    def engine(self) -> DepthEngine:
+        """Everything that decides after the filter."""
+        facts, emitter = self.camera.engine, self.camera.emitter_position_m
+        # emitter offset along the ray (m), emitter offset squared (m^2), cosine to the axis
         rays = np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
         length = np.linalg.norm(rays, axis=-1)
         along = rays @ emitter / length
-        return np.stack([along, np.full_like(along, emitter @ emitter), 1 / length]).reshape(3, -1).astype(f4)
+        geometry = np.stack([along, np.full_like(along, emitter @ emitter), 1 / length]).reshape(3, -1).astype(f4)
+        edge, lattice, by_amplitude = facts.edge_threshold, facts.lattice_residual_turns, facts.residual_by_amplitude
+        gates = ranging.Gates(
+            edge=f4(edge.value if edge and self.config.edge_gate else np.inf),
+            residual=f4(lattice.value if lattice else np.inf),
+            residual_most=f4(by_amplitude.greatest_turns.value if by_amplitude else np.inf),
+            residual_scale=f4(by_amplitude.scale_turns.value if by_amplitude else 0.0),
+            residual_slope=f4(by_amplitude.slope.value if by_amplitude else 0.0),
+            ratio=f4(facts.amplitude_ratio.value if facts.amplitude_ratio else np.inf),
+            least=f4(facts.min_amplitude_units.value),
+            total=f4(facts.min_amplitude_sum_units.value),
+            reflectivity=f4((r.value if (r := facts.min_reflectivity_units_mm2) else 0.0) * MM**2),
+            nearest_m=f4(facts.min_range_mm.value * MM),
+            farthest_m=f4(facts.max_range_mm.value * MM),
+            axial=f4(facts.limits_along.value == "axis"),
+        )
+        flying = None
+        if (fly := facts.flying_pixels) is not None:
+            lengths_m = (f4(mm.value * MM) for mm in (fly.near_mm, fly.far_mm, fly.most_mm))
+            flying = ranging.FlyingGate(f4(fly.relative_deviation.value), f4(fly.least_mean_units.value), *lengths_m)
+        return DepthEngine(geometry, self.outside_mask.reshape(-1), self.unwrap.for_kernel, gates, flying)
 
     @cached_property
-    def _gates(self) -> ranging.Gates:
-        engine = self.camera.engine
-        edge, lattice, by_amplitude = engine.edge_threshold, engine.lattice_residual_turns, engine.residual_by_amplitude
-        values = {
-            "edge": edge.value if edge and self.config.edge_gate else np.inf,
-            "residual": lattice.value if lattice else np.inf,
-            "residual_most": by_amplitude.greatest_turns.value if by_amplitude else np.inf,
-            "residual_scale": by_amplitude.scale_turns.value if by_amplitude else 0.0,
-            "residual_slope": by_amplitude.slope.value if by_amplitude else 0.0,
-            "ratio": engine.amplitude_ratio.value if engine.amplitude_ratio else np.inf,
-            "least": engine.min_amplitude_units.value,
-            "total": engine.min_amplitude_sum_units.value,
-            "reflectivity": (r.value if (r := engine.min_reflectivity_units_mm2) else 0.0) * MM**2,
-            "nearest_m": engine.min_range_mm.value * MM,
-            "farthest_m": engine.max_range_mm.value * MM,
-            "axial": engine.limits_along.value == "axis",
-        }
-        return ranging.Gates(**{name: f4(value) for name, value in values.items()})
+    def linear_window(self) -> FilterWindow:
+        """The filter, as `scenes.sensor.amcw.linear` takes it."""
+        weights, settings = self.filter_settings
+        space = weights.astype(float)
+        concentration, dim = float(settings.concentration), float(settings.dim)
+        return FilterWindow(space, space.ravel(), concentration, dim, settings.drop_dim, settings.by_amplitude)
 
-    @cached_property
-    def _flying_gate(self) -> ranging.FlyingGate | None:
-        facts = self.camera.engine.flying_pixels
-        if facts is None:
-            return None
-        lengths_m = (f4(mm.value * MM) for mm in (facts.near_mm, facts.far_mm, facts.most_mm))
-        return ranging.FlyingGate(f4(facts.relative_deviation.value), f4(facts.least_mean_units.value), *lengths_m)
+    def at_once(self, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
+        """Return what sums frames of an exposure without drawing each, at the pixels ``asked`` (h, w) bool; None where
+        only frames will do."""
+        return at_once(self, exposure, asked)

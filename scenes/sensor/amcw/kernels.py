@@ -1,12 +1,13 @@
 """Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter.
 
-One core, float32. Numba, because on one core it does a frame of 30,000 pixels in a few milliseconds;
-tests/benchmarks/bench_sensor.py compares it with Dr.Jit and NumPy.
+Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32. Numba,
+because on one core it does a frame of 30,000 pixels in a few milliseconds; tests/benchmarks/bench_sensor.py compares it
+with Dr.Jit and NumPy.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -14,24 +15,23 @@ import numpy as np
 from scenes.sensor.normals import FAST, bits_float, float_bits
 
 OUTSIDE = np.float32(-1)
-"""The amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped."""
+"""Amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped."""
+
+STRIDE = 2128
+"""Longest padded row of an image; not a power of two, whose multiples share the cache's lines (a factor of 4 in time
+where memory lands badly)."""
+LANES = 32
+"""Frames of a listed pixel that are drawn together, whether they all count or not: a loop of 32 becomes vector code,
+a shorter one, of 16, a list of single steps, five times as slow."""
+BLOCK = 3 * LANES
+"""Numbers of one listed pixel and frequency: re, im and amplitude of all frames."""
 
 
 @numba.njit(**FAST)
-def expose(
-    means: np.ndarray,
-    sigma: np.ndarray,
-    limit: np.ndarray,
-    normals: np.ndarray,
-    knee: np.float32,
-    gains: np.ndarray,
-    cosines: np.ndarray,
-    sines: np.ndarray,
-    unit: np.ndarray,
-    amplitude: np.ndarray,
-    saturated: np.ndarray,
-) -> None:
-    """Samples to unit phasors and amplitudes.
+def expose(  # type: ignore[no-untyped-def]
+    means, sigma, limit, normals, knee, gains, cosines, sines, unit, amplitude, saturated
+):
+    """Convert samples to unit phasors and amplitudes.
 
     ``means`` (f, k, n) noise-free samples, ``sigma`` (n,) their deviation and ``limit`` (n,) the largest that fits, in
     converter units; ``normals`` (f, k, n) standard normals; ``gains`` (f,) of the amplitudes; ``cosines`` and ``sines``
@@ -80,124 +80,170 @@ def expose(
             amplitude[:, i] = OUTSIDE
 
 
-STRIDE = 2128
-"""Longest padded row; not a power of two, whose multiples share the cache's lines (a factor of 4 in time where memory
-lands badly). A compile-time constant: the compiler turns a loop into vector code only where it can see that
-the few arrays in it do not overlap, which it does for planes a constant apart."""
-
-
-@numba.njit(inline="always", **FAST)
-def exp_of_sixteenth(t):  # type: ignore[no-untyped-def]
-    """exp(16 t) as the sixteenth power of five terms of the series: for -0.46 <= t <= 0 the relative error is below
-    2e-4 at the smallest value (7e-4), and below 1e-6 where the value exceeds 0.1."""
-    e = np.float32(1 / 24) + t * np.float32(1 / 120)
-    e = np.float32(1 / 6) + t * e
-    e = np.float32(0.5) + t * e
-    e = np.float32(1) + t * e
-    e = np.float32(1) + t * e
-    e = e * e
-    e = e * e
-    e = e * e
-    return e * e
-
-
 @numba.njit(**FAST)
-def _add_neighbour(
-    row: np.ndarray,
-    start: int,
-    neighbour_start: int,
-    length: int,
-    space: np.float32,
-    by_amplitude: bool,
-    total: np.ndarray,
-) -> None:
-    """Add one neighbour of each pixel of a row to ``total``: planes re, im, amplitude, weight, gap, rate, floor.
+def noisy_phasors(  # type: ignore[no-untyped-def]
+    phasor, amplitude, turn, swell, normals, planes
+):
+    """Write phasors of pixels (f, g) with noise across and along each from ``normals`` (g, f, 2, lanes) into ``planes``
+    (g, f, 3 lanes): re and im of length 1, and amplitude."""
+    g, n_frequencies, _, _ = normals.shape
+    p1, p2 = np.uint64(LANES), np.uint64(2 * LANES)
+    for j in range(g):
+        for f in range(n_frequencies):
+            c, s = np.float32(phasor[f, j].real), np.float32(phasor[f, j].imag)
+            size = np.float32(amplitude[f, j])
+            over = np.float32(amplitude[f, j] * turn[f, j])
+            beside = np.float32(amplitude[f, j] * swell[f, j])
+            out = planes[j, f]
+            for t in range(np.uint64(LANES)):
+                along = size + beside * normals[j, f, 0, t]
+                across = over * normals[j, f, 1, t]
+                length = np.sqrt(along * along + across * across)
+                inverse = np.float32(1) / max(length, np.float32(1e-30))
+                out[t] = (c * along - s * across) * inverse
+                out[p1 + t] = (s * along + c * across) * inverse
+                out[p2 + t] = length
 
-    The last two are input: a sixteenth of the concentration, and the least amplitude of a neighbour that counts.
-    ``space`` is the weight by distance; ``by_amplitude``: whether phasors count by their amplitude as well.
-    Indices are unsigned: a signed one might count from the end, and the compiler would gather element by element.
+
+def _filter_of(stride: int) -> Any:
+    """Compile the filter of one window for ``stride`` values side by side: pixels of a row, or frames of a pixel.
+
+    The stride is a compile-time constant: the compiler turns a loop into vector code only where it can see that the few
+    arrays in it do not overlap, which it does for planes a constant apart.
     """
-    centre = np.uint64(start)
-    neighbour = np.uint64(neighbour_start)
-    p1 = np.uint64(STRIDE)
-    p2 = np.uint64(2 * STRIDE)
-    p3 = np.uint64(3 * STRIDE)
-    p4 = np.uint64(4 * STRIDE)
-    p5 = np.uint64(5 * STRIDE)
-    p6 = np.uint64(6 * STRIDE)
-    for x in range(np.uint64(length)):
-        r = row[neighbour + x]
-        i = row[neighbour + p1 + x]
-        amplitude = row[neighbour + p2 + x]
-        gap = np.float32(1) - (row[centre + x] * r + row[centre + p1 + x] * i)
-        e = exp_of_sixteenth(-total[p5 + x] * gap)
-        kept = amplitude >= total[p6 + x]
-        e = space * e if kept else np.float32(0)
-        a = e * amplitude
-        v = a if by_amplitude else e
-        total[x] += v * r
-        total[p1 + x] += v * i
-        total[p2 + x] += a
-        total[p3 + x] += e
-        total[p4 + x] += gap if kept else np.float32(0)
+
+    @numba.njit(**FAST)
+    def filter_window(planes, centre, starts, space, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
+        """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart; ``centre`` and
+        ``starts`` (k,): where the values and their neighbours begin, -1 for none; ``space`` (k,): weights by distance;
+        ``total``: room for 7 planes. Writes ``filtered`` (3, length) and ``edge`` (length,).
+
+        Indices are unsigned: a signed one might count from the end, and the compiler would gather element by element.
+        """
+        concentration, dim, drop_dim, by_amplitude = settings
+        p1, p2, p3, p4 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride), np.uint64(4 * stride)
+        p5, p6 = np.uint64(5 * stride), np.uint64(6 * stride)
+        middle = np.uint64(centre)
+        # planes of ``total``: re, im, amplitude, weight, gap; a sixteenth of the concentration; the least amplitude of
+        # a neighbour that counts
+        for x in range(np.uint64(length)):
+            bright = planes[middle + p2 + x] > dim
+            total[x] = np.float32(0)
+            total[p1 + x] = np.float32(0)
+            total[p2 + x] = np.float32(0)
+            total[p3 + x] = np.float32(0)
+            total[p4 + x] = np.float32(0)
+            total[p5 + x] = concentration / np.float32(16) if bright else np.float32(0)
+            total[p6 + x] = dim if bright and drop_dim else np.float32(0)
+        for q in range(starts.size):
+            if starts[q] < 0:
+                continue
+            neighbour = np.uint64(starts[q])
+            weight = space[q]
+            for x in range(np.uint64(length)):
+                r = planes[neighbour + x]
+                i = planes[neighbour + p1 + x]
+                amplitude = planes[neighbour + p2 + x]
+                gap = np.float32(1) - (planes[middle + x] * r + planes[middle + p1 + x] * i)
+                # exp(16 t) as the sixteenth power of five terms of the series: for -0.46 <= t <= 0 the relative error
+                # is below 2e-4 at the smallest value (7e-4), and below 1e-6 where the value exceeds 0.1
+                t = -total[p5 + x] * gap
+                e = np.float32(1 / 24) + t * np.float32(1 / 120)
+                e = np.float32(1 / 6) + t * e
+                e = np.float32(0.5) + t * e
+                e = np.float32(1) + t * e
+                e = np.float32(1) + t * e
+                e = e * e
+                e = e * e
+                e = e * e
+                e = e * e
+                kept = amplitude >= total[p6 + x]
+                e = weight * e if kept else np.float32(0)
+                a = e * amplitude
+                v = a if by_amplitude else e
+                total[x] += v * r
+                total[p1 + x] += v * i
+                total[p2 + x] += a
+                total[p3 + x] += e
+                total[p4 + x] += gap if kept else np.float32(0)
+        for x in range(np.uint64(length)):
+            a = total[x]
+            b = total[p1 + x]
+            size = np.sqrt(a * a + b * b) if by_amplitude else total[p2 + x]
+            filtered[0, x] = a
+            filtered[1, x] = b
+            # nothing is kept where the whole window is saturated
+            filtered[2, x] = size / max(total[p3 + x], np.float32(1e-30))
+            edge[x] = np.float32(0.5) * total[p4 + x]
+
+    return filter_window
+
+
+_filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
+
+
+class FilterSettings(NamedTuple):
+    """Settings of the joint bilateral filter; a centre not brighter than ``dim`` takes all by distance alone, before a
+    brighter one neighbours below ``dim`` are dropped where ``drop_dim``. Phasors count by their amplitude as well where
+    ``by_amplitude``, and the filtered amplitude is then the length of their mean; else unit phasors are averaged, and
+    their amplitudes beside them."""
+
+    concentration: np.float32
+    dim: np.float32
+    drop_dim: bool
+    by_amplitude: bool
 
 
 @numba.njit(**FAST)
-def joint_bilateral(
-    unit: np.ndarray,
-    amplitude: np.ndarray,
-    space: np.ndarray,
-    concentration: np.float32,
-    dim: np.float32,
-    drop_dim: bool,
-    by_amplitude: bool,
-    filtered: np.ndarray,
-    edge: np.ndarray,
-) -> None:
-    """Joint bilateral filter on the phasors of one frequency.
+def filter_image(  # type: ignore[no-untyped-def]
+    unit, amplitude, space, settings, filtered, edge
+):
+    """Filter the phasors of one frequency by a joint bilateral filter.
 
     ``unit`` (2, h, w), ``amplitude`` (h, w), ``space`` (2 k + 1, 2 k + 1) weights by distance. Weight of a neighbour:
-    space exp(-concentration (1 - cos dphi)). A centre not brighter than ``dim`` takes all by ``space`` alone; a
-    brighter one drops neighbours below ``dim`` where ``drop_dim``. Writes ``filtered`` (3, h, w): phasor (re, im; any
-    length) and amplitude, and ``edge`` (h, w): the sum over kept neighbours of (1 - cos dphi)/2.
-    Unit phasors are averaged, and their amplitudes beside them; ``by_amplitude`` the phasors themselves are, and the
-    amplitude is the length of their mean. The window is clipped at the border.
+    space exp(-concentration (1 - cos dphi)). Writes ``filtered`` (3, h, w): phasor (re, im; any length) and amplitude,
+    and ``edge`` (h, w): the sum over kept neighbours of (1 - cos dphi)/2. The window is clipped at the border.
     """
     h, w = amplitude.shape
     side = space.shape[0]
     half = side // 2
     rows = np.zeros(3 * side * STRIDE, np.float32)
+    weights, starts = space.ravel(), np.empty(side * side, np.int64)
     for dy in range(side):
         rows[(3 * dy + 2) * STRIDE : (3 * dy + 3) * STRIDE] = OUTSIDE
+        for dx in range(side):
+            starts[dy * side + dx] = 3 * dy * STRIDE + dx
     total = np.empty(7 * STRIDE, np.float32)
     for y in range(h):
         for dy in range(-half, half + 1):
-            re = 3 * (dy + half) * STRIDE
+            re = 3 * (dy + half) * STRIDE + half
             im = re + STRIDE
             amp = im + STRIDE
             if 0 <= y + dy < h:
                 # to the left and right of the picture stand the zeros and ``OUTSIDE`` of the start
-                rows[re + half : re + half + w] = unit[0, y + dy]
-                rows[im + half : im + half + w] = unit[1, y + dy]
-                rows[amp + half : amp + half + w] = amplitude[y + dy]
+                rows[re : re + w] = unit[0, y + dy]
+                rows[im : im + w] = unit[1, y + dy]
+                rows[amp : amp + w] = amplitude[y + dy]
             else:
-                rows[amp + half : amp + half + w] = OUTSIDE
-        for plane in range(5):
-            total[plane * STRIDE : plane * STRIDE + w] = np.float32(0)
-        for x in range(w):
-            bright = amplitude[y, x] > dim
-            total[5 * STRIDE + x] = concentration / np.float32(16) if bright else np.float32(0)
-            total[6 * STRIDE + x] = dim if bright and drop_dim else np.float32(0)
+                rows[amp : amp + w] = OUTSIDE
         centre = 3 * half * STRIDE + half
-        for dy in range(side):
-            for dx in range(side):
-                _add_neighbour(rows, centre, 3 * dy * STRIDE + dx, w, space[dy, dx], by_amplitude, total)
-        for x in range(w):
-            a = total[x]
-            b = total[STRIDE + x]
-            size = np.sqrt(a * a + b * b) if by_amplitude else total[2 * STRIDE + x]
-            filtered[0, y, x] = a
-            filtered[1, y, x] = b
-            # nothing is kept where the whole window is saturated
-            filtered[2, y, x] = size / max(total[3 * STRIDE + x], np.float32(1e-30))
-            edge[y, x] = np.float32(0.5) * total[4 * STRIDE + x]
+        _filter_row(rows, centre, starts, weights, w, settings, total, filtered[:, y], edge[y])
+
+
+@numba.njit(**FAST)
+def filter_listed(  # type: ignore[no-untyped-def]
+    planes, window, space, settings, filtered, edge
+):
+    """Filter listed pixels as `filter_image` does: ``planes`` (g, f, 3 lanes) of `noisy_phasors`, ``window`` (m, k)
+    places among them, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and ``edge`` (f, m, lanes)."""
+    n_frequencies, _, m, _ = filtered.shape
+    flat = planes.reshape(planes.size)
+    k = window.shape[1]
+    weights, starts = space.ravel(), np.empty(k, np.int64)
+    total = np.empty(7 * LANES, np.float32)
+    for p in range(m):
+        for f in range(n_frequencies):
+            for q in range(k):
+                starts[q] = (window[p, q] * n_frequencies + f) * BLOCK if window[p, q] >= 0 else -1
+            centre = starts[k // 2]
+            _filter_frames(flat, centre, starts, weights, LANES, settings, total, filtered[f, :, p], edge[f, p])

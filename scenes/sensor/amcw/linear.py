@@ -1,11 +1,12 @@
-"""The engine's filter to first order in the noise: what each pixel gives in the mean, and how far noise moves it.
+"""The engine's filter to first order in the noise: each pixel's mean, and how far noise moves it.
 
-A pixel's filtered phasor S is a sum over its window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase
-less its own. Noise of a neighbour turns t by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first
-order, by its derivative F' + v F'''/2 (Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences:
-over it the mean is taken last, of arg S, by three nodes. On a face of phase noise s the centre's own noise so counts
-more than by its weight, by some c s^2 of the window's sum, and a neighbour's less by c s^2.
-What is left out, of second and third order, is estimated beside it; a pixel where it counts is not for this module.
+Before the filter noise turns a pixel's phasor and changes its amplitude (`Light`). The filtered phasor S is a sum over
+the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase less its own. Noise of a neighbour turns t
+by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first order, by its derivative F' + v F'''/2
+(Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences: over it the mean is taken last, of
+arg S, by three nodes. On a face of phase noise s the centre's own noise so counts more than by its weight, by some
+c s^2 of the window's sum, and a neighbour's less by c s^2.
+Terms of second and third order are left out and estimated; a pixel where they count is not for this module.
 """
 
 from __future__ import annotations
@@ -14,17 +15,86 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from scipy import special
 
-from scenes.sensor.amcw.filtered import DEVIATIONS, Filtered, Near, amplitude_of, edge_of
-from scenes.sensor.amcw.light_noise import SMALLEST, Light
+from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.normals import FAST
 
+DEVIATIONS = 5.5
+"""Distance from a limit, in deviations, at which it is never met: 2e-8 a frame, and few pixels are just so far off."""
+NOISY = 0.35
+"""Phase noise in radians above which a pixel's phase is no longer a normal about its mean."""
 LITTLE = 0.004
 """c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work."""
+SMALLEST = 1e-12
 
 
-class Window(NamedTuple):
-    """The filter, as `kernels.joint_bilateral` has it; ``flat`` (k,): its ``space``, row by row."""
+class Light(NamedTuple):
+    """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise and
+    ``bright``, its mean with it, times the gains; ``turn``: deviation of the phase in radians; ``swell``: that of the
+    amplitude, over the amplitude."""
+
+    phasor: np.ndarray
+    amplitude: np.ndarray
+    bright: np.ndarray
+    turn: np.ndarray
+    swell: np.ndarray
+
+
+def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
+    """Return the light of an exposure, ``gains`` (f,) those of the amplitudes.
+
+    Each sample has its own variance: the exposure's, and step^2/12 of the converter's rounding.
+    """
+    frequencies, phases, n = exposure.means.shape
+    angle = 2 * np.pi * np.arange(phases) / phases
+    phasor = np.empty((frequencies, n), complex)
+    size, across, along = (np.empty((frequencies, n)) for _ in range(3))
+    _moments(exposure.means, exposure.sigma, knee, np.cos(angle), np.sin(angle), phasor, size, across, along)
+    scale = gains.astype(float)[:, None] * 2.0 / phases
+    bright = np.sqrt(size**2 + across**2)
+    # the mean length of a vector plus normals of one deviation in both directions (Rice)
+    near = size < 10 * along
+    deviation = np.sqrt((across[near] ** 2 + along[near] ** 2) / 2)
+    x = (size[near] / np.maximum(deviation, SMALLEST)) ** 2 / 4
+    bright[near] = deviation * np.sqrt(np.pi / 2) * ((1 + 2 * x) * special.ive(0, x) + 2 * x * special.ive(1, x))
+    return Light(phasor, scale * size, scale * bright, across / size, along / size)
+
+
+@numba.njit(**FAST)
+def _moments(means, sigma, knee, cosines, sines, phasor, size, across, along):  # type: ignore[no-untyped-def]
+    """Write direction and length of each pixel's phasor, and its deviations across and along that direction."""
+    frequencies, phases, n = means.shape
+    for f in range(frequencies):
+        for i in range(n):
+            re, im = 0.0, 0.0
+            for k in range(phases):
+                re += cosines[k] * means[f, k, i]
+                im += sines[k] * means[f, k, i]
+            length = np.sqrt(re * re + im * im)
+            if length > SMALLEST:
+                re /= length
+                im /= length
+            else:
+                # no light has no direction: any will do
+                re, im, length = 1.0, 0.0, SMALLEST
+            over, beside = 0.0, 0.0
+            for k in range(phases):
+                # the companding converter's step at a sample of so many knees
+                knees, step = abs(means[f, k, i]) / knee, 1.0
+                while 2.0 * step <= knees:
+                    step *= 2.0
+                variance = np.float64(sigma[i]) ** 2 + step * step / 12.0
+                over += variance * (re * sines[k] - im * cosines[k]) ** 2
+                beside += variance * (re * cosines[k] + im * sines[k]) ** 2
+            phasor[f, i] = complex(re, im)
+            size[f, i] = length
+            across[f, i] = np.sqrt(over)
+            along[f, i] = np.sqrt(beside)
+
+
+class FilterWindow(NamedTuple):
+    """The filter, as `kernels.filter_image` has it; ``flat`` (k,): its ``space``, row by row."""
 
     space: np.ndarray
     flat: np.ndarray
@@ -34,17 +104,130 @@ class Window(NamedTuple):
     by_amplitude: bool
 
 
+class Near(NamedTuple):
+    """Room for a pixel's window, (k,): ``at``: flat indices of the neighbours that count, -1 of others; ``between``:
+    exp(i t) of their phases less its own; ``weight`` in the filter, without noise."""
+
+    at: np.ndarray
+    between: np.ndarray
+    weight: np.ndarray
+
+
+class Filtered(NamedTuple):
+    """Each pixel after the filter, (f, n) float64.
+
+    ``phasor`` (complex, length 1) and ``amplitude`` in the mean, ``turned`` and ``spread``: deviations of the phase in
+    radians and of the amplitude. ``left_out``: share of the phase's variance that is not of first order; infinite where
+    neighbours are too noisy, or may or may not count. ``edge``, ``edge_spread``: mean and deviation of the sum over
+    neighbours of (1 - cos)/2, infinite where unknown. ``edge_least``: what the mean is at least, whatever the centre's
+    noise does, and ``edge_loose``, a bound of its deviation then: right at any noise.
+    """
+
+    phasor: np.ndarray
+    amplitude: np.ndarray
+    turned: np.ndarray
+    spread: np.ndarray
+    left_out: np.ndarray
+    edge: np.ndarray
+    edge_spread: np.ndarray
+    edge_least: np.ndarray
+    edge_loose: np.ndarray
+
+
+def unknown_filtered(frequencies: int, n: int) -> Filtered:
+    """Return n pixels of which nothing is known."""
+    start = (1.0, 0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
+    kinds = (complex,) + (float,) * 8
+    return Filtered(*(np.full((frequencies, n), value, kind) for value, kind in zip(start, kinds, strict=True)))
+
+
+@numba.njit(**FAST)
+def _edge_of(i, light, near, out):  # type: ignore[no-untyped-def]
+    """Write the edge sum's mean, deviation and bounds; return whether a pixel of the window is too noisy for the
+    former."""
+    own = light.turn[i]
+    noisy = own > NOISY
+    kept = 0
+    mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
+    longest, loose = 0.0j, 0.0
+    for q in range(near.at.size):
+        j = near.at[q]
+        if j < 0 or j == i:
+            continue
+        kept += 1
+        turn = light.turn[j]
+        noisy = noisy or turn > NOISY
+        between = near.between[q]
+        shrunk = 1.0 - 0.5 * (turn * turn + own * own)
+        mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
+        sines += 0.5 * between.imag
+        cosines += 0.25 * between.real
+        variance += (0.5 * between.imag * turn) ** 2
+        variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
+        # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
+        longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
+        # of any phase (1 - cos)/2 scatters no wider than that of an even one, 1/8; of a known one by half its noise
+        loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
+    out.edge[i] = mean
+    out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
+    # the centre's own noise turns it at most as far as that, and where it is large anywhere
+    away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
+    out.edge_least[i] = 0.5 * (kept - abs(longest) * np.cos(away))
+    out.edge_loose[i] = np.sqrt(loose)
+    return noisy
+
+
+@numba.njit(**FAST)
+def _amplitude_of(i, light, by_amplitude, c, near, out):  # type: ignore[no-untyped-def]
+    """Write the filtered amplitude and its deviation, and the filtered phasor where noise leaves the phases alone."""
+    total = 0.0j
+    weights, amplitudes, spread = 0.0, 0.0, 0.0
+    for q in range(near.at.size):
+        j = near.at[q]
+        if j < 0:
+            continue
+        between = near.between[q]
+        variance = 0.0 if j == i else light.turn[j] ** 2 + light.turn[i] ** 2
+        curved = (c * between.imag) ** 2 - c * between.real
+        weight = near.weight[q]
+        mean = weight * (1.0 + 0.5 * min(variance, 0.25) * curved)
+        weights += mean
+        amplitudes += mean * light.bright[j]
+        # noise across makes a phasor longer by what it takes of its mean
+        total += mean * light.amplitude[j] * between
+        spread += (mean * light.amplitude[j] * light.swell[j]) ** 2
+    weights = max(weights, SMALLEST)
+    out.amplitude[i] = (abs(total) if by_amplitude else amplitudes) / weights
+    out.phasor[i] = total * light.phasor[i] / max(abs(total), SMALLEST)
+    # noise of phases changes weights, and how phasors add up: its variance, times the weights' sum squared
+    along = total.conjugate() / max(abs(total), SMALLEST)
+    common = 0.0
+    for q in range(near.at.size):
+        j = near.at[q]
+        if j < 0 or j == i:
+            continue
+        between = near.between[q]
+        weight = near.weight[q]
+        change = -c * between.imag * weight * (light.bright[j] - out.amplitude[i])
+        if by_amplitude:
+            value = weight * light.amplitude[j] * between * complex(-c * between.imag, 1.0)
+            change = (along * value).real + c * between.imag * weight * out.amplitude[i]
+        spread += (change * min(light.turn[j], 0.5)) ** 2
+        common += change
+    out.spread[i] = np.sqrt(spread + (common * min(light.turn[i], 0.5)) ** 2) / weights
+
+
 def linearised(
     pixels: np.ndarray,
     light: Light,
-    window: Window,
+    window: FilterWindow,
     shape: tuple[int, int],
     wild: np.ndarray,
     lost: np.ndarray,
     out: Filtered,
 ) -> np.ndarray:
-    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``; (f, m, k): by how many radians one deviation of each
-    neighbour's noise moves a pixel's phase.
+    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``; return (f, m, k): by how many radians one deviation
+    of each neighbour's noise moves a pixel's phase.
 
     ``wild`` and ``lost`` (n,) bool: pixels whose samples may saturate, and those where they always do. A neighbour's
     phase and amplitude are independent, so what both do is put together in squares.
@@ -58,8 +241,8 @@ def linearised(
 
 @numba.njit(inline="always", **FAST)
 def _turned(c, between, v):  # type: ignore[no-untyped-def]
-    """F, F' and F'' at an angle whose exp(i t) is ``between``, in the mean over a normal of the angle of variance v:
-    the first two to v^2."""
+    """Return F, F' and F'' at an angle whose exp(i t) is ``between``, in the mean over a normal of the angle of
+    variance v: the first two to v^2."""
     cosine = c * between.real
     sine = c * between.imag
     value = np.exp(cosine - c) * between
@@ -80,8 +263,8 @@ def _turned(c, between, v):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-untyped-def]
-    """Fill ``near``; whether it is sure which neighbours count, whether it is sure if the centre is bright, and the
-    concentration that then holds."""
+    """Fill ``near``; return whether it is sure which neighbours count, whether it is sure if the centre is bright, and
+    the concentration that then holds."""
     h, w = shape
     side = window.space.shape[0]
     half = side // 2
@@ -121,8 +304,8 @@ def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: i
     for row in range(pixels.size):
         i = pixels[row]
         sure, rule_known, c = _look_around(i, light, window, shape, wild, lost, near)
-        noisy = edge_of(i, light, near, out)
-        amplitude_of(i, light, window.by_amplitude, c, near, out)
+        noisy = _edge_of(i, light, near, out)
+        _amplitude_of(i, light, window.by_amplitude, c, near, out)
         known = sure and rule_known and not (noisy or lost[i])
         out.turned[i] = np.inf
         out.left_out[i] = np.inf
@@ -138,7 +321,7 @@ def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: i
 
 @numba.njit(**FAST)
 def _moves_of(i, light, window, c, near, slopes, bends, out, moved):  # type: ignore[no-untyped-def]
-    """The mean phasor, and into ``moved`` (k,) how far each neighbour's phase moves its.
+    """Write the mean phasor, and into ``moved`` (k,) how far each neighbour's phase moves its.
 
     The centre's noise is in all differences, so the mean is taken over it last, by Gauss and Hermite's three nodes, of
     little noise by two.
@@ -189,8 +372,8 @@ def _moves_of(i, light, window, c, near, slopes, bends, out, moved):  # type: ig
 
 @numba.njit(**FAST)
 def _rest_of(i, light, by_amplitude, c, near, values, out, moved):  # type: ignore[no-untyped-def]
-    """The phase's deviation, and the share of its variance that is not of first order in phases; puts what the centre
-    and amplitudes do into ``moved``. ``values`` (k,) is room."""
+    """Write the phase's deviation, and the share of its variance that is not of first order in phases; puts what the
+    centre and amplitudes do into ``moved``. ``values`` (k,) is room."""
     own2 = light.turn[i] * light.turn[i]
     total = 0.0j
     for q in range(near.at.size):
@@ -230,5 +413,5 @@ def _rest_of(i, light, by_amplitude, c, near, values, out, moved):  # type: igno
 
 @numba.njit(inline="always", **FAST)
 def _inverse(z):  # type: ignore[no-untyped-def]
-    """1 / z, 0 where z is."""
+    """Return 1 / z, 0 where z is 0."""
     return z.conjugate() / max(z.real * z.real + z.imag * z.imag, SMALLEST**2)

@@ -1,4 +1,4 @@
-"""Frames of the imager to first order in its noise: one number a pixel and frame, summed, and rounded, in one loop.
+"""Frames of the imager to first order in its noise: a number for each pixel and frame, summed and rounded in one loop.
 
 Where the mean of a frame's z and the pull of each neighbour's noise on it are known (`scenes.sensor.amcw.linear`), z is
 a moving sum of one normal a pixel: whatever the frequencies and taps, only one combination of a pixel's noise reaches
@@ -12,14 +12,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from scenes.sensor.normals import FAST
+from scenes.sensor.amcw.kernels import LANES
+from scenes.sensor.normals import EXACT_SUMS, FAST
 
 f4 = np.float32
 NONE, EVEN, UNEVEN = 0, 1, 2
-LANES = 32
-"""Frames that are drawn together, whether they all count or not. A compile-time constant: the compiler makes vector
-code of such a loop, but of a shorter one, of 16, it makes a list of single steps: five times as slow.
-Compiled code of `scenes.sensor.amcw.listed` holds it too; numba's cache does not see that this file changed."""
 
 
 class Linear(NamedTuple):
@@ -45,7 +42,8 @@ class Linear(NamedTuple):
 
 
 def _bend() -> tuple[float, float]:
-    """(b, scale): u = scale v (1 + b v^2) of an even v in -1..1 at 256 levels has variance 1 and a normal's kurtosis.
+    """Return (b, scale): u = scale v (1 + b v^2) of an even v in -1..1 at 256 levels has variance 1 and a normal's
+    kurtosis.
 
     Sums of nine or more of them are normal to 1e-4 at 4 deviations, with a byte of randomness each.
     """
@@ -62,24 +60,20 @@ BEND, SCALE = _bend()
 
 
 @numba.njit(**FAST)
-def _noise_of_bytes(words, first, deviation, start, row):  # type: ignore[no-untyped-def]
-    bend, centre, size = f4(BEND), f4(0.5 / 128), f4(1 / 128)
-    for t in range(np.uint64(LANES)):
-        v = f4(words[np.uint64(first) + t]) * size + centre
-        row[np.uint64(start) + t] = deviation * v * (f4(1) + bend * v * v)
-
-
-@numba.njit(**FAST)
 def _noise_row(y, words, given, given_at, noise, w, half, row):  # type: ignore[no-untyped-def]
-    """Noise of picture row y into ``row`` ((w + 2 half) lanes,), zeros beside the picture."""
+    """Write noise of picture row y into ``row`` ((w + 2 half) lanes,), zeros beside the picture."""
+    bend, centre, size = f4(BEND), f4(0.5 / 128), f4(1 / 128)
     for x in range(w):
         i = y * w + x
-        start = (x + half) * LANES
+        start, first = np.uint64((x + half) * LANES), np.uint64(i * LANES)
         if given_at[i] >= 0:
             for t in range(LANES):
-                row[start + t] = noise[i] * given[given_at[i], t]
+                row[start + np.uint64(t)] = noise[i] * given[given_at[i], t]
         else:
-            _noise_of_bytes(words, i * LANES, noise[i] * f4(SCALE), start, row)
+            deviation = noise[i] * f4(SCALE)
+            for t in range(np.uint64(LANES)):
+                v = f4(words[first + t]) * size + centre
+                row[start + t] = deviation * v * (f4(1) + bend * v * v)
 
 
 @numba.njit(**FAST)
@@ -89,14 +83,14 @@ def _begin_sum(source, tap, shift, length, total):  # type: ignore[no-untyped-de
 
 
 @numba.njit(**FAST)
-def _pair_sum(one, other, tap, shift, other_shift, length, total):  # type: ignore[no-untyped-def]
+def _pair_sum(above, below, tap, shift, other_shift, length, total):  # type: ignore[no-untyped-def]
     for k in range(np.uint64(length)):
-        total[k] += tap * (one[np.uint64(shift) + k] + other[np.uint64(other_shift) + k])
+        total[k] += tap * (above[np.uint64(shift) + k] + below[np.uint64(other_shift) + k])
 
 
 @numba.njit(**FAST)
 def _window_sums(rows, blank, y, h, taps, w, down, across):  # type: ignore[no-untyped-def]
-    """Weighted sums over the window of each pixel of picture row y, (w lanes,) into ``across``."""
+    """Write weighted sums over the window of each pixel of picture row y, (w lanes,), into ``across``."""
     side = taps.size
     half = side // 2
     length = w * LANES
@@ -111,36 +105,28 @@ def _window_sums(rows, blank, y, h, taps, w, down, across):  # type: ignore[no-u
 
 
 @numba.njit(**FAST)
-def _add_scaled(pull, source, start, sums):  # type: ignore[no-untyped-def]
-    for t in range(np.uint64(LANES)):
-        sums[t] += pull * source[np.uint64(start) + t]
-
-
-@numba.njit(**FAST)
-def _round_and_add(z, by_path, errors, counted, each, moved, start, more, own, own_start):  # type: ignore[no-untyped-def]
-    """Sums of z and z^2 over the frames that are ``counted`` (lanes,) 0 or 1, z rounded to whole steps."""
-    total, squares = f4(0), f4(0)
+def _round(z, by_path, errors, each, moved, start, more, own, own_start, rounded):  # type: ignore[no-untyped-def]
     half = f4(0.5)
     for t in range(np.uint64(LANES)):
         noise = each * moved[np.uint64(start) + t] + more * own[np.uint64(own_start) + t]
-        r = counted[t] * np.floor(z + by_path * errors[t] + noise + half)
+        rounded[t] = np.floor(z + by_path * errors[t] + noise + half)
+
+
+@numba.njit(**EXACT_SUMS)
+def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
+    """Return sums of z and z^2 over the frames that are ``counted`` (lanes,) 0 or 1: whole numbers, below 2^24."""
+    total, squares = f4(0), f4(0)
+    for t in range(np.uint64(LANES)):
+        r = counted[t] * rounded[t]
         total += r
         squares += r * r
     return total, squares
 
 
 @numba.njit(**FAST)
-def add_linear_frames(
-    shape: tuple[int, int],
-    linear: Linear,
-    words: np.ndarray,
-    given: np.ndarray,
-    given_at: np.ndarray,
-    errors: np.ndarray,
-    counted: np.ndarray,
-    total: np.ndarray,
-    squares: np.ndarray,
-) -> None:
+def add_linear_frames(  # type: ignore[no-untyped-def]
+    shape, linear, words, given, given_at, errors, counted, total, squares
+):
     """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear``: z less base, and its square, in steps, (n,).
 
     ``words`` (n lanes,) int8: random bytes. ``given`` (g, lanes): standard normals that stand for them at the pixels
@@ -153,43 +139,37 @@ def add_linear_frames(
     width = (w + 2 * half) * LANES
     rows = np.zeros((side, width), np.float32)
     blank, down, across = np.zeros(width, np.float32), np.empty(width, np.float32), np.empty(w * LANES, np.float32)
-    sums = np.empty(LANES, np.float32)
+    sums, rounded = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     for y in range(min(half, h)):
         _noise_row(y, words, given, given_at, linear.noise, w, half, rows[y % side])
     for y in range(h):
         if y + half < h:
             _noise_row(y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side])
         _window_sums(rows, blank, y, h, linear.taps, w, down, across)
-        _finish_row(y, w, linear, rows, errors, counted, across, sums, total, squares)
-
-
-@numba.njit(**FAST)
-def _finish_row(y, w, linear, rows, errors, counted, across, sums, total, squares):  # type: ignore[no-untyped-def]
-    side = linear.taps.size
-    half = side // 2
-    own = rows[y % side]
-    for x in range(w):
-        i = y * w + x
-        if linear.kind[i] == EVEN:
-            start, mine = x * LANES, (x + half) * LANES
-            z, by_path, each, more = linear.z[i], linear.by_path[i], linear.each[i], linear.more[i]
-            a, b = _round_and_add(z, by_path, errors, counted, each, across, start, more, own, mine)
-            total[i] += a
-            squares[i] += b
-    for x in range(w):
-        i = y * w + x
-        if linear.kind[i] == UNEVEN:
-            sums[:] = f4(0)
-            for q in range(side * side):
-                pull = linear.moved[linear.row[i], q]
-                if pull != f4(0):
-                    _add_scaled(pull, rows[(y + q // side - half) % side], (x + q % side) * LANES, sums)
-            a, b = _round_and_add(linear.z[i], linear.by_path[i], errors, counted, f4(1), sums, 0, f4(0), sums, 0)
+        own = rows[y % side]
+        for x in range(w):
+            i = y * w + x
+            if linear.kind[i] == EVEN:
+                start, mine = x * LANES, (x + half) * LANES
+                z, by_path, each, more = linear.z[i], linear.by_path[i], linear.each[i], linear.more[i]
+                _round(z, by_path, errors, each, across, start, more, own, mine, rounded)
+            elif linear.kind[i] == UNEVEN:
+                sums[:] = f4(0)
+                for q in range(side * side):
+                    pull = linear.moved[linear.row[i], q]
+                    if pull != f4(0):
+                        source, first = rows[(y + q // side - half) % side], np.uint64((x + q % side) * LANES)
+                        for t in range(np.uint64(LANES)):
+                            sums[t] += pull * source[first + t]
+                _round(linear.z[i], linear.by_path[i], errors, f4(1), sums, 0, f4(0), sums, 0, rounded)
+            else:
+                continue
+            a, b = _sums_of(rounded, counted)
             total[i] += a
             squares[i] += b
 
 
-@numba.njit(**FAST)
+@numba.njit(**EXACT_SUMS)
 def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None:
     """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the frames that count, as numbers of variance 1."""
     scale = f4(1 / np.sqrt((256.0**2 - 1) / 12))

@@ -14,7 +14,7 @@ from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 
 
 class Lattice(NamedTuple):
-    """What the compiled unwrapping takes; f frequencies, r = f - 1 rows, k keys.
+    """Unwrapping tables as compiled code takes them; f frequencies, r = f - 1 rows, k keys.
 
     ``combination`` (r, f) and ``lattice``, ``metres_per_turn`` (f,) float32; ``sizes`` and ``offset`` (r,) int32 and
     ``wraps`` (f, k) float32: the table of `UnwrapTable`, laid flat.
@@ -30,7 +30,7 @@ class Lattice(NamedTuple):
 
 @dataclass(frozen=True)
 class UnwrapTable:
-    """How the phases of f = 1, 2 or 3 frequencies become half the light's path.
+    """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path.
 
     ``lattice`` (f,) integers m with f_k = m_k f_0; ``combination`` (f - 1, f) integer rows orthogonal to m: for a true
     distance they sum the wrapped phases to whole numbers, which name the wrap counts. ``table`` (..., f) wrap counts
@@ -48,7 +48,7 @@ class UnwrapTable:
 
     @cached_property
     def for_kernel(self) -> Lattice:
-        """The same in the types of the compiled loop."""
+        """Return the same in the types of the compiled loop."""
         *sizes, frequencies = self.table.shape
         return Lattice(
             self.combination.astype(np.float32),
@@ -62,7 +62,8 @@ class UnwrapTable:
 
 @lru_cache(maxsize=64)
 def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
-    """The table for one to three frequencies. Raises UserError where they are no small multiples of a common one."""
+    """Return the table for one to three frequencies. Raises UserError where they are no small multiples of a common
+    one."""
     lattice, base_hz = _integer_ratios(frequencies_hz)
     combination = _orthogonal_rows(lattice)
     wraps = _wrap_counts(lattice)
@@ -79,7 +80,7 @@ def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squar
 
 
 def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, float]:
-    """Smallest integers m and base frequency with f = m * base, to 1e-6."""
+    """Return smallest integers m and base frequency with f = m * base, to 1e-6."""
     frequencies = np.array(frequencies_hz)
     lowest = frequencies.min()
     for divisor in range(1, 65):
@@ -93,7 +94,7 @@ def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, floa
 
 
 def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
-    """(n, f) wrap counts that occur within the unambiguous range.
+    """Return (n, f) wrap counts that occur within the unambiguous range.
 
     Where two frequencies wrap at the same distance (a third of the range for ratios 21 and 6), noise lets one wrap
     before the other, so counts that a phase error of ``noise_turns`` can make are among them. The count of a key
@@ -108,7 +109,7 @@ def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
 
 
 def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
-    """(f - 1, f): the shortest independent integer rows t with t . m = 0 that tell all wrap counts apart.
+    """Return (f - 1, f): the shortest independent integer rows t with t . m = 0 that tell all wrap counts apart.
 
     Short rows amplify phase noise least: the rounding fails when |t| times the phase noise reaches half a turn.
     """

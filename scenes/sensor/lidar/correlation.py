@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from scenes.sensor.normals import FAST
+from scenes.sensor.normals import IN_DOUBLE
 
 SAMPLES_PER_LINE = 4
 """Samples of the correlation in a period, per spectral line; two would just hold it, four miss no peak."""
 NEWTON_STEPS = 4
-"""From a sample's parabola: three converge to 1e-7 of a sample even where two pulses are about to part."""
+"""Steps from a sample's parabola: three converge to 1e-7 of a sample even where two pulses are about to part."""
 NO_PEAK = -1e9
-"""Height where there is no second peak, or none at all."""
+"""Stand-in for the height of a peak that does not exist."""
 
 
 @dataclass(frozen=True)
@@ -36,27 +36,24 @@ class Peaks:
 
 
 def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
-    """Peaks of correlations with phasors (K, n) on lines 1..K of the comb and the pulse's ``weights`` (K,)."""
+    """Find peaks of correlations with phasors (K, n) on lines 1..K of the comb and the pulse's ``weights`` (K,)."""
     lines, n = phasor.shape
     spectrum = np.empty((n, 2 * lines), np.float32)
     scaled = (phasor * (weights / weights.sum())[:, None].astype(np.float32)).T
     spectrum[:, :lines] = scaled.real
     spectrum[:, lines:] = scaled.imag
+    # cosines and sines of the lines at the samples of one period, (2 K, M)
+    samples = SAMPLES_PER_LINE * lines
+    angle = 2 * np.pi * np.outer(np.arange(1, lines + 1), np.arange(samples)) / samples
+    waves = np.concatenate([np.cos(angle), np.sin(angle)]).astype(np.float32)
     out = np.empty((3, 2, n))
-    _peaks(spectrum @ _waves(lines), spectrum, *out)
+    _peaks(spectrum @ waves, spectrum, *out)
     return Peaks(*out)
 
 
-def _waves(lines: int) -> np.ndarray:
-    """(2 K, M) cosines and sines of the lines at the samples of one period."""
-    samples = SAMPLES_PER_LINE * lines
-    angle = 2 * np.pi * np.outer(np.arange(1, lines + 1), np.arange(samples)) / samples
-    return np.concatenate([np.cos(angle), np.sin(angle)]).astype(np.float32)
-
-
-@numba.njit(**FAST)
+@numba.njit(**IN_DOUBLE)
 def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, float]:
-    """The correlation with ``spectrum`` (2 K,) at an angle, its first and its second derivative by angle."""
+    """Return the correlation with ``spectrum`` (2 K,) at an angle, its first and its second derivative by angle."""
     lines = spectrum.size // 2
     step_re, step_im = np.cos(angle), np.sin(angle)
     re, im = 1.0, 0.0
@@ -72,9 +69,9 @@ def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, floa
     return value, slope, bend
 
 
-@numba.njit(**FAST)
+@numba.njit(**IN_DOUBLE)
 def _refined(spectrum: np.ndarray, start: float, spacing: float) -> tuple[float, float, float]:
-    """(angle, height, curvature) of the peak beside the sample at ``start``, within one sample of it."""
+    """Return (angle, height, curvature) of the peak beside the sample at ``start``, within one sample of it."""
     angle = start
     for _ in range(NEWTON_STEPS):
         _, slope, bend = _derivatives(spectrum, angle)
@@ -85,7 +82,7 @@ def _refined(spectrum: np.ndarray, start: float, spacing: float) -> tuple[float,
     return angle, value, -bend
 
 
-@numba.njit(**FAST)
+@numba.njit(**IN_DOUBLE)
 def _peaks(
     samples: np.ndarray, spectrum: np.ndarray, delay: np.ndarray, height: np.ndarray, curvature: np.ndarray
 ) -> None:

@@ -98,7 +98,7 @@ class LidarPhotonFacts(Config):
 
 
 class RippleFacts(Config):
-    """What is the same in every frame of one unit: smooth ripples of range."""
+    """Fixed pattern, the same in every frame of a unit: smooth ripples of range."""
 
     smooth_mm: NonNegative
     smooth_length_px: LengthPx
@@ -166,7 +166,7 @@ class ScannedLidar(CameraFacts):
 
     @property
     def integration_points(self) -> float:
-        """How many points' time the integration of one point spans."""
+        """Number of points' times that the integration of a point spans."""
         return self.code.integration_ns.value / self.scan.point_ns.value
 
     @cached_property
@@ -191,7 +191,7 @@ class ScannedLidar(CameraFacts):
         return float((1 / (1 + (slopes**2).sum(axis=-1)) ** 2).sum() / (lens.fx * lens.fy))
 
     def ambient_electrons(self, irradiance_uw_cm2_nm: float) -> float:
-        """Electrons of one integration from daylight or lamps of that spectral irradiance on the whole field.
+        """Return electrons of an integration from daylight or lamps of that spectral irradiance on the whole field.
 
         A surface of albedo a under irradiance E has the radiance a E / pi, and sends from the field's solid angle what
         the beam of power P sends from albedo 1 at 1 m when P a / pi / 1 m^2 equals a E / pi times that angle.
@@ -212,7 +212,7 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """What the render needs: pixels are beams from the origin, and the receiver stands where an emitter would."""
+        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would."""
         return Optics(
             title=self.title,
             lens=self.nominal_lens,

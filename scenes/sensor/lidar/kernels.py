@@ -17,7 +17,8 @@ NOWHERE_M = np.float32(1e9)
 
 @numba.njit(**FAST)
 def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
-    """Moving sum along axis 1 of ``normals`` (f, h + q, w) with q + 1 ``taps``, in place: rows 0..h-1 are the result.
+    """Take the moving sum along axis 1 of ``normals`` (f, h + q, w) with q + 1 ``taps``, in place: rows 0..h-1 are the
+    result.
 
     A point's sum takes later points only, which are still as they were drawn.
     """
@@ -36,18 +37,10 @@ def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
 
 
 @numba.njit(**FAST)
-def stronger_peak(
-    height: np.ndarray,
-    half_m: np.ndarray,
-    deviation_m: np.ndarray,
-    noise: np.ndarray,
-    normals: np.ndarray,
-    sweep_m: np.ndarray,
-    won_m: np.ndarray,
-    won_height: np.ndarray,
-    won_deviation_m: np.ndarray,
-) -> None:
-    """The higher of two peaks after noise, with the noise of its range.
+def stronger_peak(  # type: ignore[no-untyped-def]
+    height, half_m, deviation_m, noise, normals, sweep_m, won_m, won_height, won_deviation_m
+):
+    """Choose the higher of two peaks after noise, with the noise of its range.
 
     ``height``, ``half_m``, ``deviation_m`` (2, h, w) of the two peaks; ``noise`` (h, w) deviation of a height;
     ``normals`` (3, h or more, w): of the two heights and of the winner's range; ``sweep_m`` (w,) added to a column.
@@ -67,17 +60,9 @@ def stronger_peak(
 
 
 @numba.njit(**FAST)
-def noise_peaks(
-    weak: np.ndarray,
-    noise: np.ndarray,
-    uniforms: np.ndarray,
-    rate: float,
-    bandwidth_m: float,
-    unambiguous_m: float,
-    won_m: np.ndarray,
-    won_height: np.ndarray,
-    won_deviation_m: np.ndarray,
-) -> None:
+def noise_peaks(  # type: ignore[no-untyped-def]
+    weak, noise, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
+):
     """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``.
 
     Rice: a level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period; taken as Poisson, the
@@ -96,21 +81,10 @@ def noise_peaks(
 
 
 @numba.njit(**FAST)
-def smooth_and_gate(
-    won_m: np.ndarray,
-    won_height: np.ndarray,
-    gate_m: np.ndarray,
-    side: np.float32,
-    along_m: np.ndarray,
-    cosine: np.ndarray,
-    saturated: np.ndarray,
-    limits: tuple,
-    error_m: np.float32,
-    z_m: np.ndarray,
-    reason: np.ndarray,
-    strength: np.ndarray,
-) -> None:
-    """Mean over the 3 x 3 neighbours that agree, then range, gates and rounding.
+def smooth_and_gate(  # type: ignore[no-untyped-def]
+    won_m, won_height, gate_m, side, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
+):
+    """Average the 3 x 3 neighbours that agree, then range, gates and rounding.
 
     ``won_m``, ``won_height`` and ``gate_m`` (h + 2, w + 2): half path, height, and how far a neighbour's half path may
     differ. Weights: 1 in the centre, ``side`` beside, above and below it, its square in the corners. ``strength``

@@ -24,13 +24,12 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from harness.vocabulary.units import MM
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.decoded import Decoded
+from scenes.sensor.frames import DecodedFrame
 from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import ScannedLidar
-from scenes.sensor.light import light_of
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import drift_m, smooth_field, static_error_m
+from scenes.sensor.unit import light_of, smooth_field, unit_error_m
 from scenes.view import NoiseFreeView
 
 f4 = np.float32
@@ -43,8 +42,8 @@ FACTOR_ROWS = 400
 
 
 @dataclass(frozen=True)
-class Returns:
-    """What one view sends back before noise.
+class LidarReturns:
+    """Light that a view sends back before noise.
 
     Of the two strongest peaks, (2, h, w) float32: ``height`` (electrons), ``half_m`` (half the path, with the unit's
     errors), ``deviation_m`` (of the half path, from noise). ``noise`` (h, w): deviation of a height, electrons.
@@ -60,7 +59,7 @@ class Returns:
 
 
 class LidarScanner:
-    """A camera of this kind on one region of its raster: `expose` once per view, then `frame` for each exposure."""
+    """A camera of this kind on a region of its raster: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: ScannedLidar, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
         self.camera = camera
@@ -80,22 +79,17 @@ class LidarScanner:
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share, as far as they are on."""
+        """(h, w): all errors of range that frames of this unit share, as far as they are on; the fixed pattern is cut
+        from a field over the whole raster."""
         camera, config = self.camera, self.config
-        error = drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
-        error = error + static_error_m(camera.unit, config.effects, camera.name, config.unit_seed)
-        return np.asarray(error + self.ripples_m if config.effects.fixed_pattern else error)
-
-    @cached_property
-    def ripples_m(self) -> np.ndarray:
-        """(h, w): this unit's fixed pattern, cut from a field over the whole raster."""
-        facts, lens = self.camera.fixed_pattern, self.camera.nominal_lens
-        rng = random_stream(self.config.unit_seed, "fixed pattern", self.camera.name)
-        white = rng.standard_normal((lens.height, lens.width), dtype=f4)
-        field = smooth_field(white, facts.smooth_length_px.value)
-        return np.asarray(field * facts.smooth_mm.value * MM * self.config.fixed_pattern_scale)[
-            self.region.within(lens.whole)
-        ]
+        error = unit_error_m(camera, config, self.slopes[..., 0])
+        if not config.effects.fixed_pattern:
+            return error
+        facts, lens = camera.fixed_pattern, camera.nominal_lens
+        rng = random_stream(config.unit_seed, "fixed pattern", camera.name)
+        field = smooth_field(rng.standard_normal((lens.height, lens.width), dtype=f4), facts.smooth_length_px.value)
+        ripples_m = field * facts.smooth_mm.value * MM * config.fixed_pattern_scale
+        return np.asarray(error + ripples_m[self.region.within(lens.whole)])
 
     @cached_property
     def gathered(self) -> np.ndarray:
@@ -105,10 +99,9 @@ class LidarScanner:
         """
         return np.asarray(self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
 
-    # ---------------------------------------------------------------- once per view
-
-    def expose(self, view: NoiseFreeView) -> Returns:
-        """The two strongest returns of each beam of a view that covers this scanner's region, and their noise."""
+    def expose(self, view: NoiseFreeView) -> LidarReturns:
+        """Return the two strongest returns of each beam of a view that covers this scanner's region, and their
+        noise."""
         camera, effects = self.camera, self.config.effects
         phasor, intensity = light_of(view, effects)
         electrons = self.gathered * self._along_sweeps(intensity)
@@ -116,7 +109,7 @@ class LidarScanner:
         height, half_m, deviation_m = self._peaks(phasor, noise)
         full = camera.photons.full_scale_electrons.value if effects.saturation else np.inf
         weak = height[0] < CERTAIN_DEVIATIONS * noise if effects.noise else np.zeros(noise.shape, bool)
-        return Returns(
+        return LidarReturns(
             height.astype(f4),
             (half_m + self.static_error_m).astype(f4),
             deviation_m.astype(f4),
@@ -132,7 +125,8 @@ class LidarScanner:
         return self.camera.ambient_electrons(config.ambient_uw_cm2_nm) if config.effects.ambient else 0.0
 
     def noise_electrons(self, signal_electrons: np.ndarray) -> np.ndarray:
-        """Deviation of the correlation in a point with that much light: sqrt(F (signal + ambient) + amplifier^2)."""
+        """Return the deviation of the correlation in a point with that much light: sqrt(F (signal + ambient) +
+        amplifier^2)."""
         photons = self.camera.photons
         shot = photons.excess_noise_factor.value * (signal_electrons + self.ambient_electrons)
         return np.asarray(np.sqrt(shot + photons.amplifier_electrons.value**2))
@@ -146,7 +140,7 @@ class LidarScanner:
         return self.camera.unambiguous_m / (self.camera.period_s * self.camera.bandwidth_rad_s)
 
     def _peaks(self, phasor: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Heights in electrons, half paths and their deviations in metres, each (2, h, w)."""
+        """Return heights in electrons, half paths and their deviations in metres, each (2, h, w)."""
         camera = self.camera
         h, w = noise.shape
         height, half_m, deviation_m = (np.empty((2, h, w)) for _ in range(3))
@@ -168,7 +162,8 @@ class LidarScanner:
         return height, half_m, np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
 
     def _along_sweeps(self, light: np.ndarray, rows: slice | None = None) -> np.ndarray:
-        """Light (..., h, w) integrated over the points of a column that one point's time spans; only ``rows`` of it.
+        """Return light (..., h, w) integrated over the points of a column that one point's time spans; only ``rows`` of
+        it.
 
         At the region's border the nearest row stands for those beyond it; the margin takes them off.
         """
@@ -181,81 +176,45 @@ class LidarScanner:
             total = total + light.real.dtype.type(weight) * light[..., at, :]
         return total
 
-    # ---------------------------------------------------------------- once per frame
-
-    def frame(self, exposure: Returns, rng: np.random.Generator, error_m: float = 0.0) -> Decoded:
-        """One frame: noise from ``rng`` on the peaks, then the device's processing; ``error_m`` displaces the frame."""
+    def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
+        """Draw a frame: noise from ``rng`` on the peaks, then the device's processing; ``error_m`` displaces the
+        frame."""
         h, w = exposure.noise.shape
         won_m = np.full((h + 2, w + 2), kernels.NOWHERE_M, f4)
         won_height = np.zeros((h + 2, w + 2), f4)
         won_deviation_m = np.zeros((h + 2, w + 2), f4)
-        normals, sweep_m = self._draw(rng, h, w)
+        # standard normals, correlated along columns, and the sweeps' errors
+        normals, sweep_m, more = np.zeros((3, h, w), f4), np.zeros(w, f4), len(self.noise_taps) - 1
+        if self.config.effects.noise:
+            normals = standard_normals(rng, (3, h + more, w))
+            kernels.correlate_along_columns(normals, self.noise_taps)
+            sweep_m = standard_normals(rng, (w,)) * f4(self.camera.scan.sweep_jitter_mm.value * MM)
+        won = won_m, won_height, won_deviation_m
         kernels.stronger_peak(
-            exposure.height,
-            exposure.half_m,
-            exposure.deviation_m,
-            exposure.noise,
-            normals,
-            sweep_m,
-            won_m,
-            won_height,
-            won_deviation_m,
+            exposure.height, exposure.half_m, exposure.deviation_m, exposure.noise, normals, sweep_m, *won
         )
-        kernels.noise_peaks(
-            exposure.weak,
-            exposure.noise,
-            rng.random((2, exposure.weak.size)),
-            self.camera.bandwidth_rad_s * self.camera.period_s / (2 * np.pi),
-            self.metres_at_unit_ratio,
-            self.camera.unambiguous_m,
-            won_m,
-            won_height,
-            won_deviation_m,
-        )
+        slope = self.camera.bandwidth_rad_s * self.camera.period_s / (2 * np.pi)
+        rates = slope, self.metres_at_unit_ratio, self.camera.unambiguous_m
+        kernels.noise_peaks(exposure.weak, exposure.noise, rng.random((2, exposure.weak.size)), *rates, *won)
         won_deviation_m *= f4(self.camera.engine.agree_deviations.value)
-        return self._processed(won_m, won_height, won_deviation_m, exposure.saturated, error_m)
 
-    def at_once(self, exposure: Returns, asked: np.ndarray) -> None:
-        """None: there is no way to sum frames that is equal in distribution and costs much less than they do.
+        # smoothing, range, gates and rounding
+        z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
+        along_m, cosine = self._geometry
+        kernels.smooth_and_gate(
+            *won, f4(self.camera.engine.side_weight.value), along_m, cosine, exposure.saturated, self._limits,
+            f4(error_m), z_m, reason, strength,
+        )  # fmt: skip
+        return DecodedFrame(z_m, reason, strength)
+
+    def at_once(self, exposure: LidarReturns, asked: np.ndarray) -> None:
+        """Return None: there is no way to sum frames that is equal in distribution and costs much less than they do.
 
         A neighbour counts where it agrees within a gate of a few of its own deviations, so what a pixel gives is far
         from linear in the noise everywhere, face included, and a frame's noise is one array of three fields that a
         linear camera would need as well.
         """
         return None
-
-    def _draw(self, rng: np.random.Generator, h: int, w: int) -> tuple[np.ndarray, np.ndarray]:
-        """Standard normals (3, h or more, w), correlated along columns, and the sweeps' errors (w,) in metres."""
-        q = len(self.noise_taps) - 1
-        if not self.config.effects.noise:
-            return np.zeros((3, h, w), f4), np.zeros(w, f4)
-        normals = standard_normals(rng, (3, h + q, w))
-        kernels.correlate_along_columns(normals, self.noise_taps)
-        return normals, standard_normals(rng, (w,)) * f4(self.camera.scan.sweep_jitter_mm.value * MM)
-
-    def _processed(
-        self, won_m: np.ndarray, won_height: np.ndarray, gate_m: np.ndarray, saturated: np.ndarray, error_m: float
-    ) -> Decoded:
-        """Smoothing, range, gates and rounding."""
-        z_m = np.empty(saturated.shape, f4)
-        reason = np.empty(saturated.shape, np.uint8)
-        strength = np.empty(saturated.shape, f4)
-        along_m, cosine = self._geometry
-        kernels.smooth_and_gate(
-            won_m,
-            won_height,
-            gate_m,
-            f4(self.camera.engine.side_weight.value),
-            along_m,
-            cosine,
-            saturated,
-            self._limits,
-            f4(error_m),
-            z_m,
-            reason,
-            strength,
-        )
-        return Decoded(z_m, reason, strength)
 
     @cached_property
     def _geometry(self) -> np.ndarray:
@@ -279,7 +238,7 @@ class LidarScanner:
 
 
 def smear_weights(points: float) -> np.ndarray:
-    """Weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time.
+    """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time.
 
     The light between two points is taken as linear between them, so a weight is the integral of a hat function.
     """
@@ -294,7 +253,8 @@ def smear_weights(points: float) -> np.ndarray:
 
 
 def overlap_taps(points: float) -> np.ndarray:
-    """Taps, of sum of squares 1, of a moving sum of white noise that correlates as integrations over ``points`` points.
+    """Return taps, of sum of squares 1, of a moving sum of white noise that correlates as integrations over ``points``
+    points.
 
     Windows of length p that start a point apart share 1 - k / p of white noise at lag k. The taps with that
     autocorrelation are the last row of the Cholesky factor of its matrix (Bauer 1955).
