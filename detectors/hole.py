@@ -347,6 +347,48 @@ class HoleFit:
     converged: bool
 
 
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _products(
+    by: np.ndarray,
+    image: np.ndarray,
+    data: np.ndarray,
+    used: np.ndarray,
+    q: np.ndarray,
+    hole: np.ndarray,
+    prior: np.ndarray,
+) -> np.ndarray:
+    """Return the products (7, 7) of the Jacobian's columns by the fitted parameters ``q``, and the misfit, over the
+    used pixels (h, w). ``prior``: mean and weight of the wall's."""
+    h, w = image.shape
+    rows, products = np.empty((7, w)), np.zeros((7, 7))
+    radius, depth = hole[2], hole[3]
+    slope = 0.5 * math.pi * math.sin(math.pi * q[5])
+    for r in range(h):
+        for c in range(w):
+            share = 1.0 if used[r, c] else 0.0
+            rows[0, c] = share * by[0, r, c]
+            rows[1, c] = share * by[1, r, c]
+            rows[2, c] = share * (radius * by[2, r, c] - 2.0 * depth * by[3, r, c])
+            rows[3, c] = share * by[3, r, c] / radius**2
+            rows[4, c] = share
+            rows[5, c] = share * by[4, r, c] * slope
+            rows[6, c] = image[r, c] + q[4] - data[r, c] if used[r, c] else 0.0
+        for a in range(7):
+            for b in range(a + 1):
+                total = 0.0
+                for c in range(w):
+                    total += rows[a, c] * rows[b, c]
+                products[a, b] += total
+    by_wall, apart = prior[1] * slope, prior[1] * (hole[4] - prior[0])
+    products[5, 5] += by_wall * by_wall
+    products[6, 5] += by_wall * apart
+    products[6, 6] += apart * apart
+    for a in range(7):
+        for b in range(a):
+            products[b, a] = products[a, b]
+    return products
+
+
 def fit_hole(patch: Patch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
     """Fit by least squares from a start, by Levenberg's and Marquardt's way (MINPACK's), with `sandwich_covariance`.
 
@@ -360,43 +402,40 @@ def fit_hole(patch: Patch, u: float, v: float, radius_m: float, depth_m: float, 
     # keeps a wild trial step finite: no disc is larger than ten patches
     low = np.array([-10.0 * w, -10.0 * h, -20.0])
     high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
-    weight, used = patch.prior_weight, patch.used.astype(np.float64)
-    data = np.where(patch.used, patch.residual_m, 0.0)
-    image, drawn, sloped = np.empty(patch.shape), np.full(6, np.nan), np.full(6, np.nan)
-    misfits, rows = np.empty(data.size + 1), np.zeros((6, data.size + 1))
+    prior, data = np.array([WALL_PRIOR[0], patch.prior_weight]), np.ascontiguousarray(patch.residual_m)
+    used, at, root = np.ascontiguousarray(patch.used), np.full(6, np.nan), np.empty((7, 7))
+    image, by = np.empty(patch.shape), np.empty((5, *patch.shape))
 
     def hole_of(q: np.ndarray) -> np.ndarray:
         u, v, log_radius = np.clip(q[:3], low, high).tolist()
         radius = math.exp(log_radius)
         return np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
 
-    def misfit(q: np.ndarray) -> np.ndarray:
-        if not np.array_equal(q, drawn):
-            drawn[:] = q
-            _picture(hole_of(q), *patch.seen, image)
-        misfits[:-1] = ((image + q[4] - data) * used).ravel()
-        misfits[-1] = weight * (hole_of(q)[4] - WALL_PRIOR[0])
-        return misfits.copy()
+    def root_at(q: np.ndarray) -> np.ndarray:
+        """Return (7, 7) whose columns, the Jacobian's six and the misfit, have the products of the full ones: MINPACK
+        needs no more, and a factor of 7 rows takes no time."""
+        if not np.array_equal(q, at):
+            at[:] = q
+            hole = hole_of(q)
+            _picture(hole, *patch.seen, image)
+            _differences(hole, image, *patch.seen, by)
+            products = _products(by, image, data, used, q, hole, prior)
+            size = np.sqrt(np.diagonal(products))
+            size[size == 0.0] = 1.0
+            values, vectors = np.linalg.eigh(products / np.outer(size, size))
+            root[:] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * size
+        return root
 
-    def jacobian(q: np.ndarray) -> np.ndarray:
-        # MINPACK's wrapper asks for the start's twice
-        if np.array_equal(q, sloped):
-            return rows
-        sloped[:] = q
-        misfit(q)
-        hole = hole_of(q)
-        by = derivatives(patch, hole, image)
-        slope = 0.5 * math.pi * math.sin(math.pi * q[5])
-        by[2] = hole[2] * by[2] - 2.0 * hole[3] * by[3]
-        by[3] /= hole[2] ** 2
-        by[4] *= slope
-        by *= used
-        rows[:4, :-1], rows[4, :-1], rows[5, :-1] = by[:4].reshape(4, -1), used.ravel(), by[4].ravel()
-        rows[5, -1] = weight * slope
-        return rows
-
-    limits = {"ftol": TOLERANCE, "xtol": TOLERANCE, "gtol": 1e-9, "maxfev": IMAGES}
-    q, _, _, _, outcome = leastsq(misfit, start, Dfun=jacobian, col_deriv=True, full_output=True, **limits)
+    q, _, _, _, outcome = leastsq(
+        lambda q: root_at(q)[:, 6].copy(),
+        start,
+        Dfun=lambda q: root_at(q)[:, :6].copy(),
+        full_output=True,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+        gtol=1e-9,
+        maxfev=IMAGES,
+    )
     hole, offset = hole_of(q), float(q[4])
     covariance = sandwich_covariance(patch, hole, offset)
     u, v, radius, depth, wall = hole.tolist()

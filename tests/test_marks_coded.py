@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from detectors.average import AverageConfig, average
 from detectors.crop import AutoCrop, crop
 from detectors.marks.find import find_marks
-from detectors.marks.settings import CodedMarks, ColourMarks
+from detectors.marks.mark import CodedMarks, ColourMarks
 from detectors.recordings.opening import open_capture
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import random_stream

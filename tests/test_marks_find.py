@@ -10,8 +10,7 @@ import pytest
 from marked_boards import RED, TAPES, WOOD, board_pose, marked_cloud, strips
 
 from detectors.marks.find import find_marks
-from detectors.marks.mark import MarkSet
-from detectors.marks.settings import ColourMarks, RedMarks
+from detectors.marks.mark import ColourMarks, MarkSet, RedMarks
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import random_stream

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from detectors.crop import AutoCrop, CropConfig
-from detectors.marks.settings import ColourMarks, MarksConfig
+from detectors.marks.mark import ColourMarks, MarksConfig
 from detectors.registration.settings import MarksRegistration, RegistrationConfig
 from harness.vocabulary.config import Config
 

@@ -1,4 +1,4 @@
-"""The target's own colour, pixel by pixel, and the pixels that differ from it.
+"""The target's own colour, pixel by pixel, and the pixels that stand apart from it.
 
 Colour enters as chromaticity, which uneven light leaves alone and light of another colour shifts. A smooth polynomial
 over the target, fitted robustly, follows the shift; the scatter of what is left (minimum covariance determinant,
@@ -23,7 +23,7 @@ DEGREE = 2
 SAMPLE = 4096
 """Pixels of the fit: a coefficient's standard error is then a sixtieth of the scatter."""
 STEPS = 6
-"""Iterations of the reweighting: the scatter has then settled to 3 %."""
+"""Steps of reweighting: the scatter has then settled to 3 %."""
 CORE = 0.6
 """Share of the pixels that the scatter rests on."""
 CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
@@ -32,22 +32,23 @@ the chi-squared distribution."""
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
 """Distances that `FALSE_RATE` of a Gaussian's exceed, in one and two dimensions."""
 NEARBY_PX = 16
-"""Reach over which a camera smears colour: JPEG and video keep one colour for two by two pixels, in blocks of eight of
+"""Reach to which a camera smears colour: JPEG and video keep one colour for two by two pixels, in blocks of eight of
 these."""
 TAIL = (0.4, 0.7)
 """Quantiles from which the tail is extrapolated; those above may be marks."""
 
 
 def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) shares of red and of blue in the sum of the channels, and (n,) the variance that rounding to whole counts
-    gives each of them, of colours (n, 3) uint8. Half a count is added, so that black has a share."""
+    """Return shares (n, 2) of red and of blue in the sum of the channels, and the variance (n,) that rounding to whole
+    counts gives each of them, of colours (n, 3) uint8. Half a count is added, so that black has a share."""
     counts = rgb.astype(np.float64) + 0.5
     total = counts.sum(axis=1)
     return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
 
 
 def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 1) logarithm of the mean of the channels and (n,) the variance that rounding gives it; see `chromaticity`."""
+    """Return the logarithm (n, 1) of the mean of the channels and the variance (n,) that rounding gives it; see
+    `chromaticity`."""
     mean = rgb.astype(np.float64).mean(axis=1) + 0.5
     return np.log(mean)[:, None], 1.0 / 36.0 / mean**2
 
@@ -79,9 +80,9 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> Apa
 
 
 def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
-    """(h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby, so that a
-    group ends where its edge is half way, and what a camera smears around it is not taken for more. The greatest is
-    that of a pixel with its eight neighbours, by their median."""
+    """Return (h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby, so
+    that a group ends where its edge is half way, and what a camera smears around it is not taken for more. The greatest
+    is that of a pixel with its eight neighbours, by their median."""
     beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
     side = 2 * NEARBY_PX + 1
     greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((side, side), np.uint8))
@@ -96,7 +97,7 @@ def _polynomials(xy: np.ndarray) -> np.ndarray:
 
 
 def _smooth(basis: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """(terms, p) coefficients by iterated bisquare weights from the median, one weight a pixel."""
+    """Return coefficients (terms, p) by iterated bisquare weights from the median, one weight a pixel."""
     coefficients = np.zeros((basis.shape[1], features.shape[1]))
     coefficients[0] = np.median(features, axis=0)
     for _ in range(STEPS):
@@ -110,7 +111,7 @@ def _smooth(basis: np.ndarray, features: np.ndarray) -> np.ndarray:
 
 
 def _scatter(apart: np.ndarray) -> np.ndarray:
-    """(p, p) covariance of the bulk about the backdrop, as of a Gaussian whose innermost part it is."""
+    """Return the covariance (p, p) of the bulk about the backdrop, as of a Gaussian whose innermost part it is."""
     p = apart.shape[1]
     covariance = np.diag(np.maximum(np.median(np.abs(apart), axis=0) / 0.6745, 1e-6) ** 2)
     for _ in range(STEPS):
@@ -121,8 +122,9 @@ def _scatter(apart: np.ndarray) -> np.ndarray:
 
 
 def _threshold(distance: np.ndarray, p: int) -> float:
-    """The distance that `FALSE_RATE` of the target's own pixels exceed: a Weibull tail through the quantiles `TAIL`,
-    between a Gaussian's (shape 2 in two dimensions) and an exponential one (shape 1), and never below the Gaussian's.
+    """Return the distance that `FALSE_RATE` of the target's own pixels exceed: a Weibull tail through the quantiles
+    `TAIL`, between a Gaussian's (shape 2 in two dimensions) and an exponential one (shape 1), and never below the
+    Gaussian's.
     """
     middle, outer = np.quantile(distance, TAIL)
     logs = [-np.log(1.0 - share) for share in TAIL]

@@ -23,12 +23,19 @@ WHOLE = 0.95
 
 
 def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
-    """The tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one code are in doubt."""
+    """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one code are in doubt."""
     none = np.zeros(0, dtype=np.int64)
     if not cloud.organised:
         return MarkSet((), none, problem="codes are read from a picture, and this cloud has no pixel grid")
-    tags = _detected(cloud, dictionary)
-    codes = [code for code, _ in tags]
+    assert cloud.rgb is not None
+    grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    corners_px, found, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
+    codes = [] if found is None else found.ravel().tolist()
+    # corners (4, 2) in pixels of the grid, the centre of the first being (0, 0)
+    tags = [(code, tag.reshape(4, 2).astype(float)) for code, tag in zip(codes, corners_px, strict=True)]
     marks, off = [], 0
     for code, corners in sorted(tags, key=lambda tag: (tag[0], tag[1].tolist())):
         mark = _mark(cloud, inside, code, corners, codes.count(code) > 1)
@@ -37,19 +44,6 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
     pixels = np.unique(np.concatenate([mark.pixels for mark in marks])) if marks else none
     notes = (f"{off} tags lie off the target, or have no range",) if off else ()
     return MarkSet(tuple(marks), pixels, problem_of(marks, f"searched for tags of {dictionary}"), notes)
-
-
-def _detected(cloud: Cloud, dictionary: str) -> list[tuple[int, np.ndarray]]:
-    """Codes and (4, 2) corners, pixels of the grid, the centre of the first being (0, 0)."""
-    assert cloud.rgb is not None
-    grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    corners, codes, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
-    if codes is None:
-        return []
-    return [(int(code), tag.reshape(4, 2).astype(float)) for code, tag in zip(codes.ravel(), corners, strict=True)]
 
 
 def _mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool) -> Mark | None:
@@ -69,6 +63,14 @@ def _mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twic
     ray = centre / centre[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
     along = ray * patch.normal[2] / (patch.normal @ ray)
     covariance = spread + mean_sigma_m(cloud, pixels, patch.sigma_m) ** 2 * np.outer(along, along)
+    seen, without = len(pixels) / whole, 1.0 - cloud.valid[area > 0].mean()
+    doubt = ""
+    if twice:
+        doubt = f"code {code} is seen more than once"
+    elif seen < WHOLE and without > 1.0 - WHOLE:
+        doubt = f"without range in {100 * without:.0f} % of it"
+    elif seen < WHOLE:
+        doubt = f"{100 * (1 - seen):.0f} % of it beyond the crop's edge"
     diagonals = np.cross(places[2] - places[0], places[3] - places[1])
     return Mark(
         centre_m=centre,
@@ -77,14 +79,14 @@ def _mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twic
         pixels=pixels,
         area_m2=float(np.linalg.norm(diagonals)) / 2,
         code=code,
-        doubt=_doubt(cloud, area > 0, len(pixels) / whole, code, twice),
+        doubt=doubt,
     )
 
 
 def _corners_on(
     patch: Patch, corners: np.ndarray, pixels: np.ndarray, points_m: np.ndarray, width: int, projection: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(4, 3) the corners on the tag's plane, and (3, 2) how their mean moves with the picture's co-ordinates.
+    """Return the corners (4, 3) on the tag's plane, and (3, 2) how their mean moves with the picture's co-ordinates.
 
     The rays of the corners follow from those of the tag's pixels, whose x/z and y/z (x and y of a map) are a quadratic
     in the pixel's place to well within a hundredth of a pixel, distortion or not.
@@ -104,14 +106,3 @@ def _corners_on(
 def _quadratic(uv: np.ndarray) -> np.ndarray:
     u, v = uv.T
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-
-
-def _doubt(cloud: Cloud, area: np.ndarray, seen: float, code: int, twice: bool) -> str:
-    if twice:
-        return f"code {code} is seen more than once"
-    if seen >= WHOLE:
-        return ""
-    without = 1.0 - cloud.valid[area].mean()
-    if without > 1.0 - WHOLE:
-        return f"without range in {100 * without:.0f} % of it"
-    return f"{100 * (1 - seen):.0f} % of it beyond the crop's edge"

@@ -1,14 +1,17 @@
-"""A fiducial mark as a registration sees it: a position in the view's frame, with its covariance; and the marks that
-suffice for a registration: three or more, trusted, and not on a line."""
+"""A fiducial mark as a registration needs it: a place in the view's frame, with its covariance; the settings that say
+how marks are found; and what a registration needs of them: three or more, trusted, and not on a line."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
 
+from harness.vocabulary.config import Config
 from harness.vocabulary.units import MM
 
 LEAST_MARKS = 3
@@ -18,6 +21,43 @@ mark's place: the turn about the line would be wrong by a fifth of a radian."""
 OFF_LINE_SHARE = 0.02
 """... or less than this part of their root mean square distance along it: each millimetre that a view is wrong at a
 mark would become 50 mm at the same distance across the line."""
+
+
+class RedMarks(Config):
+    """The thesis' rule: pixels whose red channel exceeds the cropped cloud's mean by so many standard deviations."""
+
+    kind: Literal["red"] = "red"
+    deviations: float = Field(default=2.6, gt=0, le=20)
+
+
+class ColourMarks(Config):
+    """Pixels whose chromaticity stands apart from the target's own, whatever the colour, in uneven light too;
+    where that gives no three marks (black or white tape), pixels whose lightness does."""
+
+    kind: Literal["colour"] = "colour"
+
+
+class CodedMarks(Config):
+    """Printed codes (ArUco, AprilTag), found in the cloud's colour by OpenCV.
+
+    ``dictionary``: OpenCV's name of the set of codes that the tags were printed from.
+    """
+
+    kind: Literal["coded"] = "coded"
+    dictionary: str = "DICT_6X6_50"
+
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        import cv2
+
+        known = sorted(word for word in dir(cv2.aruco) if word.startswith("DICT_"))
+        if name not in known:
+            raise ValueError(f"OpenCV has no dictionary of codes '{name}'; it has {', '.join(known)}")
+        return name
+
+
+MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator="kind")]
 
 
 @dataclass(frozen=True)
@@ -53,26 +93,25 @@ class MarkSet:
 
     @property
     def trusted(self) -> tuple[Mark, ...]:
-        """The marks without a doubt."""
+        """Marks without a doubt."""
         return tuple(mark for mark in self.marks if not mark.doubt)
 
 
 def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
-    """Return the reason why no registration can rest on these marks, else empty. ``missing`` says why there are not
+    """Return why no registration can rest on these marks; empty where one can. ``missing`` says why there are not
     more."""
     trusted = [mark for mark in marks if not mark.doubt]
-    doubtful = [mark for mark in marks if mark.doubt]
-    if len(trusted) < LEAST_MARKS:
-        found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
-        counted = sorted(Counter(mark.doubt for mark in doubtful).items())
-        each = "; ".join(doubt if n == 1 else f"{doubt} ({n} times)" for doubt, n in counted)
-        doubts = f"; {len(doubtful)} more in doubt: {each}" if doubtful else ""
-        return found + doubts + (f"; {missing}" if missing else "")
-    return off_line_problem(trusted)
+    if len(trusted) >= LEAST_MARKS:
+        return off_line_problem(trusted)
+    found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+    times = sorted(Counter(mark.doubt for mark in marks if mark.doubt).items())
+    doubts = "; ".join(doubt if n == 1 else f"{doubt} ({n} times)" for doubt, n in times)
+    in_doubt = f"; {len(marks) - len(trusted)} more in doubt: {doubts}" if doubts else ""
+    return found + in_doubt + (f"; {missing}" if missing else "")
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
-    """Return the problem that the marks lie on a line, with their distance from it, else empty."""
+    """Return that the marks lie on a line, and how far off it they stray; empty where they do not."""
     places = np.stack([mark.centre_m for mark in marks])
     sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))

@@ -1,4 +1,4 @@
-"""Matching of the marks of two views: by code, or by the distances between marks, which no move changes.
+"""Matches of the marks of two views: by code, or by the distances between marks, which no move changes.
 
 Search over pairs, as in the interpretation trees of Grimson and Lozano-Perez (1987), without the tree. Two marks and
 their normals fix a placement; so each ordered pair of marks of the larger set that is as far apart as a pair of the
@@ -29,17 +29,17 @@ allows more (11 mm + 0.1 % of the distance), nearly all of which the marks of on
 DISTANCE_SIGMAS = 4.0
 """A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
-"""Chi-square limit of a matched mark's position, three degrees of freedom: a true match is lost once in 10,000."""
+"""Limit of chi^2 of a matched mark's place, three degrees of freedom: a true one is lost once in 10,000."""
 LEAST_PAIRS = 3
 GUESS_SIGMA_M = 50 * MM
-"""Error of the marks' positions by the guess, root mean square: five degrees over half a metre, and some
-centimetres."""
+"""Error of the guess at marks, root mean square: five degrees over half a metre, and some centimetres."""
 PAIR_WORTH = 3.0
 """Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
 CLEAR_ODDS = 4.5
 """Logarithm of the odds, 90 to 1, at which one placement is taken before another: two marks more without a guess."""
 FEWER = 3
 """Placements with so many pairs fewer than the best are looked for, since the guess may prefer one of them."""
+NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     """Match the marks of two views; the guess is used only to choose between placements that fit."""
     if len(reference) < LEAST_PAIRS or len(view) < LEAST_PAIRS:
         return Pairing(
-            _no_pairs(),
+            NO_PAIRS,
             f"{len(reference)} marks in the reference and {len(view)} in the view, {LEAST_PAIRS} needed in each",
         )
     if all(mark.code is not None for mark in (*reference, *view)):
@@ -65,10 +65,6 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     swapped = len(view) < len(reference)
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     return _chosen(ours, theirs, solutions, swapped, T_reference_view_guess)
-
-
-def _no_pairs() -> np.ndarray:
-    return np.zeros((0, 2), dtype=np.int64)
 
 
 def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
@@ -114,7 +110,7 @@ class _Side:
         return cls(places, np.stack([mark.normal for mark in marks]), distances, own + own.T, worst)
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(k, 3, 3) axes (columns: from i to j, across, mean normal) and (k, 3) middles of pairs of marks."""
+        """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of pairs of marks."""
         along = self.places[j] - self.places[i]
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
         normal = self.normals[i] + self.normals[j]
@@ -139,8 +135,8 @@ class _Solution:
 
 
 def _solutions(few: _Side, many: _Side) -> list[_Solution]:
-    """All placements that bring more than half of the smaller set's marks together and at most `FEWER` less than the
-    best, which comes first."""
+    """Find all placements that bring more than half of the smaller set's marks together and at most `FEWER` less than
+    the best, which comes first."""
     n = len(few.places)
     least = max(LEAST_PAIRS, n // 2 + 1)
     found: dict[tuple[int, ...], _Solution] = {}
@@ -153,12 +149,19 @@ def _solutions(few: _Side, many: _Side) -> list[_Solution]:
         if n - max(best - FEWER, least) < tried <= n // 2:
             break
     near = [solution for solution in found.values() if solution.count >= best - FEWER]
-    return _distinct(sorted(near, key=lambda s: (-s.count, s.misfit, s.partner)), few)
+    # without those that place the marks as a better one does, to within half the distance between neighbours
+    limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
+    kept: list[_Solution] = []
+    for solution in sorted(near, key=lambda s: (-s.count, s.misfit, s.partner)):
+        placed = transform_points(solution.T, few.places)
+        if all(np.linalg.norm(placed - transform_points(k.T, few.places), axis=1).max() > limit for k in kept):
+            kept.append(solution)
+    return kept
 
 
 def _pairs_in_turn(distances: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of marks of which every set of more than half of the marks holds one: disjoint ones, the longest first, and
-    of an odd number the last mark with both marks of the first pair."""
+    """Return pairs of marks of which every set of more than half of the marks holds one: disjoint ones, the longest
+    first, and of an odd number the last mark with both marks of the first pair."""
     n = len(distances)
     pairs: list[tuple[int, int]] = []
     free = set(range(n))
@@ -170,7 +173,7 @@ def _pairs_in_turn(distances: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[_Solution]:
-    """The solutions with at least so many pairs in which marks i and j of the smaller set have partners."""
+    """Find the solutions with at least so many pairs in which marks i and j of the smaller set have partners."""
     apart = np.abs(many.distances - few.distances[i, j])
     a, b = np.nonzero(
         (apart < DISTANCE_SIGMAS * np.sqrt(few.variances[i, j] + many.variances)) & ~np.eye(len(apart), dtype=bool)
@@ -183,7 +186,8 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[_Solut
         # once from the marks that the distances gave, once more from those that fitted
         if len(partner) == 0:
             return []
-        T = kabsch(np.broadcast_to(few.places, (*partner.shape, 3)), many.places[partner], _weights(few, many, partner))
+        weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
+        T = kabsch(np.broadcast_to(few.places, (*partner.shape, 3)), many.places[partner], weights)
         partner, misfit = _by_place(few, many, T)
         enough = (partner >= 0).sum(axis=1) >= least
         T, partner, misfit = T[enough], partner[enough], misfit[enough]
@@ -196,8 +200,8 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[_Solut
 def _by_distances(
     few: _Side, many: _Side, pair: tuple[int, int], partners: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """(k, n) partners, -1 for none, that lie as far from both partners (k,) of the pair as they should, on the side of
-    the line through them that the normals tell."""
+    """Return partners (k, n), -1 for none, that lie as far from both partners (k,) of the pair as they should, on the
+    side of the line through them that the normals tell."""
     consistent = np.ones((len(partners[0]), len(few.places), len(many.places)), dtype=bool)
     for mark, partner in zip(pair, partners, strict=True):
         apart = np.abs(few.distances[mark][None, :, None] - many.distances[partner][:, None, :])
@@ -218,7 +222,8 @@ def _by_distances(
 
 
 def _by_place(few: _Side, many: _Side, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(k, n) partners, -1 for none, where the transforms (k, 4, 4) bring the marks; (k,) their mean square misfit."""
+    """Return the partners (k, n), -1 for none, to which transforms (k, 4, 4) bring the marks; their mean square
+    misfit."""
     placed = np.einsum("kij,nj->kni", T[:, :3, :3], few.places) + T[:, None, :3, 3]
     square = ((placed[:, :, None, :] - many.places[None, None]) ** 2).sum(axis=-1)
     square /= few.worst[:, None] + many.worst[None]
@@ -229,37 +234,22 @@ def _by_place(few: _Side, many: _Side, T: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _mutual(cost: np.ndarray) -> np.ndarray:
-    """(k, n) of each row of costs (k, n, m) its cheapest column, where it is that column's cheapest row; else -1."""
+    """Return (k, n) of each row of costs (k, n, m) its cheapest column, where it is that column's cheapest row; else
+    -1."""
     column, row = cost.argmin(axis=2), cost.argmin(axis=1)
     back = np.take_along_axis(row, column, axis=1) == np.arange(cost.shape[1])
     finite = np.isfinite(np.take_along_axis(cost, column[..., None], axis=2)[..., 0])
     return np.where(back & finite, column, -1)
 
 
-def _weights(few: _Side, many: _Side, partner: np.ndarray) -> np.ndarray:
-    return np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
-
-
-def _distinct(solutions: list[_Solution], few: _Side) -> list[_Solution]:
-    """Drop solutions that place the marks as a better solution does, to within half the distance between neighbours."""
-    own = few.distances + np.where(np.eye(len(few.distances), dtype=bool), np.inf, 0.0)
-    limit = own.min() / 2
-    kept: list[_Solution] = []
-    for solution in solutions:
-        placed = transform_points(solution.T, few.places)
-        if all(np.linalg.norm(placed - transform_points(k.T, few.places), axis=1).max() > limit for k in kept):
-            kept.append(solution)
-    return kept
-
-
 def _chosen(
     reference: _Side, view: _Side, solutions: list[_Solution], swapped: bool, T_reference_view_guess: np.ndarray | None
 ) -> Pairing:
-    """The solution that the number of its pairs, their fit and the guess favour, if clearly."""
+    """Choose the solution that the number of its pairs, their fit and the guess favour, if clearly."""
     if not solutions:
         few = min(len(reference.places), len(view.places))
         return Pairing(
-            _no_pairs(),
+            NO_PAIRS,
             f"the distances between the marks fit nowhere: of {len(reference.places)} and {len(view.places)} marks no"
             f" {max(LEAST_PAIRS, few // 2 + 1)} lie alike; other targets, or other things taken for marks",
         )
@@ -267,24 +257,19 @@ def _chosen(
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         guessed = transform_points(T_reference_view_guess, view.places)
-        away = np.array([_rms_m(transform_points(T, view.places) - guessed) for T in T_reference_view])
+        off = np.stack([transform_points(T, view.places) for T in T_reference_view]) - guessed
+        away = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
     fit = np.array([s.count * (PAIR_WORTH - 0.5 * s.misfit) for s in solutions])
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
     first, *rest = np.argsort(-odds, kind="stable").tolist()
+    partner = solutions[first].partner
+    pairs = np.array([(mark, other) for mark, other in enumerate(partner) if other >= 0], dtype=np.int64)
+    pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
     if not rest or odds[first] - odds[rest[0]] >= CLEAR_ODDS:
-        return Pairing(_pairs(solutions[first], swapped))
+        return Pairing(pairs)
     counts = " and ".join(str(solutions[number].count) for number in (first, rest[0]))
     problem = f"the marks lie symmetrically: two placements bring {counts} of them together, and "
     if T_reference_view_guess is None:
-        return Pairing(_pairs(solutions[first], swapped), problem + "there is no guess to choose by")
+        return Pairing(pairs, problem + "there is no guess to choose by")
     between = f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} mm from the other"
-    return Pairing(_pairs(solutions[first], swapped), problem + between)
-
-
-def _rms_m(vectors_m: np.ndarray) -> float:
-    return float(np.sqrt((vectors_m**2).sum(axis=-1).mean()))
-
-
-def _pairs(solution: _Solution, swapped: bool) -> np.ndarray:
-    pairs = np.array([(mark, other) for mark, other in enumerate(solution.partner) if other >= 0], dtype=np.int64)
-    return pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
+    return Pairing(pairs, problem + between)

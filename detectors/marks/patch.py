@@ -32,25 +32,22 @@ class Patch:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,) unit normal towards the camera (z points away from it)."""
+        """Unit normal (3,) towards the camera (z points away from it)."""
         steep = np.array([self.slope_x, self.slope_y, -1.0])
-        unit: np.ndarray = steep / np.linalg.norm(steep)
-        return unit
+        return np.asarray(steep / np.linalg.norm(steep))
 
     def above_m(self, points_m: np.ndarray) -> np.ndarray:
-        """(n,) z of points (n, 3) less the plane's: positive behind it."""
+        """Return z of points (n, 3) less the plane's: positive behind it."""
         x, y, z = points_m.T
-        height: np.ndarray = z - self.slope_x * x - self.slope_y * y - self.offset_m
-        return height
+        return np.asarray(z - self.slope_x * x - self.slope_y * y - self.offset_m)
 
     def cut(self, points_m: np.ndarray, projection: str) -> np.ndarray:
-        """(n, 3) where the rays of points (n, 3) meet the plane."""
+        """Return the places (n, 3) at which the rays of points (n, 3) meet the plane."""
         x, y, z = points_m.T
         if projection == "parallel":
             return np.stack([x, y, z - self.above_m(points_m)], axis=1)
         scale = self.offset_m / (z - self.slope_x * x - self.slope_y * y)
-        met: np.ndarray = points_m * scale[:, None]
-        return met
+        return np.asarray(points_m * scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -72,15 +69,15 @@ class Spot:
     behind_sigma_m: float
 
     def covariance_m2(self, grid_covariance: np.ndarray) -> np.ndarray:
-        """(3, 3) of the centre: by the mean range along the ray, by the centroid's on the grid (2, 2) in the plane."""
+        """Return the covariance (3, 3) of the centre: by the mean range along the ray, by the centroid's on the grid
+        (2, 2) in the plane."""
         covariance = self.range_covariance_m2 + self.grid_steps_m @ grid_covariance @ self.grid_steps_m.T
-        symmetric: np.ndarray = (covariance + covariance.T) / 2
-        return symmetric
+        return np.asarray((covariance + covariance.T) / 2)
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """The plane of most of some points (n, 3): least absolute residuals, then bisquare. None where they are too few or
-    on a line. Up to a third of them may lie off it."""
+    """Fit the plane of most of some points (n, 3): least absolute residuals, then bisquare. None where they are too few
+    or on a line. Up to a third of them may lie off it."""
     points = points_m[:: max(1, len(points_m) // PATCH_POINTS)]
     if len(points) < 6:
         return None
@@ -106,16 +103,21 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
 
 
 def place_spot(cloud: Cloud, pixels: np.ndarray, weights: np.ndarray, grid: np.ndarray, patch: Patch) -> Spot:
-    """A mark's place from its pixels (n,) flat indices of points, ``weights`` (n,) 0..1 of its colour, and their
+    """Return a mark's place from its pixels (n,) flat indices of points, ``weights`` (n,) 0..1 of its colour, and their
     positions ``grid`` (n, 2) on a grid of unit step."""
     points = cloud.points_m.reshape(-1, 3)[pixels]
     own = weights > 0.5
-    behind, sigma = _offset(patch, points[own])
+    # the mean height of those points within four scales of the median
+    height = patch.above_m(points[own])
+    middle = float(np.median(height))
+    scale = max(float(np.median(np.abs(height - middle))) / 0.6745, LEAST_SCALE_M)
+    kept = height[np.abs(height - middle) <= 4.0 * scale]
+    behind, sigma = float(kept.mean()), float(max(kept.std(), scale))
     settled = replace(patch, offset_m=patch.offset_m + behind)
     on_plane = settled.cut(points, cloud.projection)
     covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
     centre = np.average(on_plane, axis=0, weights=covers)
-    jacobian = _grid_steps(on_plane - centre, grid - grid.mean(axis=0))
+    jacobian = np.linalg.lstsq(grid - grid.mean(axis=0), on_plane - centre, rcond=None)[0].T
     mean_sigma = mean_sigma_m(cloud, pixels[own], sigma)
     ray = centre / centre[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
     # a plane shifted along z by d is met further along the ray by d n_z / n.ray of it
@@ -138,19 +140,9 @@ def place_spot(cloud: Cloud, pixels: np.ndarray, weights: np.ndarray, grid: np.n
     )
 
 
-def _offset(patch: Patch, points_m: np.ndarray) -> tuple[float, float]:
-    """Return the distance of points behind the plane, the mean of those within four scales of the median; their
-    deviation."""
-    height = patch.above_m(points_m)
-    middle = float(np.median(height))
-    scale = max(float(np.median(np.abs(height - middle))) / 0.6745, LEAST_SCALE_M)
-    kept = height[np.abs(height - middle) <= 4.0 * scale]
-    return float(kept.mean()), float(max(kept.std(), scale))
-
-
 def mean_sigma_m(cloud: Cloud, pixels: np.ndarray, sigma_m: float) -> float:
-    """Standard deviation of the pixels' mean z: of what is left about the plane, or of the averaged frames' noise if
-    that is more, `CORRELATED_PIXELS` sharing one value; and of no less than the maker of a map states."""
+    """Return the standard deviation of the pixels' mean z: of what is left about the plane, or of the averaged frames'
+    noise if that is more, `CORRELATED_PIXELS` sharing one value; and of no less than the maker of a map states."""
     count = np.maximum(cloud.count.ravel()[pixels], 1)
     frames = cloud.variance_m2.ravel()[pixels] / count
     known = frames[np.isfinite(frames)]
@@ -159,9 +151,3 @@ def mean_sigma_m(cloud: Cloud, pixels: np.ndarray, sigma_m: float) -> float:
         stated = cloud.mean_variance_m2.ravel()[pixels]
         variance = max(variance, float(np.nanmean(stated)) if np.isfinite(stated).any() else 0.0)
     return float(np.sqrt(variance * min(1.0, CORRELATED_PIXELS / len(pixels))))
-
-
-def _grid_steps(on_plane_m: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """(3, 2) how the plane's points (n, 3) move with the grid's two co-ordinates (n, 2), both about their means."""
-    steps: np.ndarray = np.linalg.lstsq(grid, on_plane_m, rcond=None)[0].T
-    return steps

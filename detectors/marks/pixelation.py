@@ -1,4 +1,4 @@
-"""Error of a region's centroid on a grid of pixels: the lattice's own error, with sharp edges and no noise.
+"""The error of a region's centroid on a grid of pixels: the lattice's own, with sharp edges and no noise.
 
 A pixel belongs to the region where its centre does. Over random shifts of the lattice the error of the sum of
 f(x) = x - c over the pixels has, by Poisson's summation formula, the sum of |F(k)|^2 over all integer frequencies k but
@@ -26,7 +26,8 @@ TURNS = np.array([-1.0, 0.0, 1.0]) / 3
 
 
 def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
-    """(..., 2, 2) covariance of the centroid of the lattice points within polygons (..., n, 2), vertices in order.
+    """Return the covariance (..., 2, 2) of the centroid of the lattice points within polygons (..., n, 2), vertices in
+    order.
 
     First order in the error, so for regions of some ten pixels and more.
     """
@@ -34,12 +35,12 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
     area, centre = _area_and_centre(x)
     moments = _moment_transform(x - centre[..., None, :], np.sign(area))
     square = np.einsum("...ki,...kj->...ij", moments, moments.conj()).real
-    covariance: np.ndarray = 2.0 * REST * square / area[..., None, None] ** 2
-    return covariance
+    return np.asarray(2.0 * REST * square / area[..., None, None] ** 2)
 
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
-    """(2, 2) covariance of the centroid of a region known by its pixel positions (m, 2) alone, which are on no line.
+    """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
+    no line.
 
     Their convex outline stands for the region. How its size falls between whole pixels is unknown, and decides whether
     the errors of opposite edges add or cancel, and its slope is known to part of a step; so the covariance is the mean
@@ -53,12 +54,11 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     turns = TURNS / extent.max()
     axes = np.moveaxis(np.array([[np.cos(turns), -np.sin(turns)], [np.sin(turns), np.cos(turns)]]), -1, 0)
     outlines = ((outline - middle) * sizes[:, None, None, :]) @ axes
-    covariance: np.ndarray = centroid_covariance_px2(outlines).mean(axis=(0, 1))
-    return covariance
+    return np.asarray(centroid_covariance_px2(outlines).mean(axis=(0, 1)))
 
 
 def outline_px(pixels: np.ndarray) -> np.ndarray:
-    """(n, 2) outline of pixel positions (m, 2) that are no line, with as large an area as they have.
+    """Return the outline (n, 2) of pixel positions (m, 2) that are no line, with as large an area as they have.
 
     Where they fill their smallest rectangle that rectangle, whose long sides tell the slope of the short ones, where
     few steps are seen; else their convex hull.
@@ -75,7 +75,7 @@ def outline_px(pixels: np.ndarray) -> np.ndarray:
 
 
 def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(...,) signed areas and (..., 2) centroids of polygons (..., n, 2)."""
+    """Return signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
     following = np.roll(x, -1, axis=-2)
     cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
     area = cross.sum(axis=-1) / 2
@@ -83,7 +83,8 @@ def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _moment_transform(x: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """(..., k, 2) integral of x exp(-2 pi i k.x) over the polygons, for integer k up to `HIGHEST`, not 0, k or -k.
+    """Return the integral (..., k, 2) of x exp(-2 pi i k.x) over the polygons, for integer k up to `HIGHEST`, not 0, k
+    or -k.
 
     By the divergence theorem a sum over the edges: of the moment itself, and of the plain transform that is left over.
     """
@@ -98,15 +99,10 @@ def _moment_transform(x: np.ndarray, orientation: np.ndarray) -> np.ndarray:
     square = (k**2).sum(axis=1, keepdims=True)
     over = -2j * np.pi * square
     flat = np.sinc(phase)
-    plain = (flow * flat).sum(axis=-1, keepdims=True) / over
-    along = (flow * flat) @ middle + (flow * _sloped_sinc(phase, flat)) @ edge
-    moments: np.ndarray = along / over + plain * k / (2j * np.pi * square)
-    return moments
-
-
-def _sloped_sinc(phase: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """The integral of t exp(-2 pi i t phase) over -1/2..1/2: i / (2 pi) times the derivative of ``flat``, the sinc."""
+    # the integral of t exp(-2 pi i t phase) over -1/2..1/2: i / (2 pi) times the derivative of the sinc
     small = np.abs(phase) < 1e-4
     safe = np.where(small, 1.0, phase)
-    derivative = np.where(small, -(np.pi**2) * phase / 3, (np.cos(np.pi * safe) - flat) / safe)
-    return 0.5j / np.pi * derivative
+    sloped = 0.5j / np.pi * np.where(small, -(np.pi**2) * phase / 3, (np.cos(np.pi * safe) - flat) / safe)
+    plain = (flow * flat).sum(axis=-1, keepdims=True) / over
+    along = (flow * flat) @ middle + (flow * sloped) @ edge
+    return np.asarray(along / over + plain * k / (2j * np.pi * square))

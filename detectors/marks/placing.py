@@ -36,7 +36,8 @@ class Placement:
 
 
 def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) least-squares rigid transforms of points (..., n, 3) onto (..., n, 3), ``weights`` (..., n) >= 0.
+    """Return least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto (..., n, 3), with
+    ``weights`` (..., n) of 0 or more.
 
     The rotations are proper. Points on a line leave the turn about it undetermined, and any is given.
     """
@@ -56,7 +57,7 @@ def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndar
 def place(
     from_m: np.ndarray, from_covariance_m2: np.ndarray, to_m: np.ndarray, to_covariance_m2: np.ndarray
 ) -> Placement:
-    """The most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3, 3), n >= 3.
+    """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3, 3), n >= 3.
 
     Raises numpy.linalg.LinAlgError where the points leave it undetermined (two, or all on a line).
     """
@@ -66,11 +67,15 @@ def place(
     converged, steps = False, 0
     while not converged and steps < MAX_STEPS:
         steps += 1
+        rotation = T[:3, :3]
         residuals, weight = _residuals(T, from_m, from_covariance_m2, to_m, to_covariance_m2)
         jacobian = displacement_jacobian(residuals + to_m, centre)
         information = np.einsum("nki,nkl,nlj->ij", jacobian, weight, jacobian)
         move = -np.linalg.solve(information, np.einsum("nki,nkl,nl->i", jacobian, weight, residuals))
-        T = _moved(T, move, centre)
+        # a turn by the vector move[:3] about the centre, and a shift by move[3:]
+        turn, shift = cv2.Rodrigues(move[:3])[0], T[:3, 3] - centre
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = turn @ rotation, turn @ shift + centre + move[3:]
         converged = bool(np.abs(jacobian @ move).max() < SMALL_STEP_M)
     residuals, weight = _residuals(T, from_m, from_covariance_m2, to_m, to_covariance_m2)
     chi2 = float(np.einsum("ni,nij,nj->", residuals, weight, residuals))
@@ -81,16 +86,7 @@ def place(
 def _residuals(
     T: np.ndarray, from_m: np.ndarray, from_covariance: np.ndarray, to_m: np.ndarray, to_covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) mapped less partner, and (n, 3, 3) the inverse of its covariance."""
+    """Return mapped less partner (n, 3), and the inverse of its covariance (n, 3, 3)."""
     rotation = T[:3, :3]
     residuals = from_m @ rotation.T + T[:3, 3] - to_m
     return residuals, np.linalg.inv(to_covariance + rotation @ from_covariance @ rotation.T)
-
-
-def _moved(T: np.ndarray, move: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """The transform followed by a turn by the vector ``move[:3]`` about the centre and a shift by ``move[3:]``."""
-    turn, _ = cv2.Rodrigues(move[:3])
-    moved = np.eye(4)
-    moved[:3, :3] = turn @ T[:3, :3]
-    moved[:3, 3] = turn @ (T[:3, 3] - centre_m) + centre_m + move[3:]
-    return moved
