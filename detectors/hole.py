@@ -120,7 +120,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Patch:
+class HolePatch:
     """Residuals around one detection. ``residual_m`` (h, w), ``used`` (h, w) bool; pixel (0, 0) is the patch's corner.
 
     ``metric_m2`` (2, 2): squared length on the surface of a pixel offset (du, dv) is its quadratic form. ``noise_m``:
@@ -311,7 +311,7 @@ def blurred_disc(
     return image
 
 
-def blurred_hole(patch: Patch, hole: np.ndarray) -> np.ndarray:
+def blurred_hole(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
     """Return the residual (h, w) of a hole (u, v, radius, depth, wall) without offset.
 
     Depth along the optical axis, wall in 0..1. Where the depth is negative (something before the surface) a disc.
@@ -321,7 +321,7 @@ def blurred_hole(patch: Patch, hole: np.ndarray) -> np.ndarray:
     return image
 
 
-def derivatives(patch: Patch, hole: np.ndarray, image: np.ndarray) -> np.ndarray:
+def derivatives(patch: HolePatch, hole: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Return the derivatives (5, h, w) of `blurred_hole`, whose value is ``image``, by u, v, radius, depth and wall, by
     differences."""
     by = np.empty((len(hole), *patch.shape))
@@ -389,7 +389,7 @@ def _products(
     return products
 
 
-def fit_hole(patch: Patch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
+def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
     """Fit by least squares from a start, by Levenberg's and Marquardt's way (MINPACK's), with `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2). The fourth is the hole's
@@ -442,7 +442,7 @@ def fit_hole(patch: Patch, u: float, v: float, radius_m: float, depth_m: float, 
     return HoleFit(u, v, radius, depth, offset, wall, covariance, outcome in (1, 2, 3, 4))
 
 
-def sandwich_covariance(patch: Patch, hole: np.ndarray, offset_m: float) -> np.ndarray:
+def sandwich_covariance(patch: HolePatch, hole: np.ndarray, offset_m: float) -> np.ndarray:
     """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) of the least-squares fit under correlated
     noise, where the fit gave a hole (u, v, radius, depth, wall) and an offset.
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.hole import HoleFit, Patch, Sight, blurred_disc, crossed, fit_hole
+from detectors.hole import HoleFit, HolePatch, Sight, blurred_disc, crossed, fit_hole
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, quantile_of, sigma_of
@@ -141,7 +141,7 @@ class _Surroundings:
     ``origin_m`` is the surface's point at patch pixel (``u0``, ``v0``), ``per_px_m`` (2, 3) its derivatives by u and v.
     """
 
-    patch: Patch
+    patch: HolePatch
     own: np.ndarray
     invalid: np.ndarray
     offset_m: float
@@ -184,7 +184,7 @@ class _Surroundings:
         sign = 1.0 if deviations.sum() >= 0 else -1.0
         peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
         metric = plane[1] @ plane[1].T
-        patch = Patch(residual, used, metric, sides, noise, _sight(cloud, *plane, np.array(config.emitter_mm) * MM))
+        patch = HolePatch(residual, used, metric, sides, noise, _sight(cloud, *plane, np.array(config.emitter_mm) * MM))
         invalid = ~np.isfinite(cloud.points_m[cut][..., 2])
         v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
         return cls(patch, own, invalid, offset, sign, peak, u0, v0, plane[0], plane[1])

@@ -136,7 +136,7 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
         start = _lts_start(problem.sample(LTS_SAMPLE) or problem)
         solution = _bisquare(problem, start, "bisquare from a FAST-LTS start")
     else:
-        solution = _Solution(problem.least_squares, 1, True, "least squares")
+        solution = _SurfaceSolution(problem.least_squares, 1, True, "least squares")
     coefficients = solution.coefficients.copy()
     coefficients[0] += middle
     method, iterations, converged = config.method, solution.iterations, solution.converged
@@ -144,7 +144,7 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
 
 
 @dataclass(frozen=True)
-class _Solution:
+class _SurfaceSolution:
     coefficients: np.ndarray
     iterations: int
     converged: bool
@@ -188,7 +188,7 @@ def _weighted(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np
 # ---------------------------------------------------------------- least absolute residuals
 
 
-def _lar(problem: _Problem) -> _Solution:
+def _lar(problem: _Problem) -> _SurfaceSolution:
     """Find the L1 solution by smoothing (Madsen and Nielsen 1993): Huber's function with a knee that shrinks, by
     Newton.
 
@@ -218,13 +218,13 @@ def _lar(problem: _Problem) -> _Solution:
         if gap <= GAP_CONVERGED:
             break
     note = f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
-    return _Solution(c, iterations, gap <= GAP_CONVERGED, note)
+    return _SurfaceSolution(c, iterations, gap <= GAP_CONVERGED, note)
 
 
 # ---------------------------------------------------------------- bisquare
 
 
-def _bisquare(problem: _Problem, start: np.ndarray | None, note: str) -> _Solution:
+def _bisquare(problem: _Problem, start: np.ndarray | None, note: str) -> _SurfaceSolution:
     """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points; from the
     least-squares solution where no ``start`` is given."""
     sample = problem.sample(SAMPLE_POINTS)
@@ -232,10 +232,10 @@ def _bisquare(problem: _Problem, start: np.ndarray | None, note: str) -> _Soluti
         return _reweighted(problem, problem.least_squares if start is None else start, 50, note)
     inner = _reweighted(sample, sample.least_squares if start is None else start, 50, note)
     full = _reweighted(problem, inner.coefficients, 8, note)
-    return _Solution(full.coefficients, inner.iterations + full.iterations, full.converged, note)
+    return _SurfaceSolution(full.coefficients, inner.iterations + full.iterations, full.converged, note)
 
 
-def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> _Solution:
+def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> _SurfaceSolution:
     inverse = np.linalg.inv(problem.factor)
     leverage = np.minimum(kernels.leverages(problem.basis, inverse), 0.9999)
     adjust = 1.0 / np.sqrt(1.0 - leverage)
@@ -248,14 +248,14 @@ def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> 
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
         found = _weighted(problem.basis, problem.z, kernels.bisquare_weights(adjusted, BISQUARE_TUNING * scale))
         if found is None:
-            return _Solution(c, step, False, note + "; stopped: too few points kept weight")
+            return _SurfaceSolution(c, step, False, note + "; stopped: too few points kept weight")
         factor, new = found
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
         if moved < BISQUARE_CONVERGED * np.sqrt(terms):
-            return _Solution(c, step, True, note)
-    return _Solution(c, steps, False, note)
+            return _SurfaceSolution(c, step, True, note)
+    return _SurfaceSolution(c, steps, False, note)
 
 
 # ---------------------------------------------------------------- least trimmed squares

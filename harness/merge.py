@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 @dataclass
-class Merged:
+class MergedShards:
     """Counts of trials that were copied, and that were there. Of the latter, ``alike`` differ in last digits, and those
     with the keys ``different`` in more; ``damaged``: lines and files of journals that were left out."""
 
@@ -53,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
     from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
 
     _refuse_others(options.folders, options.into)
-    merged = Merged()
+    merged = MergedShards()
     declared = next((path for folder in options.folders if (path := folder / "experiment.yaml").is_file()), None)
     if declared is None:
         raise UserError(f"{options.folders[0]}: has no experiment.yaml", fix="name folders as sweeps leave them")
@@ -68,7 +68,7 @@ def _run(options: argparse.Namespace) -> int:
     return _told(merged, into)
 
 
-def merge_into(into: Journal, other: Journal, merged: Merged) -> None:
+def merge_into(into: Journal, other: Journal, merged: MergedShards) -> None:
     """Copy what ``into`` lacks, or has not done. Raises UserError where a newer tofpod wrote either."""
     for key, entry in other.entries():
         known = into.read(key)
@@ -137,7 +137,7 @@ def _refuse_others(folders: list[Path], into: Path) -> None:
         )
 
 
-def _told(merged: Merged, into: Journal) -> int:
+def _told(merged: MergedShards, into: Journal) -> int:
     print(f"{into.folder}: {merged.copied} trials copied, {merged.known} were there")
     if merged.damaged:
         some = ", ".join(merged.damaged[:3])

@@ -254,7 +254,10 @@ def test_views_without_overlap_are_refused(
         (("--register", "marks", "--quiet-capture", "x"), "--quiet-capture is one cloud"),
         (("--register", "marks", "--poses", "nowhere"), "nowhere: cannot be read"),
         (("--register", "marks", "--set", "mapping.merge.cell=1"), "unknown key `cell` in `mapping.merge`"),
-        (("--register", "marks", "--set", "mapping.registration.tolerance=1"), "unknown key `tolerance` in `mapping.registration`"),
+        (
+            ("--register", "marks", "--set", "mapping.registration.tolerance=1"),
+            "unknown key `tolerance` in `mapping.registration`",
+        ),
         (("--register", "marks", "--set", "surface.degre=1"), "unknown key `degre` in `surface`"),
         (("--register", "marks", "--crop", "box:0,1,0,1,0,1"), "view view_0: the crop box"),
         (("--register", "marks", "--threshold", "0"), "above 0"),

@@ -21,7 +21,7 @@ from harness.engine.shard import Shard
 from harness.engine.trial import TrialTask
 from harness.engine.work import Ended, Job, Outcome, Stage, State
 from harness.experiment.load import load_experiment
-from harness.merge import Merged, merge_into
+from harness.merge import MergedShards, merge_into
 
 STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
 
@@ -228,7 +228,7 @@ def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Pat
     into = Journal(home / "into")
     for number, own in ((1, 1.0), (2, factor)):
         go(plan, home / str(number), Pretended(factor=own), shard=Shard(number, 2))
-        merged = Merged()
+        merged = MergedShards()
         merge_into(into, Journal(home / str(number)), merged)
         assert not merged.different or factor == 1.01
     return home / "into"

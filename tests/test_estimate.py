@@ -107,7 +107,7 @@ def test_the_region_is_the_renders_own(tmp_path, name):
 # ---------------------------------------------------------------- what is there
 
 
-def counted(what: SweepPlan, journal: Journal, rates: Rates | None = None, **options: Any) -> estimates.Estimate:
+def counted(what: SweepPlan, journal: Journal, rates: Rates | None = None, **options: Any) -> estimates.SweepEstimate:
     return estimate(what, 3, journal, rates or Rates(), EngineOptions(**options))
 
 

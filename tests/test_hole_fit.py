@@ -13,7 +13,7 @@ from detectors.hole import (
     IMAGES,
     TOLERANCE,
     WALL_PRIOR,
-    Patch,
+    HolePatch,
     Sight,
     blurred_hole,
     correlated_products,
@@ -27,19 +27,19 @@ PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
 
 
-def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> Patch:
+def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> HolePatch:
     """A hole seen by a camera that averages over 5 x 5 pixels, with the noise that this leaves."""
     random = np.random.default_rng(seed)
     shape = (34, 37)
     used = random.random(shape) > 0.02
     sight = Sight.of(CENTRE_M, PER_PX_M, np.array([-14e-3, 0.0, 1e-3]))
-    blank = Patch(np.zeros(shape), used, PER_PX_M @ PER_PX_M.T, (5.0, 5.0), noise_m, sight)
+    blank = HolePatch(np.zeros(shape), used, PER_PX_M @ PER_PX_M.T, (5.0, 5.0), noise_m, sight)
     noise = cv2.blur(random.standard_normal(shape), (5, 5)) * 5.0 * noise_m
     residual = np.where(used, blurred_hole(blank, hole) + noise + 1e-4, np.nan)
-    return Patch(residual, used, blank.metric_m2, blank.blur_px, noise_m, sight)
+    return HolePatch(residual, used, blank.metric_m2, blank.blur_px, noise_m, sight)
 
 
-def by_minpack(patch: Patch, start: tuple[float, float, float, float, float]) -> tuple[np.ndarray, float, bool]:
+def by_minpack(patch: HolePatch, start: tuple[float, float, float, float, float]) -> tuple[np.ndarray, float, bool]:
     """(hole, offset, converged) by the same least squares, written plainly, with scipy's MINPACK."""
     u, v, radius_m, depth_m, offset_m = start
     weight = patch.noise_m * math.sqrt(patch.blur_px[0] * patch.blur_px[1]) / WALL_PRIOR[1]
@@ -90,7 +90,7 @@ def test_the_fit_is_that_of_the_plainly_written_least_squares(radius_mm: float, 
 
 def test_a_hopeless_start_is_told_and_not_looped_over() -> None:
     patch = patch_of(np.array([18.3, 16.4, 3e-3, 0.01, 0.6]), 1.5e-4, 0)
-    flat = Patch(np.where(patch.used, 1e-4, np.nan), patch.used, patch.metric_m2, (5.0, 5.0), 1.5e-4, patch.sight)
+    flat = HolePatch(np.where(patch.used, 1e-4, np.nan), patch.used, patch.metric_m2, (5.0, 5.0), 1.5e-4, patch.sight)
     fit = fit_hole(flat, 1000.0, -1000.0, 50.0, 0.1, 0.0)
     assert np.isfinite([fit.u_px, fit.v_px, fit.radius_m]).all()
 

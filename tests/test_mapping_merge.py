@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from detectors.mapping.depth_noise import noise_of
 from detectors.mapping.merge import merge
-from detectors.mapping.raster import Grid, raster_of_grid, raster_of_points
+from detectors.mapping.raster import CellGrid, raster_of_grid, raster_of_points
 from detectors.mapping.settings import FusedMerge, GridMerge, VolumeMerge
 from detectors.views import PreparedView
 from harness.vocabulary.capture import Cloud, LeftOut
@@ -247,7 +247,7 @@ def test_triangles_reproduce_what_is_linear(seed: int, step: float, parts: int) 
     places += 0.2 * rng.uniform(-1, 1, places.shape)
     slope = rng.uniform(-2, 2, 2)
     values = places @ slope + 3.0
-    grid = Grid(1.0, 1.0, step, (int(8 / step), int(8 / step)))
+    grid = CellGrid(1.0, 1.0, step, (int(8 / step), int(8 / step)))
     fine = grid.finer(parts)
     flat_places, valid = places.reshape(-1, 2), np.ones(v.size, dtype=bool)
     for raster in (raster_of_grid(places, valid.reshape(v.shape), fine), raster_of_points(flat_places, valid, fine)):
@@ -270,7 +270,7 @@ def test_concentration_is_the_variance_of_white_noise() -> None:
     places = np.stack([u, v], axis=-1)
     rng = np.random.default_rng(0)
     for parts, step in ((1, 0.93), (2, 2.1), (3, 2.9)):
-        grid = Grid(3.2, 3.1, step, (int(30 / step), int(30 / step)))
+        grid = CellGrid(3.2, 3.1, step, (int(30 / step), int(30 / step)))
         raster = replace(raster_of_grid(places, np.ones((40, 40), bool), grid.finer(parts)), parts=parts)
         drawn = np.stack([raster.at_cells(rng.standard_normal(1600)) for _ in range(400)])
         np.testing.assert_allclose((drawn.var(axis=0) / raster.concentration).mean(), 1.0, rtol=0.02)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from detectors.hole import Patch, Sight, blurred_disc, blurred_hole, derivatives
+from detectors.hole import HolePatch, Sight, blurred_disc, blurred_hole, derivatives
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, extents, measure_detection
 from harness.vocabulary.capture import Cloud
@@ -151,7 +151,7 @@ def measured(board: Board, sigma_mm: float, seed: int, threshold: float = 5.0) -
     return measure_detection(cloud, evidence, strongest(cloud, evidence, threshold), HoleModelConfig())
 
 
-def patch_of(board: Board) -> tuple[Patch, np.ndarray]:
+def patch_of(board: Board) -> tuple[HolePatch, np.ndarray]:
     """The whole picture as a patch, and the true hole (u, v, radius, depth, wall 0.6) in it."""
     u, v = board.centre[:2] / board.centre[2] * FOCAL_PX + board.middle - np.array([REGION.col0, REGION.row0])
     per_px = np.stack(
@@ -160,7 +160,7 @@ def patch_of(board: Board) -> tuple[Patch, np.ndarray]:
     per_px *= 2
     used = np.ones((HEIGHT, WIDTH), dtype=bool)
     sight = Sight.of(board.centre, per_px, board.emitter)
-    patch = Patch(board.image, used, per_px @ per_px.T, (board.blur, board.blur), 1e-4, sight)
+    patch = HolePatch(board.image, used, per_px @ per_px.T, (board.blur, board.blur), 1e-4, sight)
     return patch, np.array([u, v, board.radius, board.depth_m, 0.6])
 
 

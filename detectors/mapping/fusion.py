@@ -22,7 +22,7 @@ from detectors.mapping.chosen_views import ChosenView
 from detectors.mapping.combine import Combined, combine
 from detectors.mapping.depth_noise import noise_of
 from detectors.mapping.placing import PlacedView, T_reference_map_of, common_surface, grid_over, place
-from detectors.mapping.raster import Grid
+from detectors.mapping.raster import CellGrid
 from detectors.mapping.surface_map import SurfaceMap
 from detectors.surface import Surface, SurfaceConfig, fit_surface
 from harness.vocabulary.capture import MapViews
@@ -39,12 +39,12 @@ class _Sheet:
     """The surface on the map's cells. ``points_m`` (h, w, 3) and ``gradient`` (h, w, 3): (-dz/dx, -dz/dy, 1), whose
     product with a small displacement is the change of height along z."""
 
-    grid: Grid
+    grid: CellGrid
     points_m: np.ndarray
     gradient: np.ndarray
 
     @classmethod
-    def of(cls, grid: Grid, surface: Surface) -> _Sheet:
+    def of(cls, grid: CellGrid, surface: Surface) -> _Sheet:
         x, y = np.meshgrid(grid.x, grid.y)
         z = surface.evaluate(x, y)
         by_x = (surface.evaluate(x + grid.step, y) - z) / grid.step

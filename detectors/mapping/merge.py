@@ -1,4 +1,4 @@
-"""From views to one cloud: prepare, register, and merge by the method that the settings name."""
+"""The way from views to one cloud: prepare, register, and merge by the method that the settings name."""
 
 from __future__ import annotations
 

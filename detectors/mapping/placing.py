@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from detectors.mapping.chosen_views import ChosenView
-from detectors.mapping.raster import Grid, Raster, raster_between
+from detectors.mapping.raster import CellGrid, Raster, raster_between
 from detectors.surface import Surface, SurfaceConfig, fit_surface
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, transform_points
@@ -45,7 +45,7 @@ class PlacedView:
         """(h, w) bool: pixels of the target."""
         return np.isfinite(self.deviation_m)
 
-    def raster(self, grid: Grid) -> Raster:
+    def raster(self, grid: CellGrid) -> Raster:
         """Return the position of the grid's cells among this view's pixels."""
         return raster_between(self.places_m, self.inside, self.chosen.cloud.organised, self.pitch_m, grid)
 
@@ -127,7 +127,7 @@ def _pixel(places: np.ndarray, inside: np.ndarray, organised: bool) -> tuple[np.
     return np.array([pitch, pitch]), pitch
 
 
-def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> Grid:
+def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     """Cells over all that any view sees, at whole multiples of the cell (none: the first view's pitch).
 
     Raises UserError where that would be more than `MAX_CELLS`.
@@ -144,4 +144,4 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> Grid:
             legal=f"up to {MAX_CELLS:.2g} cells",
             fix="crop the views to the target, or give a larger merge.cell_mm",
         )
-    return Grid(float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns)))
+    return CellGrid(float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns)))

@@ -21,7 +21,7 @@ SLACK = 1e-9
 
 
 @dataclass(frozen=True)
-class Grid:
+class CellGrid:
     """Cells centred at (``x0`` + column * ``step``, ``y0`` + row * ``step``)."""
 
     x0: float
@@ -43,11 +43,11 @@ class Grid:
         """Places (..., 2) as column and row, not rounded."""
         return np.ascontiguousarray((places - np.array([self.x0, self.y0])) / self.step)
 
-    def finer(self, parts: int) -> Grid:
+    def finer(self, parts: int) -> CellGrid:
         """Each cell divided into ``parts`` x ``parts``."""
         step = self.step / parts
         inset = 0.5 * (self.step - step)
-        return Grid(self.x0 - inset, self.y0 - inset, step, (self.shape[0] * parts, self.shape[1] * parts))
+        return CellGrid(self.x0 - inset, self.y0 - inset, step, (self.shape[0] * parts, self.shape[1] * parts))
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Raster:
         return np.where(2 * known.sum(axis=(1, 3)) >= self.parts**2, means, np.nan)
 
 
-def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: Grid) -> Raster:
+def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid) -> Raster:
     """The cells of a grid among the valid of samples at ``places`` (v, u, 2), on a pixel grid or not (then v = 1).
 
     ``spacing`` of the samples: cells are divided until they are no larger.
@@ -101,7 +101,7 @@ def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spaci
     return Raster(raster.corners, raster.shares, parts)
 
 
-def raster_of_grid(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raster:
+def raster_of_grid(places: np.ndarray, valid: np.ndarray, grid: CellGrid) -> Raster:
     """The cells of a grid among samples on a pixel grid with ``places`` (v, u, 2).
 
     Two triangles for each four neighbours; of four with one invalid the one that is left.
@@ -111,7 +111,7 @@ def raster_of_grid(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raster:
     return Raster(corners, shares)
 
 
-def raster_of_points(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raster:
+def raster_of_points(places: np.ndarray, valid: np.ndarray, grid: CellGrid) -> Raster:
     """Do the same as `raster_of_grid` for samples ``places`` (n, 2) without a grid: Delaunay's triangles with short
     edges."""
     from scipy.spatial import Delaunay
@@ -126,7 +126,7 @@ def raster_of_points(places: np.ndarray, valid: np.ndarray, grid: Grid) -> Raste
     return Raster(corners, shares)
 
 
-def _empty(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _empty(grid: CellGrid) -> tuple[np.ndarray, np.ndarray]:
     return np.full((*grid.shape, 3), -1, dtype=np.int64), np.zeros((*grid.shape, 3))
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from detectors.mapping.chosen_views import ChosenView
 from detectors.mapping.placing import T_reference_map_of, common_surface
-from detectors.mapping.raster import Grid, raster_between
+from detectors.mapping.raster import CellGrid, raster_between
 from detectors.open3d_library import open3d_on_one_thread
 from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
@@ -79,7 +79,7 @@ def _undistorted(view: ChosenView) -> _Pinhole:
     step = view.slope_step / OVERSAMPLING
     low, high = slopes[inside].min(axis=0), slopes[inside].max(axis=0)
     columns, rows = np.floor((high - low) / step).astype(int) + 1
-    grid = Grid(float(low[0]), float(low[1]), step, (int(rows), int(columns)))
+    grid = CellGrid(float(low[0]), float(low[1]), step, (int(rows), int(columns)))
     raster = raster_between(slopes, inside, cloud.organised, step, grid)
     z = np.nan_to_num(raster.at_cells(cloud.points_m[..., 2].reshape(-1))).astype(np.float32)
     rgb = None if cloud.rgb is None else raster.at_cells(cloud.rgb.reshape(-1, 3).astype(np.float64))

@@ -31,7 +31,7 @@ RESULTS_RECORD_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SweepEstimate:
     """Counts of what there is to do; seconds of work by stage, and by the clock on so many processes; bytes.
 
     ``renders``: distinct views of the whole plan, ``cached`` of them stored, ``to_render`` needed by trials that are
@@ -111,7 +111,7 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     return 0
 
 
-def estimate(plan: SweepPlan, points: int, journal: Journal, rates: Rates, options: EngineOptions) -> Estimate:
+def estimate(plan: SweepPlan, points: int, journal: Journal, rates: Rates, options: EngineOptions) -> SweepEstimate:
     """Count the finished trials of a plan (or of a shard of it), and estimate the rest."""
     missing, total, is_known = _missing(plan, options.shard, journal, options.retry_failed)
     jobs = 1 if options.serial else options.jobs
@@ -122,7 +122,7 @@ def estimate(plan: SweepPlan, points: int, journal: Journal, rates: Rates, optio
     render_s, trial_s = _seconds(rates, "renders", renders), _seconds(rates, "trials", trials)
     found_bytes = sum(one.size_bytes * rates.ratio("records", one.kind) for one in trials)
     count = sum(count for _, count in missing)
-    return Estimate(
+    return SweepEstimate(
         points=points,
         groups=len(plan.groups),
         renders=len(plan.renders),

@@ -25,7 +25,7 @@ CONDITIONS = tuple(dict.fromkeys(name for each in QUANTITIES.values() for name i
 
 
 @dataclass(frozen=True)
-class Column:
+class ScoreColumn:
     """A column: ``name`` in files and ``label`` on pages and terminals, either may be empty. ``value``: a path of a
     row's attributes, or a function of the row; ``text``: a value on a page; ``spread``: values are mappings, each key a
     column of its own."""
@@ -49,12 +49,12 @@ def _cell(value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Table:
+class ScoreTable:
     """A result table. ``note``: the meaning of a row."""
 
     name: str
     note: str
-    columns: tuple[Column, ...]
+    columns: tuple[ScoreColumn, ...]
 
     def write(self, folder: Path, rows: Sequence[Any]) -> None:
         """Write the table as CSV; empty where a value is unknown, floats with nine digits."""
@@ -151,87 +151,93 @@ def _or_dash(text: str) -> str:
     return text or "–"
 
 
-def _reading(name: str, label: str, low: str, high: str, note: str, head: str = "95 % interval") -> tuple[Column, ...]:
+def _reading(
+    name: str, label: str, low: str, high: str, note: str, head: str = "95 % interval"
+) -> tuple[ScoreColumn, ...]:
     """A reading: its value and its interval's ends in three columns of a file, and in two of a page."""
     return (
-        Column(name, label, f"{name}.value", note, number),
-        Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),
-        Column(high, "", f"{name}.interval.high", "upper end of its 95 % interval"),
-        Column("", head, f"{name}.interval", "", interval),
+        ScoreColumn(name, label, f"{name}.value", note, number),
+        ScoreColumn(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),
+        ScoreColumn(high, "", f"{name}.interval.high", "upper end of its 95 % interval"),
+        ScoreColumn("", head, f"{name}.interval", "", interval),
     )
 
 
-_VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
+_VERSION = ScoreColumn("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
 
-SCORES = Table(
+SCORES = ScoreTable(
     "scorecard",
     "one row per published figure",
     (
-        Column("name", "", "figure.name", "name in the file of figures"),
-        Column("camera", "camera", "figure.entry.camera", "simulated camera"),
-        Column("", "figure", lambda score: score.figure.what()),
-        Column("quantity", "", "figure.entry.quantity", "quantity that is measured"),
-        Column("unit", "", "figure.quantity.unit", "unit of all values"),
-        Column("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
+        ScoreColumn("name", "", "figure.name", "name in the file of figures"),
+        ScoreColumn("camera", "camera", "figure.entry.camera", "simulated camera"),
+        ScoreColumn("", "figure", lambda score: score.figure.what()),
+        ScoreColumn("quantity", "", "figure.entry.quantity", "quantity that is measured"),
+        ScoreColumn("unit", "", "figure.quantity.unit", "unit of all values"),
+        ScoreColumn("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
         *_reading("simulated", "simulated", "low", "high", "simulated value"),
-        Column("published", "published", lambda score: score.figure.entry.published.in_words(), "published value"),
-        Column(
+        ScoreColumn("published", "published", lambda score: score.figure.entry.published.in_words(), "published value"),
+        ScoreColumn(
             "tolerance",
             "tolerance",
             "figure.entry.published.tolerance",
             "how far beyond it the simulated value may lie",
             lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
         ),
-        Column("", "unit", "figure.quantity.unit", "", _or_dash),
-        Column("passes_from", "", lambda score: score.figure.entry.published.limits[0], "lowest value that passes"),
-        Column("passes_to", "", lambda score: score.figure.entry.published.limits[1], "highest value that passes"),
-        Column(
+        ScoreColumn("", "unit", "figure.quantity.unit", "", _or_dash),
+        ScoreColumn(
+            "passes_from", "", lambda score: score.figure.entry.published.limits[0], "lowest value that passes"
+        ),
+        ScoreColumn("passes_to", "", lambda score: score.figure.entry.published.limits[1], "highest value that passes"),
+        ScoreColumn(
             "verdict",
             "verdict",
             "verdict",
             "whether the simulated value passes",
         ),
-        Column(
+        ScoreColumn(
             "passed_before",
             "",
             "passed_before",
             "whether it passed in the baseline, empty where that does not know it",
         ),
-        Column("calibration", "", "figure.entry.calibration", "whether the camera's file was, or may be, fitted to it"),
-        Column("", "use", lambda score: "calibration" if score.figure.entry.calibration else "test"),
-        Column("tag", "", "figure.entry.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
-        Column("source", "", "figure.entry.source", "source of the published value"),
-        Column("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
-        Column("note", "note", "figure.entry.note", "what was assumed"),
+        ScoreColumn(
+            "calibration", "", "figure.entry.calibration", "whether the camera's file was, or may be, fitted to it"
+        ),
+        ScoreColumn("", "use", lambda score: "calibration" if score.figure.entry.calibration else "test"),
+        ScoreColumn("tag", "", "figure.entry.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
+        ScoreColumn("source", "", "figure.entry.source", "source of the published value"),
+        ScoreColumn("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
+        ScoreColumn("note", "note", "figure.entry.note", "what was assumed"),
         _VERSION,
     ),
 )
-CURVES = Table(
+CURVES = ScoreTable(
     "curves",
     "one row per point of a curve",
     (
-        Column("curve", "", "point.curve", "picture that it belongs to"),
-        Column("camera", "", "camera", "simulated camera"),
-        Column("quantity", "", "point.quantity", "quantity that is measured"),
-        Column("unit", "", lambda row: QUANTITIES[row.point.quantity].unit, "unit of the value"),
-        Column("conditions", "", lambda row: _conditions(row.point.conditions), "conditions", spread=True),
+        ScoreColumn("curve", "", "point.curve", "picture that it belongs to"),
+        ScoreColumn("camera", "", "camera", "simulated camera"),
+        ScoreColumn("quantity", "", "point.quantity", "quantity that is measured"),
+        ScoreColumn("unit", "", lambda row: QUANTITIES[row.point.quantity].unit, "unit of the value"),
+        ScoreColumn("conditions", "", lambda row: _conditions(row.point.conditions), "conditions", spread=True),
         *_reading("simulated", "", "low", "high", "simulated value")[:3],
         _VERSION,
     ),
 )
-BESIDE = Table(
+BESIDE = ScoreTable(
     "capture",
     "one row per number of a capture beside its simulation",
     (
-        Column("where", "where", "where", "plane or edge"),
-        Column("quantity", "quantity", "quantity", "quantity that is measured"),
-        Column("at", "at", "at", "condition"),
-        Column("unit", "", "unit", "unit of the values"),
-        Column("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
+        ScoreColumn("where", "where", "where", "plane or edge"),
+        ScoreColumn("quantity", "quantity", "quantity", "quantity that is measured"),
+        ScoreColumn("at", "at", "at", "condition"),
+        ScoreColumn("unit", "", "unit", "unit of the values"),
+        ScoreColumn("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
         *_reading("measured", "measured", "measured_low", "measured_high", "measured on the capture", "95 %"),
         *_reading("simulated", "simulated", "simulated_low", "simulated_high", "measured on its simulation", "95 %"),
-        Column("", "ratio", "ratio", "", lambda ratio: f"{ratio:.2f}" if np.isfinite(ratio) else "–"),
-        Column("", "unit", "unit", "", _or_dash),
+        ScoreColumn("", "ratio", "ratio", "", lambda ratio: f"{ratio:.2f}" if np.isfinite(ratio) else "–"),
+        ScoreColumn("", "unit", "unit", "", _or_dash),
         _VERSION,
     ),
 )

@@ -32,7 +32,7 @@ AGAIN = "run the study again, which writes the file anew; it is not made to be e
 
 
 @dataclass(frozen=True)
-class Column:
+class StoredColumn:
     """A column of a table: an array in memory, a list of ``value`` in JSON, where null stands for NaN."""
 
     dtype: type
@@ -88,13 +88,13 @@ Number = Annotated[Whole, Field(ge=0, le=2**53)]
 Name = Annotated[str, Strict(), Field(min_length=1)]
 Size = Annotated[Real, Field(gt=0)]
 RealOrNull = Real | None
-Counts = Annotated[np.ndarray, Column(int, Number)]
-Names = Annotated[np.ndarray, Column(str, Name), Field(min_length=1)]
-Sizes = Annotated[np.ndarray, Column(float, Size)]
-Depths = Annotated[np.ndarray, Column(float, Annotated[Real, Field(ge=0)])]
-Numbers = Annotated[np.ndarray, Column(float, Real)]
-NumbersOrNull = Annotated[np.ndarray, Column(float, RealOrNull)]
-Truths = Annotated[np.ndarray, Column(bool, Annotated[bool, Strict()])]
+Counts = Annotated[np.ndarray, StoredColumn(int, Number)]
+Names = Annotated[np.ndarray, StoredColumn(str, Name), Field(min_length=1)]
+Sizes = Annotated[np.ndarray, StoredColumn(float, Size)]
+Depths = Annotated[np.ndarray, StoredColumn(float, Annotated[Real, Field(ge=0)])]
+Numbers = Annotated[np.ndarray, StoredColumn(float, Real)]
+NumbersOrNull = Annotated[np.ndarray, StoredColumn(float, RealOrNull)]
+Truths = Annotated[np.ndarray, StoredColumn(bool, Annotated[bool, Strict()])]
 FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
