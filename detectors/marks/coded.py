@@ -33,7 +33,7 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     corners_px, found, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
-    codes = [] if found is None else found.ravel().tolist()
+    codes = [] if found is None else [int(code) for code in found.ravel()]
     # corners (4, 2) in pixels of the grid, the centre of the first being (0, 0)
     tags = [(code, tag.reshape(4, 2).astype(float)) for code, tag in zip(codes, corners_px, strict=True)]
     marks, off = [], 0
