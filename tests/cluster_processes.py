@@ -17,7 +17,7 @@ from harness.engine.processes import ONE_THREAD
 from harness.engine.setup import SetUpRef, load_set_up
 
 ROOT = Path(__file__).resolve().parents[1]
-HOLD = 60.0
+HOLD = 600.0
 """Seconds, generous: what must have started or ended by then."""
 
 
@@ -57,7 +57,7 @@ class Processes:
                 process.send_signal(signal.SIGTERM)
         for process in [*self.workers, self.scheduler]:
             try:
-                process.wait(timeout=10)
+                process.wait(timeout=300)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

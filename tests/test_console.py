@@ -220,5 +220,5 @@ def shown_on_terminal(program: str, columns: int) -> str:
             break
         said += content
     os.close(ours)
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=600) == 0
     return said.decode()

@@ -61,7 +61,7 @@ sweep:
 def sweep(folder: Path, *arguments: str, experiment: Path | None = None) -> subprocess.CompletedProcess[str]:
     path = experiment or folder.parent / "tiny.yaml"
     command = [sys.executable, "-m", "harness.sweep", str(path), "--out", str(folder), *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
 
 
 def results(folder: Path) -> Path:
@@ -174,14 +174,14 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     process = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 900
     while not recorded(cut, "damaged"):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
     began = time.monotonic()
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=600)
     assert time.monotonic() - began < 10
     assert process.returncode == 130, errors
     assert "interrupted; finished trials are kept" in errors
@@ -198,7 +198,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished):
     command = [sys.executable, "-m", "harness.sweep", str(finished.parent / "tiny.yaml"), "--out", str(cut)]
     marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
     process = subprocess.Popen([*command, "--set", "repeats=400"], cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 900
     while not recorded(cut, "hole_free"):
         assert process.poll() is None
         assert time.monotonic() < deadline
@@ -206,7 +206,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished):
     assert len(processes_marked(str(cut))) > 1
     process.kill()
     process.wait()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 300
     while processes_marked(str(cut)):
         assert time.monotonic() < deadline, "workers outlive their driver"
         time.sleep(0.1)
@@ -273,7 +273,7 @@ def test_missing_llvm_is_one_message(finished, tmp_path):
         "--out",
         str(tmp_path / "out"),
     ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=120)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=900)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert "DRJIT_LIBLLVM_PATH" in done.stderr

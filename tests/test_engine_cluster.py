@@ -141,7 +141,7 @@ def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
 
 def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
     jobs = [*squares(20, "before"), Job("endless", "trials", hang, ()), *squares(200, "after")]
-    with engine_at(cluster, Limits(seconds=2.0)) as engine:
+    with engine_at(cluster, Limits(seconds=20.0)) as engine:
         ended = run(engine, jobs)
         again = run(engine, squares(30))
     endless = ended.pop("endless")
@@ -151,7 +151,7 @@ def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
 
 
 def test_a_job_that_stops_its_whole_process_is_ended_by_its_limit(cluster):
-    with engine_at(cluster, Limits(seconds=2.0)) as engine:
+    with engine_at(cluster, Limits(seconds=20.0)) as engine:
         ended = run(engine, [Job("endless", "trials", hold_the_interpreter, ()), *squares(100)])
     endless = ended.pop("endless")
     assert endless.state == "timed out" and "in hold_the_interpreter" in endless.why

@@ -99,7 +99,7 @@ def engine_with(client: FakeClient, *, scheduler: str = "tcp://driver:1", **node
 
 
 def stepped(engine: ClusterEngine, holds: Callable[[], object]) -> None:
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + 600.0
     while not holds():
         assert time.monotonic() < end, "waited too long"
         engine._step()

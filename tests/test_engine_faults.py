@@ -42,6 +42,9 @@ class Clumsy(ThesisDetector):
 REPEATS = "repeats=6"
 
 
+pytestmark = pytest.mark.slow  # a campaign: kills, hangs, full disks, damaged files
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With the experiment, a detector as a plug-in, and an undisturbed run."""
@@ -92,7 +95,7 @@ def test_faults_in_trials_are_told_and_mended(home):
     summary and the exit code say so; the same command leaves them, --retry-failed ends as if nothing had been. A fifth,
     which sets the threshold, kills its process and is tried again at once."""
     with_renders(home, "disturbed")
-    limits = ("--time-limit", "20", "--memory-limit", "1.5")
+    limits = ("--time-limit", "120", "--memory-limit", "1.5")
     done = run(home, "disturbed", *limits, faults=("any-raise", "any-kill", "any-hang", "any-eat", "judged-kill"))
     assert done.returncode == 1, done.stderr
     assert "2 failed, 1 crashed, 1 timed out" in done.stderr
@@ -116,7 +119,7 @@ def test_a_killed_driver_costs_what_was_under_way(home):
     out = with_renders(home, "killed")
     command = sweep_command(home / "tiny.yaml", out, "--set", REPEATS)
     process = subprocess.Popen(command, cwd=ROOT, env=os.environ | environment(home), stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 900
     while not (kept := judged_in(out)):
         assert process.poll() is None
         assert time.monotonic() < deadline

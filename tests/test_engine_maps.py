@@ -155,7 +155,7 @@ def sweep(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         str(folder),
         *arguments,
     ]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +195,7 @@ def test_walls_are_seen_better_from_more_places(finished):
     assert (walls.xs(3, level="views") < walls.xs(1, level="views")).all()
 
 
+@pytest.mark.slow
 def test_one_process_or_two_give_the_same_numbers(finished, tmp_path):
     import shutil
 

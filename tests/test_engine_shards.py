@@ -32,6 +32,7 @@ def plan(home: Path) -> SweepPlan:
     return plan_of(load_experiment(home / "tiny.yaml"), home / "whole" / ".cache" / "renders")
 
 
+@pytest.mark.slow
 def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, capsys):
     """Two folders without a common file; merged, and the report written where no render is."""
     name = results(home / "whole").name

@@ -166,7 +166,7 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
 
 def sweep(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "harness.sweep", str(folder.parent / "tiny.yaml"), "--out", str(folder)]
-    return subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=1800)
 
 
 @pytest.fixture(scope="module")

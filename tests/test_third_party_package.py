@@ -44,7 +44,7 @@ repeats: 1
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of a new environment that sees this one's packages and has the third-party one installed."""
     home = tmp_path_factory.mktemp("third_party")
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(home / "venv")], check=True, timeout=60)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(home / "venv")], check=True, timeout=900)
     interpreter = home / "venv" / "bin" / "python"
     paths = subprocess.run(
         [interpreter, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
@@ -56,7 +56,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = write_package(home / "acme")
     command = [sys.executable, "-m", "pip", "--python", str(interpreter), "install", "--quiet", "--no-deps"]
     command += ["--no-index", "--no-build-isolation", "--disable-pip-version-check", str(source)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     return interpreter
 
@@ -64,7 +64,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def program(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
-        [python, "-m", *arguments], cwd=python.parent, env=environment, capture_output=True, text=True, timeout=300
+        [python, "-m", *arguments], cwd=python.parent, env=environment, capture_output=True, text=True, timeout=1800
     )
 
 

@@ -38,7 +38,7 @@ def sweep_command(yaml: Path, out: Path, *arguments: str) -> list[str]:
 def sweep(yaml: Path, out: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run it to its end."""
     command = sweep_command(yaml, out, *arguments)
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, env=os.environ | environment)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800, env=os.environ | environment)
 
 
 def results(out: Path) -> Path:
