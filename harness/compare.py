@@ -88,25 +88,18 @@ def _refuse_where_nothing_is_paired(first: StudyRecord, second: StudyRecord) -> 
 
 def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
     """The table, in colour on a terminal; or JSON."""
-    from harness.report.compare_rows import compare_table, compare_text
+    from harness.report.compare import compare_parts
+    from harness.tables.grid import show
 
     if as_json:
         print(_json(comparison))
-        return
-    if sys.stdout.isatty():
-        from rich.console import Console
-
-        console, table = Console(), compare_table(comparison)
-        # On a narrow terminal rich would cut the numbers; wrapped lines can still be read.
-        if console.measure(table, options=console.options.update(max_width=1000)).maximum <= console.width:
-            console.print(table)
-            return
-    print(compare_text(comparison))
+    else:
+        show(compare_parts(comparison))
 
 
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
     """`FILES` in ``folder``."""
-    from harness.report.compare_page import compare_html
+    from harness.report.compare import compare_html
     from harness.vocabulary.files import write_text
 
     write_text(folder / FILES[0], _json(comparison) + "\n")
@@ -116,7 +109,7 @@ def write_comparison(comparison: Comparison, folder: Path, command: str) -> None
 def _json(comparison: Comparison) -> str:
     import json
 
-    from harness.report.compare_rows import compare_data
+    from harness.report.compare import compare_data
 
     return json.dumps(compare_data(comparison), indent=2, allow_nan=False)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
     from harness.evaluation.pod.planning import HoleFree
     from harness.evaluation.study.record import SetUpRecord, StudyRecord
-    from harness.report.design_rows import StudyDesign
+    from harness.report.design import StudyDesign
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
@@ -107,9 +107,13 @@ def _run(options: argparse.Namespace, command: str) -> int:
     guess = _told(options) if options.study is None else _from_study(options)
     _check(options, guess)
     design = _designed(options, guess)
-    from harness.report.design_rows import design_text
+    from harness.report.design import design_parts
+    from harness.tables.grid import show
 
-    print(_json(design, command) if options.json else design_text(design))
+    if options.json:
+        print(_json(design, command))
+    else:
+        show(design_parts(design))
     if options.out is not None:
         _write(design, options.out, command)
     return 0
@@ -259,7 +263,7 @@ def _designed(options: argparse.Namespace, guess: _Guess) -> StudyDesign:
     from harness.evaluation.pod.design import design
     from harness.evaluation.pod.planning import plans_by_frames, recommend
     from harness.evaluation.pod.repeats import repeated_studies
-    from harness.report.design_rows import StudyDesign
+    from harness.report.design import StudyDesign
 
     noise, hole_free = _noise(options, guess), _hole_free(options, guess)  # Mistakes before the simulation's minute.
     asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
@@ -319,7 +323,7 @@ def _flag(name: str) -> str:
 def _json(design: StudyDesign, command: str) -> str:
     import json
 
-    from harness.report.design_rows import design_data
+    from harness.report.design import design_data
     from harness.vocabulary.versions import RESULTS_VERSION
 
     told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
@@ -327,8 +331,7 @@ def _json(design: StudyDesign, command: str) -> str:
 
 
 def _write(design: StudyDesign, out: Path, command: str) -> None:
-    from harness.report.design_figure import save_design_png
-    from harness.report.design_page import design_html
+    from harness.report.design import design_html, save_design_png
     from harness.vocabulary.files import write_text
 
     data, picture, page = (out / name for name in FILES)

@@ -67,9 +67,10 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, command: str) -> int:
     _refuse_what_does_not_belong(options)
     statement = _hits(options) if options.hit is not None else _signals(options)
-    from harness.report.pod_page import pod_text
+    from harness.report.pod import pod_parts
+    from harness.tables.grid import show
 
-    print(pod_text(statement))
+    show(pod_parts(statement))
     _write(statement, options.out, command)
     return 0
 
@@ -137,8 +138,7 @@ def _signals(options: argparse.Namespace) -> PodStatement:
 def _write(statement: PodStatement, out: Path, command: str) -> None:
     import json
 
-    from harness.report.pod_figure import save_pod_png
-    from harness.report.pod_page import pod_html
+    from harness.report.pod import pod_html, save_pod_png
     from harness.vocabulary.files import write_text
     from harness.vocabulary.versions import RESULTS_VERSION
 

@@ -19,10 +19,12 @@ ALLOWED = {
     "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
     "harness/exchange": ("harness.vocabulary", "harness.exchange"),
     "harness/evaluation": ("harness.vocabulary", "harness.evaluation"),
+    "harness/tables": ("harness.vocabulary", "harness.evaluation", "harness.tables"),
     "harness/thesis": ("harness.vocabulary", "harness.evaluation", "harness.thesis"),
     "harness/report": (
         "harness.vocabulary",
         "harness.evaluation",
+        "harness.tables",
         "harness.thesis",
         "harness.report",
         "detectors.interface",

@@ -12,7 +12,7 @@ import numpy as np
 from harness.evaluation.study.axes import FRAMES, AxisLine
 from harness.evaluation.study.limit import SetUpLimit
 from harness.report.canvas import GREY, svg
-from harness.report.pod_figure import plain
+from harness.report.pod import plain
 from harness.report.set_ups_figures import COLOURS, MARKERS
 from harness.report.study_rows import is_within_sizes, mm_text
 from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text

@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.evaluation.study.limit import SetUpLimit
 from harness.report.canvas import BLUE, ORANGE, RED, svg
-from harness.report.pod_figure import plain
+from harness.report.pod import plain
 from harness.report.study_rows import name_of, rate_text
 
 if TYPE_CHECKING:

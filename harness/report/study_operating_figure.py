@@ -11,7 +11,7 @@ import numpy as np
 from harness.evaluation.study.curves import PRO_LIMIT
 from harness.evaluation.study.result import SetUpResult
 from harness.report.canvas import GREY, svg
-from harness.report.pod_figure import plain, plain_numbers
+from harness.report.pod import plain, plain_numbers
 from harness.report.set_ups_figures import COLOURS
 from harness.report.study_rows import name_of
 

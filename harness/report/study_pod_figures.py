@@ -11,7 +11,7 @@ import numpy as np
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import SetUpResult
 from harness.report.canvas import GREY, PURPLE, svg
-from harness.report.pod_figure import draw_hits, draw_pod, draw_signals, hits_in_view, plain
+from harness.report.pod import draw_hits, draw_pod, draw_signals, hits_in_view, plain
 from harness.report.study_rows import limit_sentence, name_of
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.surface import PodSurface
 from harness.report.canvas import BLUE, GREEN, INK, ORANGE, SKY, svg
-from harness.report.pod_figure import plain
+from harness.report.pod import plain
 from harness.report.study_rows import mm_text, name_of
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import numpy as np
 
 from harness.evaluation.summary import MAIN
 from harness.report.measures import inches
-from harness.report.page_parts import aligned
-from harness.report.perspectives_rows import Ways
-from harness.report.set_ups_rows import Layout, count_text, found_text
+from harness.report.perspectives import Ways
+from harness.report.set_ups import Layout, count_text, found_text
+from harness.tables.grid import aligned
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -136,7 +136,7 @@ def _limit(row: pd.Series) -> str:
 
 
 def _heads(frames: list[int]) -> list[str]:
-    return ["hole", "drill", "mm", *(f"N={n}" for n in frames), "thesis mm", "model mm"]
+    return ["hole", "drill", "mm", *(f"N={n}" for n in frames), "extent mm", "model mm"]
 
 
 def _cells(summary: pd.DataFrame, variant: str) -> tuple[list[int], list[list[tuple[str, str]]]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.report import canvas
-from harness.report.page_parts import template
+from harness.report.blocks import template
 from harness.scorecard.capture import Beside, Captured, Twin
 from harness.scorecard.page import told
 from harness.scorecard.plots import COLOURS

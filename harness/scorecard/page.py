@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.report.page_parts import template
+from harness.report.blocks import template
 from harness.scorecard.judge import Score
 from harness.scorecard.quantities import QUANTITIES
 from harness.scorecard.tables import HEADS, score_cells
