@@ -33,7 +33,7 @@ FINDINGS_VERSION = 2
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 VERSION_COLUMN = "findings_version"
 BLIND_MAP = BLIND.name
-"""Where the cloud has a pixel grid."""
+"""Written of clouds with a pixel grid only."""
 FILES = (FINDINGS.name, FINDINGS_DATA.name, ANNOTATED.name, BLIND_MAP, CLOUD.name)
 
 
