@@ -1,4 +1,4 @@
-"""What `harness.detect` found, as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
+"""Findings of `harness.detect` as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
 
 All files of one run are written beside their final names first and renamed together at the end.
 """

@@ -296,7 +296,11 @@ def _noise(noise: pd.DataFrame) -> Grid:
         "displacement_mm": "whole cloud displaced (mm)",
     }
     rows = [
-        (str(row["frames"]), *(mm(row[name], 3) for name in shown), f"{row['pixels']} × {row['repeats']}")
+        (
+            str(row["frames"]),
+            *(f"{row[name]:+.3f}" if name == "offset_mm" else mm(row[name], 3) for name in shown),
+            f"{row['pixels']} × {row['repeats']}",
+        )
         for row in records(noise)
     ]
     return Grid.of(("frames", *shown.values(), "pixels × repeats"), rows, left=0)
