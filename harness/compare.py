@@ -81,18 +81,18 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
     """Print the table, in colour on a terminal; or JSON."""
-    from harness.report.compare_rows import comparison_parts
+    from harness.report.compare import compare_parts
     from harness.tables.grid import show
 
     if as_json:
         print(_json(comparison))
     else:
-        show(comparison_parts(comparison))
+        show(compare_parts(comparison))
 
 
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
     """Write `FILES` into ``folder``."""
-    from harness.report.compare_page import compare_html
+    from harness.report.compare import compare_html
     from harness.vocabulary.files import write_text
 
     write_text(folder / FILES[0], _json(comparison) + "\n")
@@ -102,7 +102,7 @@ def write_comparison(comparison: Comparison, folder: Path, command: str) -> None
 def _json(comparison: Comparison) -> str:
     import json
 
-    from harness.report.compare_rows import compare_data
+    from harness.report.compare import compare_data
 
     return json.dumps(compare_data(comparison), indent=2, allow_nan=False)
 

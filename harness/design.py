@@ -13,7 +13,7 @@ from harness.vocabulary.errors import UserError, exit_code_of
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
     from harness.evaluation.study.record import SetUpRecord, StudyRecord
-    from harness.report.design_rows import StudyDesign
+    from harness.report.design import StudyDesign
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
@@ -97,7 +97,8 @@ class _GuessedCurve(NamedTuple):
 def _run(options: argparse.Namespace, command: str) -> int:
     import json
 
-    from harness.report.design_rows import design_data, design_text
+    from harness.report.design import design_data, design_html, design_parts, save_design_png
+    from harness.tables.grid import show
     from harness.vocabulary.versions import RESULTS_VERSION
 
     _refuse_what_does_not_belong(options)
@@ -106,10 +107,11 @@ def _run(options: argparse.Namespace, command: str) -> int:
     design = _designed(options, guess)
     told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
     data_text = json.dumps(told, indent=2, allow_nan=False)
-    print(data_text if options.json else design_text(design))
+    if options.json:
+        print(data_text)
+    else:
+        show(design_parts(design))
     if options.out is not None:
-        from harness.report.design_figure import save_design_png
-        from harness.report.design_page import design_html
         from harness.vocabulary.files import write_text
 
         data, picture, page = (options.out / name for name in FILES)
@@ -268,7 +270,7 @@ def _designed(options: argparse.Namespace, guess: _GuessedCurve) -> StudyDesign:
         recommend,
         repeated_studies,
     )
-    from harness.report.design_rows import StudyDesign
+    from harness.report.design import StudyDesign
 
     asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
     guessed_with = guess.frames if options.guessed_with is None else options.guessed_with

@@ -69,12 +69,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
     _refuse_what_does_not_belong(options)
     statement = _stated(options)
-    from harness.report.pod_figure import save_pod_png
-    from harness.report.pod_page import pod_html, pod_text
+    from harness.report.pod import pod_html, pod_parts, save_pod_png
+    from harness.tables.grid import show
     from harness.vocabulary.files import write_text
     from harness.vocabulary.versions import RESULTS_VERSION
 
-    print(pod_text(statement))
+    show(pod_parts(statement))
     data, picture, page = (options.out / name for name in FILES)
     told = {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
     write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")

@@ -26,8 +26,7 @@ from harness.evaluation.study.verdict import (
     not_comparable,
     paired_set_ups,
 )
-from harness.report.compare_page import compare_html
-from harness.report.compare_rows import HEADS, cells, comparison_grid, comparison_parts
+from harness.report.compare import HEADS, compare_grid, compare_html, compare_parts
 from harness.tables.grid import text_of
 from tests.synthetic_study import SetUp, Study, study_record
 
@@ -306,7 +305,8 @@ def test_a_curve_that_flattens_is_worse_by_the_test_of_a90():
     assert row.hits.fewer_p > 0.01
     # twice for two tests of one question; Holm's first of two questions
     assert row.limit_p[0] == pytest.approx(2 * 2 * row.swap.grown_p)
-    assert cells(row)[HEADS.index("p")] == f"{row.limit_p[0]:.2g} (a90)"
+    (cells,) = compare_grid(compare_studies(one, other)).rows
+    assert cells[HEADS.index("p")].text == f"{row.limit_p[0]:.2g} (a90)"
 
 
 def test_where_hits_decide_or_the_margin_holds_a90_is_not_asked():
@@ -385,15 +385,15 @@ def comparison() -> Comparison:
 
 
 def test_every_row_is_said_in_text_and_on_the_page(comparison):
-    text, page = text_of(comparison_parts(comparison)), compare_html(comparison, "python -m harness.compare a b")
+    text, page = text_of(compare_parts(comparison)), compare_html(comparison, "python -m harness.compare a b")
     assert [row.mark for row in comparison.rows] == ["worse", "as good", "only in first", "only in second"]
     for row in comparison.rows:
-        assert len(cells(row)) == len(HEADS)
         assert row.label in text and row.label in page and row.mark in text
     assert text.splitlines()[-1].startswith("1 of 4 set-ups is worse. 1 frame: a90 ")
     assert "what differs: other frames of the same boards (1 frame)" in text
-    assert page.count("<tr") == 1 + 4 + 2 + 4 + 1 + 3 and 'class="no"' in page and "<svg" in page
-    assert comparison_grid(comparison).rich().row_count == 4
+    assert page.count("<tr") == 1 + 4 + 1 + 4 + 1 + 3 and 'none">worse</td>' in page and "<svg" in page
+    grid = compare_grid(comparison)
+    assert {len(cells) for cells in grid.rows} == {len(HEADS)} and grid.rich().row_count == 4
     assert compare_html(comparison, "x") == compare_html(comparison, "x")
 
 

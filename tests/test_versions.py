@@ -15,9 +15,9 @@ from harness.evaluation.study.record import OLDEST_VERSION, RECORD_VERSION, read
 from harness.evaluation.study.verdict import compare_studies
 from harness.experiment.load import EXPERIMENT_VERSION, load_experiment, resolved_yaml
 from harness.inspection.poses import POSES_KEY, read_poses
-from harness.report.compare_rows import COMPARISON_VERSION
+from harness.report.blocks import template
+from harness.report.compare import COMPARISON_VERSION
 from harness.report.findings import COLUMNS, FINDINGS_VERSION, VERSION_COLUMN, csv_text
-from harness.report.page_parts import template
 from harness.scorecard.figures import BASELINE_FILE, SCORECARD_VERSION, read_baseline, write_baseline
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION, check_version, stamp_of, stamped

@@ -257,7 +257,8 @@ def _write_report(
     from harness.report.page import write_report
 
     title = experiment.config.title or experiment.config.name
-    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title)
+    target = getattr(getattr(experiment.config.source, "target", None), "name", "")
+    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
 
 
 def _conclude(folder: Path, shown: list[str | Grid], outcome: Outcome) -> None:
@@ -293,8 +294,8 @@ def _final_table(tables: ResultTables) -> list[str | Grid]:
     from harness.evaluation.set_ups import compare_set_ups, set_ups_of
     from harness.evaluation.summary import summarise_holes
     from harness.report import terminal
-    from harness.report.perspectives_rows import Ways
-    from harness.report.set_ups_rows import Layout
+    from harness.report.perspectives import Ways
+    from harness.report.set_ups import Layout
 
     summary = summarise_holes(tables.holes, list(tables.axes["path"]))
     if not tables.registrations.empty:

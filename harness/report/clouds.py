@@ -1,23 +1,38 @@
-"""Pictures of averaged clouds: points with the damage in magenta, residuals in mm, depth profiles through holes."""
+"""Pictures of averaged clouds: points with the damage in magenta, residuals in mm, the same hole as set-ups see it,
+depth profiles through holes. Residuals have one colour scale: linear within 1 mm, logarithmic beyond, red behind the
+surface, blue before it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.evaluation.profile import HoleInView, hole_shape, relative_radius, true_residual_mm
 from harness.report.canvas import BLUE, DAMAGE, GREY, INK, ORANGE, svg
 from harness.report.examples import ExampleCloud
-from harness.report.residual_scale import residual_bar, residual_image, residual_norm
 from harness.tables.text import inches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.colors import SymLogNorm
+    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.image import AxesImage
 
+NOTHING = "#b9bec4"
+"""Grey: no valid point."""
+LEAST_MM = 10.0
+"""Both ends of the scale are at least this far out."""
+BOX: dict[str, Any] = {"facecolor": "#ffffff", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
+"""The box behind words in a picture."""
+AROUND_MM = 9.0
+"""Undamaged face shown beyond the rim: more than any of the cameras' filters reaches."""
+MOST_HOLES = 4
+PANEL_IN = 1.9
+SIDE_IN = 1.9
+"""Room for axes, titles and the colour bar."""
 PROFILES = 6
 """Holes shown in profile, the largest ones."""
 SMALLEST_RING_PX = 2.5
@@ -122,7 +137,9 @@ def _profile(axes: Axes, clouds: list[ExampleCloud], hole: HoleInView) -> None:
     for cloud in clouds[:1] + clouds[-1:] if len(clouds) > 1 else clouds:
         z = cloud.residual_mm[row]
         colour, marker, line = (BLUE, "o", "-") if cloud is last else (GREY, "^", "none")
-        axes.plot(across[near], z[near], ls=line, color=colour, marker=marker, ms=4, lw=1, label=_measured(cloud))
+        axes.plot(
+            across[near], z[near], ls=line, color=colour, marker=marker, ms=4, lw=1, label=f"measured, {_frames(cloud)}"
+        )
         finite = z[near & np.isfinite(z)]
         deepest = max(deepest, float(finite.max()) if finite.size else 0.0)
     shape = hole_shape(last, hole)
@@ -183,7 +200,7 @@ def _coloured(cloud: ExampleCloud) -> np.ndarray:
 
 
 def _touched(cloud: ExampleCloud, hole: HoleInView) -> bool:
-    """Whether a pixel of the hole (at least the central one) belongs to a detected cluster in this very cloud."""
+    """Return whether a pixel of the hole (at least the central one) belongs to a cluster that this cloud shows."""
     radius = relative_radius(cloud, hole)
     return bool(cloud.detected[radius <= max(1.0, 0.75 / hole.radius_px)].any())
 
@@ -207,9 +224,112 @@ def _ring(axes: Axes, frame: _Frame, hole: HoleInView, *, found: bool) -> None:
     )
 
 
-def _measured(cloud: ExampleCloud) -> str:
-    return f"measured, {_frames(cloud)}"
-
-
 def _frames(cloud: ExampleCloud) -> str:
     return "1 frame" if cloud.frames == 1 else f"{cloud.frames} frames averaged"
+
+
+def residual_norm(deepest_mm: float) -> SymLogNorm:
+    """The scale for residuals up to ``deepest_mm`` in size."""
+    from matplotlib.colors import SymLogNorm
+
+    limit = max(LEAST_MM, deepest_mm)
+    return SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
+
+
+def residual_image(axes: Axes, residual_mm: np.ndarray, norm: SymLogNorm, **place: Any) -> AxesImage:
+    """``residual_mm`` (h, w) as a picture without grid lines; ``place``: what `Axes.imshow` needs to put it there."""
+    axes.set_facecolor(NOTHING)
+    axes.grid(visible=False)
+    return axes.imshow(residual_mm, norm=norm, cmap="RdBu_r", aspect="equal", **place)
+
+
+def residual_bar(figure: Figure | SubFigure, picture: AxesImage, label: str, **place: Any) -> None:
+    """The colour bar with round numbers; ``place``: what `Figure.colorbar` needs (``ax`` or ``cax``, ``shrink``)."""
+    limit = picture.get_clim()[1] or LEAST_MM
+    bar = figure.colorbar(picture, extend="both", **place)
+    bar.set_label(label)
+    ticks = [t for t in (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100) if abs(t) <= limit]
+    bar.set_ticks(ticks, labels=[f"{t:+d}".replace("-", "−") if t else "0" for t in ticks])
+    bar.minorticks_off()
+
+
+def chosen_holes(cloud: ExampleCloud) -> list[str]:
+    """Every second hole from the fourth smallest on (of the thesis' board 4, 6, 8 and 10), at most `MOST_HOLES`."""
+    names = [hole.hole for hole in sorted(cloud.truth, key=lambda hole: hole.diameter_mm)]
+    return names[min(3, len(names) - 1) :: 2][:MOST_HOLES]
+
+
+def sights_figure(clouds: Mapping[str, ExampleCloud]) -> str:
+    """Holes down, set-ups across."""
+    titles = list(clouds)
+    holes = chosen_holes(clouds[titles[0]])
+    grid = [[(clouds[title], hole) for title in titles] for hole in holes]
+    first = clouds[titles[0]]
+    sides = [_hole_title(first, hole) for hole in holes]
+    return _grid("sights", grid, titles, sides, "The same holes as each set-up sees them: residual in millimetres.")
+
+
+def one_hole_figure(rows: Mapping[str, Sequence[ExampleCloud]], columns: Sequence[str]) -> str:
+    """One hole, the second of `chosen_holes`, in every set-up: rows of the layout down, its columns across."""
+    first = next(iter(rows.values()))[0]
+    hole = chosen_holes(first)[:2][-1]
+    grid = [[(cloud, hole) for cloud in line] for line in rows.values()]
+    sides = [f"{row}\n{_hole_title(first, hole)}" for row in rows]
+    return _grid("one_hole", grid, list(columns), sides, f"Hole {hole} in every set-up: residual in millimetres.")
+
+
+def _grid(
+    name: str, grid: Sequence[Sequence[tuple[ExampleCloud, str]]], titles: Sequence[str], sides: Sequence[str], alt: str
+) -> str:
+    norm = residual_norm(max(_deepest(cloud, hole) for line in grid for cloud, hole in line))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(len(grid), len(titles), squeeze=False)
+        for row, line in enumerate(grid):
+            for column, (cloud, hole) in enumerate(line):
+                axes = panels[row, column]
+                picture = _panel(axes, cloud, hole, norm)
+                if row == 0:
+                    axes.set_title(titles[column])
+                if row == len(grid) - 1:
+                    axes.set_xlabel("x from the hole (mm)")
+            panels[row, 0].set_ylabel(f"{sides[row]}\ny down (mm)")
+        residual_bar(figure, picture, "distance behind the fitted surface (mm)", ax=panels, shrink=0.8, pad=0.02)
+
+    size = (PANEL_IN * len(titles) + SIDE_IN + 0.8, PANEL_IN * len(grid) + 0.9)
+    return svg(name, size, alt, draw)
+
+
+def _panel(axes: Axes, cloud: ExampleCloud, name: str, norm: SymLogNorm) -> AxesImage:
+    """One hole in one cloud: residuals, the true rim, dots on pixels of detected clusters."""
+    index = next(i for i, hole in enumerate(cloud.truth) if hole.hole == name)
+    hole, rim = cloud.truth[index], cloud.outlines_px[index]
+    step = hole.diameter_mm / np.ptp(rim, axis=0)  # mm a pixel, across and down, through the lens as it is here
+    half = hole.diameter_mm / 2 + AROUND_MM
+    reach = np.ceil(half / step).astype(int) + 1
+    centre = np.array([hole.u_px, hole.v_px])
+    low = np.maximum(np.floor(centre - reach).astype(int), 0)
+    high = np.minimum(np.ceil(centre + reach).astype(int) + 1, cloud.residual_mm.shape[::-1])
+    cut = (slice(low[1], high[1]), slice(low[0], high[0]))
+    left, top = (low - 0.5 - centre) * step
+    right, bottom = (high - 0.5 - centre) * step
+    picture = residual_image(axes, cloud.residual_mm[cut], norm, extent=(left, right, bottom, top))
+    axes.plot(*((rim - centre) * step).T, color=INK, lw=1.1)
+    v, u = np.nonzero(cloud.detected[cut])
+    axes.plot((u + low[0] - centre[0]) * step[0], (v + low[1] - centre[1]) * step[1], ".", color=DAMAGE, ms=2.2, mew=0)
+    axes.set(xlim=(-half, half), ylim=(half, -half))
+    axes.text(0.03, 0.03, f"{step[0]:.2f} mm/px", transform=axes.transAxes, fontsize=8, bbox=BOX)
+    return picture
+
+
+def _deepest(cloud: ExampleCloud, name: str) -> float:
+    """The largest residual inside a hole's outline, mm; 0 where none is known."""
+    hole: HoleInView = next(one for one in cloud.truth if one.hole == name)
+    v, u = np.indices(cloud.residual_mm.shape)
+    inside = np.abs(cloud.residual_mm[np.hypot(u - hole.u_px, v - hole.v_px) < hole.radius_px])
+    return float(np.nanmax(inside)) if np.isfinite(inside).any() else 0.0
+
+
+def _hole_title(cloud: ExampleCloud, name: str) -> str:
+    hole = next(one for one in cloud.truth if one.hole == name)
+    return f"hole {name}, {inches(hole.diameter_mm) or f'{hole.diameter_mm:.1f} mm'}"

@@ -1,4 +1,4 @@
-"""What is kept of trials for the pictures of a report: averaged clouds, merged clouds, single damages of a study."""
+"""Parts of trials kept for the pictures of a report: averaged clouds, merged clouds, single damages of a study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `harness.detect` found, as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
+"""Findings of `harness.detect` as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
 
 All files of one run are written beside their final names first and renamed together at the end.
 """
@@ -33,7 +33,7 @@ FINDINGS_VERSION = 2
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 VERSION_COLUMN = "findings_version"
 BLIND_MAP = BLIND.name
-"""Where the cloud has a pixel grid."""
+"""Written of clouds with a pixel grid only."""
 FILES = (FINDINGS.name, FINDINGS_DATA.name, ANNOTATED.name, BLIND_MAP, CLOUD.name)
 
 

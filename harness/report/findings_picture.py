@@ -109,7 +109,7 @@ def _shown(cloud: Cloud, evidence: Evidence) -> tuple[float, float, float, float
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> tuple[float, float, float, float]:
-    """Of a part (h, w) bool of the cloud's grid."""
+    """Return the same of a part (h, w) bool of the cloud's grid."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 RULER_MM = 25.4 / 16
 """One graduation of a ruler in 1/16 in, to compare positions with."""
 MEASURES: tuple[tuple[Measure, str, str], ...] = (
-    ("extent", "thesis' measure", ORANGE),
+    ("extent", "extent of the cluster", ORANGE),
     ("model", "model of the blurred hole", BLUE),
 )
 
@@ -36,8 +36,8 @@ def sizes_figure(summary: pd.DataFrame, few: int, many: int) -> str:
             _size_scatter(figure.add_subplot(grid[1, column]), summary, measure, name, colour, (few, many))
 
     alt = (
-        "Measured hole diameters with one standard deviation beside the true ones, by the thesis' measure and the "
-        f"model, with {few} and {many} frames."
+        "Measured hole diameters with one standard deviation beside the true ones, by the extent of the cluster and "
+        f"the model, with {few} and {many} frames."
     )
     return svg("sizes", (10, 7.4), alt, draw)
 

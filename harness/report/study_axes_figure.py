@@ -11,7 +11,7 @@ import numpy as np
 from harness.evaluation.study.axes import AxisLine
 from harness.evaluation.study.limit import SetUpLimit
 from harness.report.canvas import GREY, svg
-from harness.report.pod_figure import plain
+from harness.report.pod import plain
 from harness.report.set_ups_figures import COLOURS, MARKERS
 from harness.tables import text
 from harness.tables.limits import is_within_sizes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from harness.report.canvas import DAMAGE, INK, svg
+from harness.report.clouds import BOX, residual_bar, residual_image, residual_norm
 from harness.report.examples import StudyExample, Where
-from harness.report.residual_scale import BOX, residual_bar, residual_image, residual_norm
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import SetUpResult
 from harness.evaluation.study.surface import PodSurface
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, SKY, svg
-from harness.report.pod_figure import draw_hits, draw_pod, draw_signals, hits_in_view, plain, plain_numbers
+from harness.report.pod import draw_hits, draw_pod, draw_signals, hits_in_view, plain, plain_numbers
 from harness.report.set_ups_figures import COLOURS
 from harness.tables import text
 from harness.tables.limits import limit_sentence, name_of, rate_estimate, rate_text

@@ -9,8 +9,8 @@ from typing import Any
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import StudyResult
 from harness.evaluation.study.surface import depth_varies
+from harness.report.blocks import closing, joined, template
 from harness.report.examples import StudyExample
-from harness.report.page_parts import closing_sections, template
 from harness.report.set_ups_figures import COLOURS
 from harness.report.study_axes_figure import axis_figure
 from harness.report.study_examples_figure import examples_figure
@@ -128,7 +128,7 @@ def study_html(
         sizes=[grid.html() for grid in size_grids(result.set_ups)],
         validity=result.validity,
         figures=_figures(result, groups, shown),
-        **closing_sections(provenance, resolved_yaml),
+        closing=joined(closing(provenance, resolved_yaml)),
     )
 
 

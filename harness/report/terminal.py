@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from harness.evaluation.summary import MAIN
-from harness.report.perspectives_rows import Ways
-from harness.report.set_ups_rows import Layout, count_text, found_text
+from harness.report.perspectives import Ways
+from harness.report.set_ups import Layout, count_text, found_text
 from harness.tables.grid import Cell, Grid, Tone
 from harness.tables.text import UNKNOWN_TEXT, inches, mm
 
@@ -38,7 +38,7 @@ def holes_grid(summary: pd.DataFrame, variant: str = MAIN) -> Grid:
             mean, std = (float(last[f"{measure}_diameter_{name}_mm"]) for name in ("mean", "std"))
             cells.append(f"{mm(mean)} ± {std:.2f}" if mean == mean and std == std else mm(mean))
         rows.append(cells)
-    heads = ("hole", "drill", "mm", *(f"N={n}" for n in frames), "thesis mm", "model mm")
+    heads = ("hole", "drill", "mm", *(f"N={n}" for n in frames), "extent mm", "model mm")
     return Grid.of(heads, rows, 0, "holes detected of trials, by number of averaged frames (N)")
 
 

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from harness.report.blocks import template
 from harness.report.canvas import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
-from harness.report.examples import MappedExample
-from harness.report.page_parts import template
+from harness.report.examples import FindingSeen, HoleSeen, MappedExample
 from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
@@ -46,10 +46,10 @@ class Circle3d:
 
 @dataclass(frozen=True)
 class Scene3d:
-    """What is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,) behind (+) or before (-) the
-    fitted surface, NaN where not judged; ``view_of`` (n,) index into ``view_names``, -1 of several; ``detected`` (n,)
-    bool. ``frame``: "board" (x right, y up, z to the viewer) or "camera" (x right, y down, z away). ``facts``: what
-    stands beside the picture, (name, value)."""
+    """The cloud that is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,) behind (+) or before
+    (-) the fitted surface, NaN where not judged; ``view_of`` (n,) index into ``view_names``, -1 of several;
+    ``detected`` (n,) bool. ``frame``: "board" (x right, y up, z to the viewer) or "camera" (x right, y down, z away).
+    ``facts``: what stands beside the picture, (name, value)."""
 
     points_mm: np.ndarray
     frame: Literal["board", "camera"]
@@ -64,20 +64,14 @@ class Scene3d:
 
 def scene_of(example: MappedExample) -> Scene3d:
     """The scene of a merged cloud of the report, with the truth."""
-    up = np.array([0.0, 0.0, 1.0])
-    truth = [
-        Circle3d(np.array([h.x_mm, h.y_mm, 0.0]), up, h.diameter_mm, h.hole, "found" if h.found else "missed")
-        for h in example.holes
-    ]
+
+    def circle(of: HoleSeen | FindingSeen, label: str, kind: Kind) -> Circle3d:
+        return Circle3d(np.array([of.x_mm, of.y_mm, 0.0]), np.array([0.0, 0.0, 1.0]), of.diameter_mm, label, kind)
+
+    truth = [circle(hole, hole.hole, "found" if hole.found else "missed") for hole in example.holes]
     findings = [
-        Circle3d(
-            np.array([f.x_mm, f.y_mm, 0.0]),
-            up,
-            f.diameter_mm,
-            f"{f.diameter_mm:.1f}",
-            "finding" if f.hole else "false call",
-        )
-        for f in example.findings
+        circle(finding, f"{finding.diameter_mm:.1f}", "finding" if finding.hole else "false call")
+        for finding in example.findings
     ]
     facts = (
         ("views", str(example.views)),
@@ -113,45 +107,54 @@ def write_view3d(path: Path, shown: Scene3d | MappedExample, title: str) -> Path
 
 def view3d_html(scene: Scene3d, title: str) -> str:
     """The page as text; see `write_view3d`."""
-    return template("view3d.html").render(title=title, facts=scene.facts, data=packed(scene), kinds=_legend(scene))
+    there = {circle.kind for circle in scene.circles}
+    kinds = [(kind, *words) for kind, words in KINDS.items() if kind in there]
+    return template("view3d.html").render(title=title, facts=scene.facts, data=packed(scene), kinds=kinds)
 
 
 def packed(scene: Scene3d) -> dict[str, Any]:
-    """The cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers.
-
-    Places are whole numbers of 16 bits within the bounding box: steps of 0.01 mm over 0.6 m.
-    """
+    """The cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers, None where there is
+    none. Places are whole numbers of 16 bits within the bounding box: steps of 0.01 mm over 0.6 m."""
     kept = _kept(scene)
-    points = _towards_viewer(scene, scene.points_mm[kept].astype(float))
+    # The page's frame: x right, y up, z to the viewer. From a camera's that is half a turn about x.
+    turn = np.array([1.0, 1.0, 1.0] if scene.frame == "board" else [1.0, -1.0, -1.0])
+    points = scene.points_mm[kept].astype(float) * turn
     low, high = points.min(axis=0), points.max(axis=0)
     step = np.maximum((high - low) / 65535, 1e-9)
-    data: dict[str, Any] = {
-        "count": len(points),
-        "total": int(np.isfinite(scene.points_mm).all(axis=1).sum()),
-        "low": [round(float(x), 6) for x in low],
-        "step": [float(x) for x in step],
-        "pitch": round(_pitch_mm(points), 4),
-        "places": _base64(np.rint((points - low) / step), "<u2"),
-        "circles": [_circle(scene, circle) for circle in scene.circles],
-        "views": _views(scene),
-        "residual_step": RESIDUAL_STEP_MM,
-        "several": SEVERAL,
-        "mark": DAMAGE,
-        "frame": scene.frame,
-    }
-    return data | _colours(scene, kept)
-
-
-def _colours(scene: Scene3d, kept: np.ndarray) -> dict[str, Any]:
-    """The arrays that points can be coloured by, None where there is none."""
+    # how far apart points lie across the line of sight, were they spread evenly over what they span
+    span = high[:2] - low[:2]
+    pitch = float(np.sqrt(max(span[0] * span[1], 1e-6) / len(points)))
     residual = view = None
     if scene.residual_mm is not None:
         steps = np.clip(np.rint(scene.residual_mm[kept] / RESIDUAL_STEP_MM), -32767, 32767)
         residual = _base64(np.where(np.isfinite(steps), steps, NO_RESIDUAL), "<i2")
     if scene.view_of is not None:
-        chosen = scene.view_of[kept]
-        view = _base64(np.where(chosen < 0, SEVERAL_CODE, chosen % SEVERAL_CODE), "<u1")
+        view = _base64(np.where((of := scene.view_of[kept]) < 0, SEVERAL_CODE, of % SEVERAL_CODE), "<u1")
+    views = [(name, VIEW_COLOURS[n % len(VIEW_COLOURS)]) for n, name in enumerate(scene.view_names)]
+    circles = [
+        {
+            "centre": [round(float(x), 3) for x in circle.centre_mm * turn],
+            "normal": [round(float(x), 5) for x in circle.normal * turn],
+            "diameter": round(float(circle.diameter_mm), 3),
+            "label": circle.label,
+            "kind": circle.kind,
+            "colour": KINDS[circle.kind][1],
+        }
+        for circle in scene.circles
+    ]
     return {
+        "count": len(points),
+        "total": int(np.isfinite(scene.points_mm).all(axis=1).sum()),
+        "low": [round(float(x), 6) for x in low],
+        "step": [float(x) for x in step],
+        "pitch": round(pitch, 4),
+        "places": _base64(np.rint((points - low) / step), "<u2"),
+        "circles": circles,
+        "views": [] if view is None else views,
+        "residual_step": RESIDUAL_STEP_MM,
+        "several": SEVERAL,
+        "mark": DAMAGE,
+        "frame": scene.frame,
         "rgb": None if scene.rgb is None else _base64(scene.rgb[kept], "<u1"),
         "residual": residual,
         "view": view,
@@ -170,42 +173,6 @@ def _kept(scene: Scene3d) -> np.ndarray:
     marked, others = finite[first[finite]][:MOST_POINTS], finite[~first[finite]]
     sample = np.random.default_rng(0).permutation(len(others))[: MOST_POINTS - len(marked)]
     return np.sort(np.concatenate([marked, others[sample]]))
-
-
-def _towards_viewer(scene: Scene3d, vectors: np.ndarray) -> np.ndarray:
-    """The page's frame: x right, y up, z to the viewer. From a camera's that is half a turn about x."""
-    return vectors if scene.frame == "board" else vectors * [1.0, -1.0, -1.0]
-
-
-def _circle(scene: Scene3d, circle: Circle3d) -> dict[str, Any]:
-    centre, normal = (_towards_viewer(scene, np.asarray(v, float)) for v in (circle.centre_mm, circle.normal))
-    return {
-        "centre": [round(float(x), 3) for x in centre],
-        "normal": [round(float(x), 5) for x in normal],
-        "diameter": round(float(circle.diameter_mm), 3),
-        "label": circle.label,
-        "kind": circle.kind,
-        "colour": KINDS[circle.kind][1],
-    }
-
-
-def _views(scene: Scene3d) -> list[tuple[str, str]]:
-    """(name, colour) of each view that points are told to come from."""
-    if scene.view_of is None:
-        return []
-    return [(name, VIEW_COLOURS[n % len(VIEW_COLOURS)]) for n, name in enumerate(scene.view_names)]
-
-
-def _legend(scene: Scene3d) -> list[tuple[str, str, str]]:
-    """(kind, words, colour) of the kinds of circles that are shown."""
-    there = {circle.kind for circle in scene.circles}
-    return [(kind, *words) for kind, words in KINDS.items() if kind in there]
-
-
-def _pitch_mm(points: np.ndarray) -> float:
-    """How far apart points lie across the line of sight, were they spread evenly over what they span."""
-    span = np.ptp(points[:, :2], axis=0)
-    return float(np.sqrt(max(span[0] * span[1], 1e-6) / len(points)))
 
 
 def _base64(values: np.ndarray, dtype: str) -> str:

@@ -15,7 +15,7 @@ from detectors.recordings import open_capture
 from detectors.recordings.pictures import read_picture
 from detectors.recordings.recording import Recording
 from harness.report import canvas
-from harness.report.page_parts import template
+from harness.report.blocks import template
 from harness.scorecard.capture import Captured, Twin, captured_of, compared, twin_of
 from harness.scorecard.plots import COLOURS
 from harness.scorecard.program import told

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.report.page_parts import template
+from harness.report.blocks import template
 from harness.scorecard.bench import FULL, QUICK
 from harness.scorecard.figures import (
     BASELINE_FILE,

@@ -11,18 +11,23 @@ if TYPE_CHECKING:
     from markupsafe import Markup
     from rich.table import Table as RichTable
 
-Tone = Literal["", "good", "key", "bad", "open"]
+Tone = Literal["", "good", "key", "bad", "open", "changed"]
 COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
 """Colours of a terminal; the text says the same without them."""
-CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open"}
+MOST_WIDE = 14
+"""Columns up to which a page's table has room for wide cells."""
+CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell's text, and how it is meant."""
+    """A cell's text, and how it is meant. On a page ``share`` (0 to 1) shades it, the bluer the more, ``hover`` is
+    shown where one points at it, and what follows `` (`` or a line's end stands below in small letters."""
 
     text: str
     tone: Tone = ""
+    share: float | None = None
+    hover: str = ""
 
 
 @dataclass(frozen=True)
@@ -35,9 +40,9 @@ class Grid:
     title: str = ""
 
     @staticmethod
-    def of(heads: Iterable[str], rows: Iterable[Iterable[str | Cell]], left: int = 1, title: str = "") -> Grid:
-        """Make a grid of texts and cells."""
-        cells = tuple(tuple(Cell(one) if isinstance(one, str) else one for one in row) for row in rows)
+    def of(heads: Iterable[str], rows: Iterable[Iterable[object]], left: int = 1, title: str = "") -> Grid:
+        """Make a grid of cells, or of what stands in them as text."""
+        cells = tuple(tuple(one if isinstance(one, Cell) else Cell(str(one)) for one in row) for row in rows)
         return Grid(tuple(heads), cells, left, title)
 
     def lines(self) -> list[str]:
@@ -59,24 +64,55 @@ class Grid:
 
     def html(self) -> Markup:
         """Return the table for a page: the first cell of a row is its head, an interval stands below its estimate."""
-        from markupsafe import Markup, escape
+        from markupsafe import Markup
 
         heads = Markup("").join(
             Markup("<th{}>{}</th>").format(Markup("" if place < self.left else ' class="n"'), head)
             for place, head in enumerate(self.heads)
         )
+        grouped = any(not row[0].text for row in self.rows)
         rows = []
         for row in self.rows:
             cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]
-            for place, cell in enumerate(row[1:], 1):
-                estimate, bracket, beside = cell.text.partition(" (")
-                below = Markup(" <small>({}</small>").format(beside) if bracket else ""
-                kind = " ".join(filter(None, ("" if place < self.left else "n", CLASSES.get(cell.tone, ""))))
-                cells.append(Markup('<td class="{}">{}{}</td>').format(kind, escape(estimate), below))
-            rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
+            cells += [self._data_cell(place, cell) for place, cell in enumerate(row[1:], 1)]
+            start = Markup('<tr class="group">' if grouped and row[0].text else "<tr>")
+            rows.append(start + Markup("{}</tr>").format(Markup("").join(cells)))
+        kind = "limits dense" if len(self.heads) > MOST_WIDE else "limits"
         return Markup(
-            '<div class="scroll"><table class="limits"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
-        ).format(heads, Markup("\n").join(rows))
+            '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
+        ).format(kind, heads, Markup("\n").join(rows))
+
+    def _data_cell(self, place: int, cell: Cell) -> Markup:
+        from markupsafe import Markup, escape
+
+        if isinstance(cell.text, Markup):
+            shown = cell.text
+        else:
+            estimate, mark, beside = _parts(cell.text)
+            below = Markup(" <small>{}{}</small>").format(mark, beside) if beside else Markup("")
+            shown = escape(estimate) + below
+        kinds = ("" if place < self.left else "n", CLASSES.get(cell.tone, ""), "" if cell.share is None else "rate")
+        style = Markup("") if cell.share is None else Markup(' style="{}"').format(_shade(cell.share))
+        hover = Markup(' title="{}"').format(cell.hover) if cell.hover else Markup("")
+        kind = " ".join(filter(None, kinds))
+        start = Markup("<td{}").format(Markup(f' class="{kind}"') if kind else Markup(""))
+        return start + style + hover + Markup(">{}</td>").format(shown)
+
+
+def _parts(text: str) -> tuple[str, str, str]:
+    """Split a text into the part in large letters and the part below it in small ones."""
+    large, newline, small = text.partition("\n")
+    if newline:
+        return large, "", small
+    large, bracket, small = text.partition(" (")
+    return large, "(" if bracket else "", small
+
+
+def _shade(share: float) -> str:
+    """CSS of a cell: the bluer, the greater the share."""
+    weight = 0.06 + 0.94 * share
+    red, green, blue = (round(255 + (channel - 255) * weight) for channel in (0, 94, 156))
+    return f"background:rgb({red},{green},{blue});color:{'#fff' if share > 0.72 else '#1d2530'}"
 
 
 def aligned(lines: Sequence[Sequence[str]], left: int = 1) -> list[str]:

@@ -27,6 +27,11 @@ def mm(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else UNKNOWN_TEXT
 
 
+def plus_minus(mean: float, std: float) -> str:
+    """Return ``3.20 ± 0.10``, or a dash where the mean is unknown."""
+    return UNKNOWN_TEXT if np.isnan(mean) else f"{mean:.2f}\u00a0±\u00a0{std:.2f}"
+
+
 def size(value: float, most: float = np.inf) -> str:
     """Return a size in mm: two decimals below 100 mm, as many as a drill's size has; ``> 15.9`` beyond ``most``, the
     largest size inspected; ``none`` for NaN."""

@@ -28,7 +28,7 @@ SLOPE_MARGIN = 0.05
 UNCHANGED = 0.9
 """The systematic error counts as lowered when it falls below this share; the white noise falls to 0.14 meanwhile."""
 FEWEST_RANKED = 4
-"""With fewer holes even a perfect order has a chance above 1 in 20."""
+"""Holes below which even a perfect order has a chance above 1 in 20."""
 
 
 class Example(AveragedCloud, Protocol):
@@ -42,7 +42,7 @@ class Example(AveragedCloud, Protocol):
 
 @dataclass(frozen=True)
 class Case:
-    """What one variant offers to the rules; every table holds this variant's rows only."""
+    """The tables of one variant that rules judge by; every table holds this variant's rows only."""
 
     variant: str
     summary: pd.DataFrame
@@ -348,7 +348,7 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 
 
 def _exact_set(case: Case, frames: int, expected: frozenset[str]) -> tuple[Answer, str]:
-    """Whether exactly the expected ones of the thesis' holes are found; with the counts."""
+    """Judge whether exactly the expected ones of the thesis' holes are found; with the counts."""
     status = found_holes(case.summary, case.variant, frames)
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"

@@ -1,4 +1,4 @@
-"""What a rule says of a claim, and how rules of several parts decide.
+"""Verdicts on claims, and decisions of rules with several parts.
 
 A verdict needs certainty in either direction: where an interval leaves room for both, it is "undecided". No rule is a
 parameter of the experiment, and none is chosen to make a claim come out.
@@ -24,7 +24,7 @@ CaseT = TypeVar("CaseT")
 Rules = dict[str, Callable[[CaseT], "Verdict"]]
 
 FEW = 1
-"""With `MANY` the numbers of frames that the thesis' claims speak of."""
+"""The smaller and `MANY` the greater of the numbers of frames that the thesis' claims speak of."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def decide(parts: Iterable[bool | None]) -> Answer:
 
 
 def is_above_zero(interval: Interval) -> bool | None:
-    """Whether a difference is surely above zero; None where its interval has room for both."""
+    """Return whether a difference is surely above zero; None where its interval has room for both."""
     return True if interval.above(0) else (False if interval.high <= 0 else None)
 
 

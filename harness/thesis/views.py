@@ -105,7 +105,7 @@ def claim_c7(case: MapCase) -> tuple[Answer, str]:
 
 
 def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
-    """Whether a method's error across the board is at most the noise of a surface."""
+    """Return whether a method's error across the board is at most the noise of a surface."""
     if wilson(len(rows) - len(trusted(rows)), len(rows))[0] > 0.5:
         return False
     across = per_unit(rows, "tre_across_mm").to_numpy(float)

@@ -1,4 +1,4 @@
-"""Figure: a probability of detection curve with its band, the inspections behind it, and the sizes read off it."""
+"""A probability of detection curve: its table for terminal and page, and its figure, with the inspections behind it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.pod.curve import Bound
-from harness.evaluation.pod.statement import POD, PodStatement
+from harness.evaluation.pod.statement import POD, ModelRow, PodStatement
+from harness.report.blocks import bullets, command_of, figure, heading, note, page, subheading
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, save_png, svg
+from harness.tables.grid import Cell, Grid
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,12 +22,77 @@ if TYPE_CHECKING:
 
 STRIPE = 0.10
 """Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
+VALIDITY = (
+    "The limit speaks of inspections like these: the same kind of flaws and parts, the same procedure, the sizes that "
+    "were tried. Targets are taken as independent of each other. Sizes beyond the largest target are extrapolation."
+)
 
 
-def pod_svg(statement: PodStatement) -> str:
-    """The figure as text of an inline ``<svg>``."""
+def pod_html(statement: PodStatement, command: str) -> str:
+    """The page as text: limit, figure, table of models, tests, notes; it needs no network."""
+    caption = (
+        "The curve with its pointwise band, the inspections behind it, and the sizes at POD 0.5 and 0.9. a90/95 is "
+        "where the band's lower edge reaches 0.9 if the band and the limit are of one method."
+    )
+    chosen_by = (
+        f"Sorted by {statement.criterion}, smaller is nearer to the data. Unless one was asked for, that alone "
+        "chooses, never the limit."
+    )
     size_in, draw = _plan(statement)
-    return svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
+    drawn = svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
+    body = [heading("Curve"), figure({"pod": drawn}, "pod", caption), heading("Sizes"), sizes_grid(statement).html()]
+    body += [heading("Models"), note(chosen_by), models_grid(statement).html()]
+    body += [heading("Fit"), fit_grid(statement).html()]
+    if statement.tests:
+        rows = [(what, "< 0.001" if p < 0.001 else f"{p:.3f}", reads) for what, p, reads in statement.tests]
+        body += [subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
+    body += [heading("Notes"), bullets((*statement.notes, VALIDITY)), *command_of(command)]
+    under = [note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
+    return page(f"Probability of detection: {statement.path.name}", answer(statement), body, under)
+
+
+def pod_parts(statement: PodStatement) -> list[str | Grid]:
+    """Return what a terminal shows: the page's tables and sentences."""
+    parts: list[str | Grid] = [f"{statement.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
+    parts += ["", models_grid(statement), "", sizes_grid(statement), "", fit_grid(statement)]
+    if statement.tests:
+        parts += ["", *(f"{what}: p = {p:.3g}, {reads}" for what, p, reads in statement.tests)]
+    parts += ["", *(f"note: {line}" for line in statement.notes)] if statement.notes else []
+    return [*parts, "", answer(statement)]
+
+
+def sizes_grid(statement: PodStatement) -> Grid:
+    """a50, a90 and every bound: size, and how it was found."""
+    rows = [("a50", statement.a50, "estimate"), ("a90", statement.a90, "estimate")]
+    bounds = [(statement.bound, f"{statement.bound.method}: the limit to quote")]
+    bounds += [(each, each.method) for each in statement.others]
+    if statement.independent is not None:
+        bounds.append((statement.independent, "WRONG here: as if every inspection were a target of its own"))
+    cells = [(name, sized(size, statement.unit), how) for name, size, how in rows]
+    cells += [("a90/95", _bound_text(bound, statement.unit), how) for bound, how in bounds]
+    return Grid.of(("", "size", "how"), cells, left=3)
+
+
+def models_grid(statement: PodStatement) -> Grid:
+    """The models that were tried, the one in use marked."""
+    of_unit = f" ({statement.unit})" if statement.unit else ""
+
+    def cells(row: ModelRow) -> list[Cell]:
+        sizes = sized(row.a50, ""), sized(row.a90, ""), _bound_text(row.bound, "")
+        texts = (f"{row.name}{' (used)' if row.chosen else ''}", f"{row.criterion:.2f}", *sizes)
+        return [Cell(text, "key" if row.chosen else "") for text in texts]
+
+    heads = ("model", statement.criterion, f"a50{of_unit}", f"a90{of_unit}", f"a90/95{of_unit}")
+    return Grid.of(heads, map(cells, statement.models))
+
+
+def fit_grid(statement: PodStatement) -> Grid:
+    """The numbers of the fit."""
+    return Grid.of(("of the fit", "value"), ((name, f"{value:.5g}") for name, value in statement.numbers.items()))
+
+
+def _bound_text(bound: Bound, unit: str) -> str:
+    return sized(bound.value, unit) if bound.demonstrated else "not demonstrated"
 
 
 def save_pod_png(path: Path, statement: PodStatement) -> None:
