@@ -10,7 +10,7 @@ import pandas as pd
 from synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.examples import FindingSeen, HoleSeen, MappedExample, PlacedView
+from harness.report.examples import FindingSeen, HoleSeen, MappedExample, ShownView
 
 MAP_AXES = pd.DataFrame(
     [
@@ -229,7 +229,7 @@ def map_example(views: int = 2, merge: str = "grid", points: int = 6000, registr
     )
 
 
-def _placed(number: int, rng: np.random.Generator) -> PlacedView:
+def _placed(number: int, rng: np.random.Generator) -> ShownView:
     corners = [(sx * 200, sy * 38) for sx in (-1, 1) for sy in (-1, 1)]
     marks = np.vstack([[cx, cy, 0] + rng.uniform(-1, 1, (150, 3)) * [20, 6, 0.3] for cx, cy in corners])
     shifts = {"truth": 0.0} | ({} if number == 0 else {"guess": 9.0, "icp": 1.5, "cpd": 0.4, "marks": 0.2})
@@ -238,4 +238,4 @@ def _placed(number: int, rng: np.random.Generator) -> PlacedView:
         poses[method] = np.eye(4)
         poses[method][:3, 3] = np.array([shift, -0.7 * shift, 0.5 * shift])
     failures = {"nominal": "no guess"} if number else {}
-    return PlacedView(f"view {number}", marks, np.full((len(marks), 3), 180, np.uint8), marks, poses, failures)
+    return ShownView(f"view {number}", marks, np.full((len(marks), 3), 180, np.uint8), marks, poses, failures)

@@ -32,6 +32,10 @@ ALLOWED = {
     "harness": ("",),
 }
 """Imports inside functions count as well, but for a version number that a leaf may ask for."""
+FRAGMENTS = {
+    *("Of", "For", "With", "By", "In", "At", "On", "To", "As", "From", "Into", "Without", "Beyond", "Between", "Under"),
+    *("What", "How", "Where", "Whether", "That", "Which", "Why", "When", "Per", "Among", "Within", "Because"),
+}
 PROGRAMS = [
     "sweep",
     "detect",
@@ -116,3 +120,28 @@ def test_detectors_and_their_program_never_import_mitsuba():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_class_names_have_one_meaning():
+    homes: dict[str, list[str]] = {}
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(path.relative_to(ROOT).as_posix())
+    assert not {name: where for name, where in homes.items() if len(where) > 1}
+
+
+def test_docstrings_begin_as_sentences_do():
+    """A verb or a noun comes first; a preposition or a relative word makes a fragment."""
+    fragments = []
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            body = getattr(node, "body", None)
+            for each in body if isinstance(body, list) else ():
+                if (
+                    isinstance(each, ast.Expr)
+                    and isinstance(each.value, ast.Constant)
+                    and isinstance(each.value.value, str)
+                ) and each.value.value.split(maxsplit=1)[0] in FRAGMENTS:
+                    fragments.append(f"{path.relative_to(ROOT).as_posix()}:{each.lineno}")
+    assert not fragments

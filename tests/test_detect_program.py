@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from harness import detect
 from harness.inspection.arguments import crop_from_text
 from harness.report.findings import COLUMNS, FILES
-from harness.report.findings_picture import Mark, label_places
+from harness.report.findings_picture import DrawnMark, label_places
 from harness.vocabulary.errors import UserError
 
 TRUE_CENTRE_MM = 1e3 * plane.points_m(plane.depth_mm(hole=False))[plane.HOLE_V, plane.HOLE_U]
@@ -340,7 +340,7 @@ def test_help_is_there_without_the_heavy_libraries() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 1000), st.floats(0, 600), st.floats(1, 20)), max_size=40))
 def test_numbers_in_the_picture_never_cover_each_other(circles: list[tuple[float, float, float]]) -> None:
-    marks = [Mark(str(i), *circle) for i, circle in enumerate(circles)]
+    marks = [DrawnMark(str(i), *circle) for i, circle in enumerate(circles)]
     places = label_places(marks, 6.0, 12.0, (0.0, 1000.0, 0.0, 600.0))
     for i, (x, y) in enumerate(places):
         width = 6.0 * (len(marks[i].text) + 0.6)

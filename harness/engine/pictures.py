@@ -26,7 +26,7 @@ from harness.report.examples import (
     FindingSeen,
     HoleSeen,
     MappedExample,
-    PlacedView,
+    ShownView,
     StudyExample,
     Where,
 )
@@ -146,7 +146,7 @@ def map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedEx
     clouds = [averages_of(capture, [asked.frames], asked.average, exact=asked.exact) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0), hole_free=False)
     T_board_reference = invert(set_ups[0].T_camera_board)
-    placed: dict[int, tuple[PlacedView, ...]] = {}
+    placed: dict[int, tuple[ShownView, ...]] = {}
     examples = []
     for point in chosen:
         count = maps.count(_mapping(point))
@@ -174,7 +174,7 @@ def _mapping(point: Point) -> MappingConfig:
     return point.config.mapping
 
 
-def _map_example(maps: MapMaker, point: Point, threshold: float, placed: tuple[PlacedView, ...]) -> MappedExample:
+def _map_example(maps: MapMaker, point: Point, threshold: float, placed: tuple[ShownView, ...]) -> MappedExample:
     mapping, frames = _mapping(point), point.config.capture.frames
     known = maps.known(mapping, frames)
     cloud = known.cloud
@@ -229,7 +229,7 @@ def _view_of(
 
 def _placed(
     maps: MapMaker, count: int, points: Sequence[Point], frames: int, T_board_reference: np.ndarray
-) -> tuple[PlacedView, ...]:
+) -> tuple[ShownView, ...]:
     """The views as every method of the experiment places them."""
     same = [p for p in points if maps.count(_mapping(p)) == count and p.config.capture.frames == frames]
     by_method = {_mapping(point).registration.method: _mapping(point) for point in same}
@@ -246,7 +246,7 @@ def _placed(
         for T_board_view in in_mm.values():
             T_board_view[:3, 3] /= MM
         placed.append(
-            PlacedView(
+            ShownView(
                 name=view.view.name,
                 points_mm=cloud.points_m.reshape(-1, 3)[kept] / MM,
                 rgb=rgb[kept],

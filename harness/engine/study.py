@@ -289,7 +289,7 @@ def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> i
 
 
 def _final_table(tables: ResultTables) -> list[str | Grid]:
-    """What a terminal shows at the end, by the kind of experiment."""
+    """Return the terminal's summary at the end, by the kind of experiment."""
     from harness.evaluation.maps import compare_maps
     from harness.evaluation.set_ups import compare_set_ups, set_ups_of
     from harness.evaluation.summary import summarise_holes

@@ -64,7 +64,7 @@ class StudyExample:
 
 
 @dataclass(frozen=True)
-class PlacedView:
+class ShownView:
     """One view as different methods place it. The board's frame is in millimetres: x along the row of holes, y up the
     face, z out of the face to the camera; the undamaged face is z = 0.
 
@@ -127,5 +127,5 @@ class MappedExample:
     view_of: np.ndarray
     holes: tuple[HoleSeen, ...]
     findings: tuple[FindingSeen, ...]
-    placed: tuple[PlacedView, ...]
+    placed: tuple[ShownView, ...]
     is_variation: bool = False

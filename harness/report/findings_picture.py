@@ -28,7 +28,7 @@ DIRECTIONS = 16
 
 
 @dataclass(frozen=True)
-class Mark:
+class DrawnMark:
     """A circle and its number, in the axes' units."""
 
     text: str
@@ -151,7 +151,7 @@ def _draw_residual(axis: Axes, cloud: Cloud, evidence: Evidence) -> Any:
     return axis.scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
 
 
-def _marks(cloud: Cloud, detections: Sequence[Detection]) -> tuple[Mark, ...]:
+def _marks(cloud: Cloud, detections: Sequence[Detection]) -> tuple[DrawnMark, ...]:
     """One circle round each cluster."""
     marks = []
     for number, detection in enumerate(detections, start=1):
@@ -163,11 +163,11 @@ def _marks(cloud: Cloud, detections: Sequence[Detection]) -> tuple[Mark, ...]:
             u, v, margin = points[:, 0], points[:, 1], 2.0
         centre = 0.5 * (u.min() + u.max()), 0.5 * (v.min() + v.max())
         radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
-        marks.append(Mark(str(number), float(centre[0]), float(centre[1]), radius))
+        marks.append(DrawnMark(str(number), float(centre[0]), float(centre[1]), radius))
     return tuple(marks)
 
 
-def _draw_marks(axis: Axes, marks: Sequence[Mark]) -> None:
+def _draw_marks(axis: Axes, marks: Sequence[DrawnMark]) -> None:
     from matplotlib.patches import Circle
 
     width, height = _letter(axis)
@@ -195,7 +195,7 @@ def _limits(axis: Axes) -> tuple[float, float, float, float]:
 
 
 def label_places(
-    marks: Sequence[Mark], digit_width: float, height: float, limits: tuple[float, float, float, float]
+    marks: Sequence[DrawnMark], digit_width: float, height: float, limits: tuple[float, float, float, float]
 ) -> list[tuple[float, float]]:
     """A centre for each mark's number, so that no number covers another or a small circle, within the limits.
 
@@ -217,7 +217,7 @@ def label_places(
     return places
 
 
-def _candidates(mark: Mark, width: float, height: float) -> list[tuple[float, float]]:
+def _candidates(mark: DrawnMark, width: float, height: float) -> list[tuple[float, float]]:
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS - np.pi / 4
     # Large circles are labelled on their rim first: beyond it the number would lie far from what it names.
     gaps = [0.6 * height * step for step in range(1, 40)]

@@ -11,7 +11,7 @@ import numpy as np
 from harness.evaluation.maps import LARGE_MM, AgainstOne
 from harness.evaluation.registration import PARTS, trusted
 from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY, svg
-from harness.report.examples import MappedExample, PlacedView
+from harness.report.examples import MappedExample, ShownView
 from harness.report.view3d import SEVERAL, VIEW_COLOURS
 from harness.tables.text import inches
 
@@ -87,7 +87,7 @@ def fiducials_figure(example: MappedExample) -> str:
     return svg("fiducials", (10, 4.9), alt, draw)
 
 
-def methods_of(view: PlacedView) -> list[str]:
+def methods_of(view: ShownView) -> list[str]:
     """Ways in which a view is placed, the guess first, without the truth; at most `MOST_METHODS`."""
     named = [name for name in view.T_board_view if name not in ("truth", BEFORE, "nominal")]
     return ([BEFORE] if BEFORE in view.T_board_view else []) + named[: MOST_METHODS - 1]
@@ -156,13 +156,13 @@ def _log_ticks(axes: Axes) -> None:
     axes.tick_params(axis="y", color=PALE)
 
 
-def _marks(view: PlacedView, method: str) -> np.ndarray:
+def _marks(view: ShownView, method: str) -> np.ndarray:
     """(m, 3) the fiducial points in the board's frame as this method places them, mm."""
     T_board_view = view.T_board_view[method]
     return np.asarray(view.marks_mm @ T_board_view[:3, :3].T + T_board_view[:3, 3])
 
 
-def _one_mark(view: PlacedView) -> np.ndarray:
+def _one_mark(view: ShownView) -> np.ndarray:
     """(2,) the middle of the points about the mark farthest to the upper right."""
     points = _marks(view, "truth")[:, :2]
     corner = points[np.argmax(points.sum(axis=1))]
