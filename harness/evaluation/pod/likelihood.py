@@ -154,10 +154,15 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
     return place
 
 
+CLIMBED = 6
+"""Steep starts of which the search for a penalised maximum climbs."""
+
+
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
     """(d, 2) intercepts and slopes with the largest penalised likelihood of several studies, finite for separated data
     too. Logit and probit have one maximum; under cloglog and loglog the highest is taken that is reached from a flat
-    start, from a curve that fits the gap between the largest miss and the smallest hit, and from the best of others."""
+    start, from a curve that fits the gap between the largest miss and the smallest hit, and from the best
+    `CLIMBED` others."""
     z, hits = data.z, data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
@@ -172,8 +177,9 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
     flat = np.stack([link_ppf(data.link, share), np.ones(len(hits))], axis=1)
     rows = np.arange(len(hits))
-    best = steep[np.array([data.value(start) for start in steep]).argmax(axis=0), rows]
-    found = [ascend(climb, start, tolerance) for start in (flat, steep[0], best)]
+    # the start with the highest value can lie in the basin of a lower maximum, so several of the best are climbed
+    order = np.argsort([-data.value(start) for start in steep], axis=0, kind="stable")
+    found = [ascend(climb, start, tolerance) for start in (flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED]))]
     return np.asarray(np.array([place for place, _ in found])[np.argmax([value for _, value in found], axis=0), rows])
 
 
