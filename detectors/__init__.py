@@ -19,6 +19,7 @@ GROUP = "tofpod.detectors"
 BUILT_IN = {
     "blind": "detectors.controls:BlindDetector",
     "local": "detectors.local:LocalDetector",
+    "matched": "detectors.matched:MatchedDetector",
     "oracle": "detectors.controls:Oracle",
     "thesis": "detectors.thesis:ThesisDetector",
 }
@@ -34,8 +35,7 @@ def detector_names() -> tuple[str, ...]:
 def detector_type(name: str) -> Any:
     """Return the class behind a name; its ``settings_type`` is the Config that validates its settings.
 
-    Raises UserError on an unknown name (with the nearest one), on a name taken twice, and where a plug-in cannot be
-    imported, is no detector, or calls itself otherwise.
+    Raises UserError on an unknown name, a name taken twice, and a plug-in that is no detector or is called otherwise.
     """
     from harness.vocabulary.config import Config
 

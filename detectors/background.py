@@ -1,20 +1,17 @@
 """The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit is judged.
 
-The target is divided into cells of some 16 pixels or more, as the camera sees them. Their medians know little of the
-noise between neighbouring pixels and nothing of damage that is smaller than half a cell, so they are what shapes are
-chosen on: each shape predicts tiles of cells that it was not fitted to, and the simplest whose errors are not
-significantly larger than the best shape's is taken. Polynomials and quadrics come first; where neighbouring cells still
-depart together from the best of these, smooth free forms of ever shorter wavelength are tried on top of it.
-
-Not modelled: creases, several sheets, surfaces with real structure that is as small as damage.
+Shapes are chosen on the medians of cells of some 16 pixels or more: each shape predicts tiles of cells that it was not
+fitted to, and the simplest whose errors are not significantly larger than the best shape's is taken. Polynomials and
+quadrics come first; where neighbouring cells still depart together, smooth free forms of ever shorter wavelength are
+tried. Not modelled: creases, several sheets, surfaces with real structure that is as small as damage.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numba
@@ -22,21 +19,24 @@ import numpy as np
 
 from detectors.masks import grown, on_grid
 from detectors.noise import median_of, sigma_of
-from detectors.shapes import Fit, free_form, picture_places, polynomial, quadric
-from detectors.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
-from detectors.surface_kernels import bisquare_weights
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.units import MM
+from detectors.surface import (
+    BISQUARE_TUNING,
+    Fit,
+    SurfaceConfig,
+    bisquare_weights,
+    fit_surface,
+    free_form,
+    picture_places,
+    polynomial,
+    quadric,
+)
+from harness.vocabulary.geometry import MM, Cloud
 
-MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS = 3600, 16, 64, 600
-"""Cells at most, and points in each at least; with more than enough cells, points in each that outlast the correlation
-of noise in cameras that filter over 5 x 5 pixels."""
-FEW_CELLS = 40
-"""Least number by which a shape can be chosen and judged; with fewer a plane, or the stated degree, is fitted and not
+MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
+"""Cells at most, points in each at least, in each where there are enough cells; with few the shape is not
 questioned."""
 TILE_CELLS, FOLDS = 3, 5
 """Side of what is predicted together, in cells, and the number of parts that these tiles are dealt to."""
-DEGREES = (1, 2, 3, 4, 5)
 LEAST_SCALE_M = 0.04
 """Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows it."""
 WORTH = 0.1
@@ -47,27 +47,17 @@ NOISIER = 1.25
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
-"""Share of the target with structure beyond the noise: from the first on a free form is tried, from the second on the
-surface is said not to fit."""
-STRUCTURE_CELLS = 5
-"""Side of what is averaged to see structure larger than damage."""
-STRUCTURE_SIGMAS = 4.0
-SEEN = 0.5
-"""Structure below this share of a pixel's noise changes no finding."""
-
-FitTo = Callable[[np.ndarray, np.ndarray], Fit | None]
-"""Function of points (n, 3) and weights (n,) that fits a shape to them; None where it cannot."""
+"""Share with structure from which on a free form is tried, and from which on the surface is said not to fit."""
+STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
+"""Side of what is averaged to see structure, its least significance, and the share of a pixel's noise."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """The surface without its damage.
-
-    ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud less the surface; NaN off the mask and
-    where the surface cannot be judged. ``noise_m`` (h, w): standard deviation of the pixels' residuals round about, off
-    findings, without the surface's own misfit. ``scale_m``: width above which shallow damage is taken for shape; None
-    where the shape is no free form. ``warning``: a sentence where structure is left that would pass for damage.
-    """
+    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud
+    less the surface; NaN where it is not judged. ``noise_m`` (h, w): standard deviation of the residuals round about,
+    without the surface's own misfit. ``scale_m``: width above which shallow damage is taken for shape, of a free form.
+    ``warning``: a sentence where structure is left that would pass for damage."""
 
     surface_z_m: np.ndarray
     residual_m: np.ndarray
@@ -77,17 +67,12 @@ class Background:
     warning: str
     notes: dict[str, Any]
 
-    @property
-    def fits(self) -> bool:
-        """True where no structure is left that would pass for damage."""
-        return not self.warning
-
 
 @dataclass(frozen=True)
 class _Cells:
-    """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,): 1 for full cells.
-    ``of`` (n,): each point's cell; ``row``, ``column`` (c,): places in the grid of cells. ``noise`` (c,): standard
-    deviation of a pixel in the cell; ``side``: in the picture's units; ``side_m`` at the median distance."""
+    """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,); ``noise`` (c,): of a pixel
+    in the cell; ``level_noise``: of a median; ``of`` (n,): each point's cell, -1 for none; ``side``: in the picture's
+    units."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -112,46 +97,39 @@ class _Cells:
         return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
 
     def refreshed(self, points: np.ndarray, fit: Fit) -> _Cells:
-        """Return the cells with medians and deviations of the points' residuals to a surface."""
+        """Return the cells with medians and deviations of the points' residuals; some then count no more."""
         medians, deviations = _group_medians(points[:, 2] - fit(points), self.of, len(self.points))
         z = fit(self.points) + medians
         known = np.isfinite(z)
         moved = self.points * (z / self.points[:, 2])[:, None] if self.central else self.points.copy()
         moved[:, 2] = z
-        # cells that the surface does not reach keep their points and count no more
         moved[~known] = self.points[~known]
         weights = np.where(known, self.weights, 0.0)
         level_noise = _cell_noise(self.image(medians))[0]
         return replace(self, points=moved, weights=weights, noise=deviations, level_noise=level_noise)
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """A shape fitted to all cells."""
-
+class _Shape(NamedTuple):
     name: str
-    fit_to: FitTo
+    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None]
     fit: Fit
     weights: np.ndarray
-    wavelength: float | None = None
+    wavelength: float | None
 
 
 def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
-    """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true; all of them finite.
-
-    Deterministic. Raises UserError where the points do not determine the surface.
-    """
+    """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true. Deterministic. Raises
+    UserError where the points do not determine it."""
     points = np.ascontiguousarray(cloud.points_m[mask])
-    cells = _cells(points, cloud.projection == "central" and float(points[:, 2].min()) > 0)
+    cells = _cells(points, cloud)
     if cells is None:
-        # a plane, or the stated polynomial, and nobody can tell whether it fits
         name, fit = _stated(points, config if config.shape == "polynomial" else SurfaceConfig(degree=1))
         fitted = fit(points)
         noise_m = sigma_of(points[:, 2] - fitted)
         warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
+        few: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
         z_m, residual_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted))
-        unknown: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
-        return Background(z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, unknown)
+        return Background(z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, few)
     wavelength = None
     if config.shape == "polynomial":
         name, fit = _stated(points, config)
@@ -165,10 +143,10 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     fitted = fit(points)
     unseen = ~np.isfinite(fitted)
     if cells.central:
-        # few pixels are near enough to the steepest incidence to be looked at each
+        # few pixels are near enough to the steepest incidence to be looked at each; a ray that misses the surface
+        # beside the pixel gives NaN: not below the limit either
         near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
         looked = np.flatnonzero((cells.of < 0) | near[cells.of])
-        # a ray that misses the surface beside the pixel gives NaN: not below the limit either
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
     fitted[unseen] = np.nan
     cells = cells.refreshed(points, fit)
@@ -178,16 +156,13 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
         text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
     if unseen.mean() > 0.001:
-        text += (
-            f"; {100 * unseen.mean():.1f} % of the target, seen at more than {STEEPEST_DEG:g} degrees, is not judged"
-        )
+        steep = f"seen at more than {STEEPEST_DEG:g} degrees"
+        text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
     # a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is much more
-    image = cells.image(cells.noise)
-    rows, columns = image.shape
-    padded = np.pad(image, 3, constant_values=np.nan)
-    around = np.stack([padded[i : i + rows, j : j + columns] for i in range(7) for j in range(7)])
+    padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))[cells.row, cells.column].reshape(-1, 49)
     with np.errstate(all="ignore"):
-        local = np.hypot(np.nanmedian(around[:, cells.row, cells.column], axis=0), cells.level_noise)
+        local = np.hypot(np.nanmedian(around, axis=1), cells.level_noise)
     pixel = cells.pixel_noise
     noise = np.where(cells.of >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.of], pixel)
     z_m, residual_m, noise_map_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted, noise))
@@ -196,14 +171,9 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """Return a sentence where a surface that was stated, not chosen, leaves structure that would pass for damage; else
-    "".
-
-    ``residual_m`` (h, w): of the cloud to the surface, NaN where nothing was judged; ``surface``: its name.
-    """
+    """Return a sentence where a stated ``surface`` leaves structure in ``residual_m`` (h, w) like damage."""
     mask = np.isfinite(residual_m)
-    points = cloud.points_m[mask]
-    cells = _cells(points, cloud.projection == "central" and len(points) > 0 and float(points[:, 2].min()) > 0)
+    cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
         return ""
     medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
@@ -218,13 +188,11 @@ def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
     return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
 
 
-# ---------------------------------------------------------------- cells
-
-
-def _cells(points: np.ndarray, central: bool) -> _Cells | None:
-    """Return the cells of points (n, 3); None where they fill too few."""
+def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
+    """Return the cells of points (n, 3) of a cloud; None where they fill too few."""
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
+    central = cloud.projection == "central" and float(points[:, 2].min()) > 0
     places = picture_places(points, central)
     low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-12)
     wanted = max(min(max(CELL_POINTS, len(points) / ENOUGH_CELLS), EVEN_CELL_POINTS), len(points) / MOST_CELLS)
@@ -253,8 +221,7 @@ def _cells(points: np.ndarray, central: bool) -> _Cells | None:
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of each group's finite values, and their median distance from it over 0.6745; NaN without
-    values."""
+    """Return the median of each group's finite values, and their median distance from it over 0.6745; NaN without."""
     starts = np.zeros(groups + 1, np.int64)
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
@@ -275,16 +242,13 @@ def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[
 
 
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:
-    """Return the standard deviation of cells' medians, from second differences over every other cell along rows and
-    columns, which are blind to slopes; and the correlation of neighbours, from those over neighbours."""
+    """Return the deviation of cells' medians and their neighbours' correlation, from second differences."""
 
     def bend(step: int) -> float:
-        twice = 2 * step
-        down = image[twice:] - 2 * image[step:-step] + image[:-twice]
-        across = image[:, twice:] - 2 * image[:, step:-step] + image[:, :-twice]
-        bends = np.concatenate([down.ravel(), across.ravel()])
-        bends = bends[np.isfinite(bends)]
-        return sigma_of(bends) if len(bends) else 0.0
+        bends = [each[2 * step :] - 2 * each[step:-step] + each[: -2 * step] for each in (image, image.T)]
+        some = np.concatenate([each.ravel() for each in bends])
+        some = some[np.isfinite(some)]
+        return sigma_of(some) if len(some) else 0.0
 
     near, far = bend(1), bend(2)
     # of cells with variance s^2 and correlation r with their neighbours only: (6 - 8 r) s^2 and 6 s^2
@@ -292,18 +256,14 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
     return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
 
 
-# ---------------------------------------------------------------- choice
-
-
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     shapes: list[_Shape] = []
     errors: list[np.ndarray] = []
-    worth = WORTH * cells.pixel_noise
-    formulas: list[tuple[str, FitTo]] = [
-        ("plane" if degree == 1 else f"polynomial of degree {degree}", partial(polynomial, degree=degree))
-        for degree in DEGREES
-    ]
-    formulas.insert(2, ("quadric", partial(quadric, central=cells.central)))
+    worth, auto = WORTH * cells.pixel_noise, config.shape == "auto"
+    degrees = {degree: partial(polynomial, degree=degree) for degree in (1, 2, 3, 4, 5)}
+    formulas: list[tuple[str, Any]] = [("plane", degrees[1]), ("polynomial of degree 2", degrees[2])]
+    formulas += [("quadric", partial(quadric, central=cells.central))]
+    formulas += [(f"polynomial of degree {degree}", degrees[degree]) for degree in (3, 4, 5)]
     for name, fit_to in formulas:
         shape = _fitted(cells, name, fit_to, None)
         if shape is not None:
@@ -313,30 +273,25 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
         if len(shapes) > 2 and _simplest(errors, worth) <= len(shapes) - 3:
             break
     best = shapes[_simplest(errors, worth)]
-    if config.shape == "auto" and _structure(cells, best.fit)[0] < FREE_FORM_FROM:
+    if auto and _misfit(cells, best.fit, "")[1]["misfit_share"] < FREE_FORM_FROM:
         return best
     base = shapes[int(np.argmin([each.mean() for each in errors]))]
-    free = [best] if config.shape == "auto" else []
-    # wavelengths in the picture's units, long ones first: down to twice what is predicted together, or the least scale
-    cells_long: float = max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1
-    ladder = [cells_long * cells.side]
-    while (cells_long := cells_long / 1.6) >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
-        ladder.append(cells_long * cells.side)
+    # wavelengths in cells, long ones first: down to twice what is predicted together, or the least scale
+    ladder: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
+    while ladder[-1] / 1.6 >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
+        ladder.append(ladder[-1] / 1.6)
     if config.scale_mm is not None:
-        ladder = [2 * config.scale_mm * MM * cells.side / cells.side_m]
-    for wavelength in ladder:
+        ladder = [2 * config.scale_mm * MM / cells.side_m]
+    free = [best] if auto else []
+    for wavelength in (each * cells.side for each in ladder):
         fit_to = partial(free_form, base=base.fit, wavelength=wavelength, cell=cells.side, central=cells.central)
         made = _fitted(cells, "free form", fit_to, wavelength)
-        if made is not None:
-            free.append(made)
+        free += [] if made is None else [made]
     return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
 
 
-def _fitted(cells: _Cells, name: str, fit_to: FitTo, wavelength: float | None, widened: bool = False) -> _Shape | None:
-    """Fit the shape by bisquare weights; ``widened``: what borders on cells without weight loses its own, for the flank
-    of a dent departs too little to be noticed and enough to bend the surface. None where it cannot be fitted, or misses
-    one cell in fifty."""
-    fit: Fit | None = None
+def _fitted(cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False) -> _Shape | None:
+    """Fit by bisquare weights, ``widened`` by the flanks of dents; None where a cell in fifty is missed."""
     weights, floor = cells.weights, 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
     for _ in range(6):
         fit = fit_to(cells.points, weights)
@@ -356,13 +311,12 @@ def _fitted(cells: _Cells, name: str, fit_to: FitTo, wavelength: float | None, w
         weights = cells.weights * robust
         if np.abs(weights - before).max() < 0.05:
             break
-    return None if fit is None else _Shape(name, fit_to, fit, weights, wavelength)
+    return _Shape(name, fit_to, fit, weights, wavelength)
 
 
 def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
     """Return the median size (tiles,) of the errors in each tile of cells, predicted from the tiles of other folds."""
-    across = cells.column // TILE_CELLS
-    down = cells.row // TILE_CELLS
+    across, down = cells.column // TILE_CELLS, cells.row // TILE_CELLS
     fold = (across + 2 * down) % FOLDS
     error = np.full(len(cells.points), np.inf)
     for left_out in range(FOLDS):
@@ -375,59 +329,46 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
     return _group_medians(np.abs(error), tile, int(tile.max()) + 1)[0]
 
 
-def _simplest(errors: Sequence[np.ndarray], worth: float) -> int:
-    """Return the first of shapes, simple ones first, whose mean error over tiles is above the least by no more than
-    ``worth`` or a standard error of the difference. ``errors``: (tiles,) of each shape."""
-    means = [each.mean() for each in errors]
-    best = int(np.argmin(means))
-    for i in range(best):
-        difference = errors[i] - errors[best]
-        if means[i] - means[best] <= max(worth, float(difference.std()) / np.sqrt(len(difference))):
+def _simplest(errors: list[np.ndarray], worth: float) -> int:
+    """Return the first shape whose mean error is above the least by no more than ``worth`` or a standard error."""
+    best = int(np.argmin([each.mean() for each in errors]))
+    for i, each in enumerate(errors):
+        difference = each - errors[best]
+        if each.mean() - errors[best].mean() <= max(worth, float(difference.std()) / np.sqrt(len(difference))):
             return i
     return best
 
 
-# ---------------------------------------------------------------- goodness of fit
-
-
-def _structure(cells: _Cells, fit: Fit) -> tuple[float, float]:
-    """Return the share of the cells that take part in structure, and its rms in metres."""
+def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
+    """Return a warning where structure is left that would pass for damage, else ""."""
     error = cells.points[:, 2] - fit(cells.points)
-    known = np.isfinite(error) & (cells.weights > 0)
-    image = cells.image(np.where(known, error, np.nan))
-    noise, shared = _cell_noise(image)
+    image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
+    (noise, shared), pixel = _cell_noise(image), cells.pixel_noise
     # compact findings stand out of their neighbourhood's median; structure makes the neighbourhood
-    size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
     valid = np.isfinite(image)
     limit = np.nanmedian(np.abs(image)) / 0.6745 * BISQUARE_TUNING
     used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
-    count = cv2.boxFilter(used.astype(float), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    total = cv2.boxFilter(np.where(used, image, 0.0), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    smooth = total / np.maximum(count, 1)
-    enough = valid & (count >= 9)
+    size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
+    count, total = (
+        cv2.boxFilter(each, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (used.astype(float), np.where(used, image, 0.0))
+    )
+    smooth, enough = total / np.maximum(count, 1), valid & (count >= 9)
     chance = STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1))
-    beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * cells.pixel_noise))
-    rms = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
-    return float(beyond.sum() / max(enough.sum(), 1)), rms
-
-
-def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
-    """Return a warning where structure is left that would pass for damage; and what was measured."""
-    share, rms_m = _structure(cells, fit)
-    notes: dict[str, Any] = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": cells.pixel_noise}
-    if share < MISFIT_FROM:
-        return "", notes
+    beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
+    rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
+    share = float(beyond.sum() / max(enough.sum(), 1))
     text = (
         f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
-        f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is"
-        f" {1e3 * notes['local_noise_m']:.2g} mm, on {100 * share:.0f} % of the target; findings there may be its shape"
+        f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
+        f" {100 * share:.0f} % of the target; findings there may be its shape"
     )
-    return text, notes
+    notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
+    return (text if share >= MISFIT_FROM else ""), notes
 
 
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
-    """Return the angle (n,) between the ray and the surface's normal, from the surface a ``step`` in x/z and in y/z
-    beside it."""
+    """Return the angle (n,) between the ray and the surface's normal, from the surface a ``step`` beside it."""
 
     def on_surface(dx: float, dy: float) -> np.ndarray:
         rays = points / points[:, 2:] + [dx, dy, 0.0]

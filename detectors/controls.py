@@ -1,8 +1,4 @@
-"""Two detectors that test the harness, not a target: the oracle is handed the truth, the blind detector guesses.
-
-Whatever a study says of the oracle beyond every damage found once is a fault of the study. The blind detector must
-score what chance gives: its false calls, and no more hits than places that happen to lie near a damage.
-"""
+"""Two detectors that test the harness, not a target: the oracle is handed the truth, the blind detector guesses."""
 
 from __future__ import annotations
 
@@ -17,14 +13,12 @@ from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement, TrueDamage
 from detectors.measure import measure_extents
 from detectors.score_map import above
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 
-UNIT_M = 1.0 * MM
-"""Length of one unit of score: neither score is a length, and tables ask for one."""
+UNIT_M = 1.0 * MM  # length of one unit of score: neither score is a length, and tables ask for one
 
 
 class OracleConfig(Config):
@@ -32,11 +26,7 @@ class OracleConfig(Config):
 
 
 class Oracle:
-    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else.
-
-    Implements `detectors.interface.ToldTheTruth`, and `detectors.interface.Detector` once it was told. Its findings are
-    the truth as it stands, so a damage none of whose pixels has a range is found like any other.
-    """
+    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else."""
 
     settings_type: ClassVar[type[OracleConfig]] = OracleConfig
     name = "oracle"
@@ -52,10 +42,7 @@ class Oracle:
         return Oracle(self.settings, tuple(truth))
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score 1 on the pixels of true damage, 0 on all others with a point; the surface is the cloud itself.
-
-        Raises UserError where it was not told the truth, and where the cloud has no valid point.
-        """
+        """Score 1 on the pixels of true damage, 0 on others. Raises UserError where it was not told the truth."""
         truth = self._known()
         if not cloud.valid.any():
             raise UserError("the cloud has no valid point to judge", fix="check the capture")
@@ -67,9 +54,8 @@ class Oracle:
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return the damages, in the truth's order, below a threshold of 1; nothing from 1 on."""
-        if not threshold < 1.0:
-            return ()
-        return tuple(Detection(1.0, np.sort(damage.pixels), damage.centre_m) for damage in self._known())
+        known = self._known() if threshold < 1.0 else ()
+        return tuple(Detection(1.0, np.sort(damage.pixels), damage.centre_m) for damage in known)
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return 1 where there is damage, 0 on a hole-free board."""
@@ -93,8 +79,7 @@ class Oracle:
 
 
 class BlindConfig(Config):
-    """``guesses_per_m2``: mean number of guesses on a square metre of what the crop leaves. Above a threshold t there
-    are exp(-t) times as many, so that one false call per square metre needs t = ln(guesses_per_m2)."""
+    """``guesses_per_m2``: mean number of guesses on a square metre; above a threshold t exp(-t) times as many."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     guesses_per_m2: float = Field(default=400.0, gt=0, le=1e6)
@@ -102,12 +87,8 @@ class BlindConfig(Config):
 
 
 class BlindDetector:
-    """Random: guesses without looking, at a stated number per square metre, with exponential scores.
-
-    A Poisson number of guesses falls on the judged pixels, each pixel as likely as any other. The stream is that of
-    the seed and of the cloud's bytes: the same cloud gives the same guesses, another draw of noise independent ones.
-    So, unlike a detector's, they do not move with the cloud. Implements `detectors.interface.Detector`.
-    """
+    """Random: guesses without looking, at a stated number per square metre, with exponential scores; the same cloud
+    gives the same guesses, another draw of noise independent ones."""
 
     settings_type: ClassVar[type[BlindConfig]] = BlindConfig
     name = "blind"
@@ -150,10 +131,8 @@ class BlindDetector:
 
 
 def judged_area_m2(cloud: Cloud, mask: np.ndarray) -> float:
-    """Return the area of the surface that a mask (h, w) of pixels covers: that of its cells across the optical axis,
-    over the cosine of the tilt of its plane (a curved face's area is a little more). Cells lie between four pixels of
-    the mask, and their signed areas add up to that of the outline, so that noise along the rays does not make a surface
-    larger. Of a cloud without a grid it is the area of the convex hull."""
+    """Return the area of the surface that a mask (h, w) of pixels covers: of its cells between four pixels across the
+    optical axis, over the cosine of the tilt of its plane. Of a cloud without a grid the area of the convex hull."""
     from scipy.spatial import ConvexHull, QhullError
 
     x, y, z = cloud.points_m[mask].T

@@ -1,23 +1,245 @@
-"""The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface."""
+"""The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface.
+
+Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
+through its hole, or they only meet. The surface with the best odds is proposed; where some are poor, the choice is
+called doubtful. The odds are a model of how people take pictures of a target, not a measured rate.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, NamedTuple
 
+import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import inset
-from detectors.target import Choice, propose
-from harness.vocabulary.capture import Cloud
+from detectors.masks import grown, holes_filled, inset, nearest_pixel
+from detectors.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud
+
+DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
+CENTRE_SPREAD = 0.25
+"""Standard deviation of the weight that pixels have, as a share of the picture's width and height: people aim at the
+target."""
+LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
+"""Weight in the view at which a thing is as likely the target as the surface that it lies on, or stands far before."""
+OBSTACLE_AREA = 0.2
+"""Area, as a part of that of a target seen whole behind it, at which a thing before it is as likely the target."""
+GRAZING = 0.5
+"""Cosine of the tilt, 60 degrees, beyond which a surface counts for less: nobody inspects at a grazing angle, and the
+pixels that mix two surfaces look like a third that is seen so."""
+STEEPNESS = 2.0  # odds grow with this power of weights and areas
+SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
+"""Part of its outline that must border on a surface for a thing to lie on it; from which on two are neighbours; and
+part of a common border that must be a step."""
+CUT_OFF = 0.15
+"""Part of its outline on the edge of the picture from which on a surface goes on outside of it, as walls and floors."""
+ENCLOSED, MOST_SAMPLES = 0.9, 20_000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A surface that may be the target. ``outline`` (h, w) bool on the choice's grid: its pixels and what they enclose,
+    but for other candidates before it. ``distance_m``, ``nearest_m``, ``farthest_m``: median, 1st and 99th percentile
+    of z. ``extent_m``: sides of the smallest rectangle around it in its mean plane, longer first. ``share``: part of
+    all pixels. ``weight``: the same, weighted towards the centre, less at a grazing angle. ``cut_off``: part of its
+    outline on the picture's edge."""
+
+    outline: np.ndarray
+    pixels: int
+    distance_m: float
+    nearest_m: float
+    farthest_m: float
+    extent_m: tuple[float, float]
+    share: float
+    weight: float
+    tilt_deg: float
+    cut_off: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``candidates``: the proposal first; ``taken``: number, from 1, of the one that was taken. ``mask`` (h, w) bool:
+    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: why the choice is doubtful."""
+
+    candidates: tuple[Candidate, ...]
+    taken: int
+    mask: np.ndarray
+    grid: Cloud
+    warnings: tuple[str, ...] = ()
+
+
+class _Border(NamedTuple):
+    """Border on another surface: its ``part`` of the outline, whether it is a step, and its height in metres."""
+
+    part: float
+    is_step: bool
+    behind_m: float
+
+
+def propose(cloud: Cloud, crease_deg: float, smooth_px: int, inset_px: int, wanted: int | None) -> Choice:
+    """Choose the target of a cloud with a valid point: the proposal, or candidate number ``wanted``."""
+    grid, spacings = cloud, 1.0
+    if not cloud.organised:
+        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
+        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
+        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
+    candidates, doubts = _candidates(smooth_surfaces(grid, crease_deg, smooth_px), grid)
+    if wanted is not None and wanted > len(candidates):
+        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+        raise UserError(
+            f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
+            legal=f"1 to {len(candidates)}:{known}" if candidates else "none",
+            fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
+        )
+    taken = wanted or 1
+    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    mask = inset(mask, inset_px)
+    if not cloud.organised:
+        kept, mask = mask, cloud.valid.copy()
+        mask[mask] = kept[rows, columns]
+    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
+    return Choice(candidates, taken, mask, grid, warnings)
+
+
+def described_text(candidate: Candidate) -> str:
+    """Return distance, extent, share of the view and tilt in words."""
+    long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
+    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f} m"
+    share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
+    return (
+        f"{candidate.distance_m:.2f} m away ({depths}), {long} x {short} mm, {share} % of the view, tilted by"
+        f" {candidate.tilt_deg:.0f} degrees"
+    )
+
+
+def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
+    """Return the candidates, best odds first, and what makes the first doubtful."""
+    numbers = range(len(surfaces.own))
+    described = [_described(surfaces, grid, number) for number in numbers]
+    borders = [_borders(surfaces, grid, number) for number in numbers]
+
+    def encloses(outer: int, inner: int) -> bool:
+        own = surfaces.own[inner]
+        return bool(np.count_nonzero(own & surfaces.filled[outer]) >= ENCLOSED * np.count_nonzero(own))
+
+    def before(front: int, back: int) -> tuple[float, str] | None:
+        """Return the probability that ``front`` is the target, and the reason for a doubt."""
+        ours = borders[front].get(back)
+        if ours is None or not ours.is_step:
+            return None
+        it, other = described[front], described[back]
+        covered = f"{100 * it.share:.2g} % of the view"
+        if encloses(front, back):
+            opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
+            return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
+        if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
+            why = f"a thing that covers {covered} lies on a larger surface, or is fixed before it"
+            return _probability(it.weight / LYING_WEIGHT), why
+        if other.cut_off < CUT_OFF:
+            ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            why = f"a thing that covers {covered} stands before a surface that is seen whole"
+            return _probability(ratio / OBSTACLE_AREA), why
+        return _probability(it.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
+
+    def judged(i: int, j: int) -> tuple[float, str]:
+        """Return the probability that surface i and not j is the target, and the reason for a doubt."""
+        if i == j:
+            return 1.0, ""
+        ahead, behind = before(i, j), before(j, i)
+        if ahead is not None:
+            return ahead
+        if behind is not None:
+            return 1.0 - behind[0], behind[1]
+        # of two that meet, or have nothing to do with one another, weight, a frontal view and nearness count
+        it, other = described[i], described[j]
+        ratio = it.weight / max(other.weight, 1e-9)
+        facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+        near = other.distance_m / max(it.distance_m, 1e-6)
+        return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
+
+    table = [[judged(i, j) for j in numbers] for i in numbers]
+    odds = [sum(math.log(probability) for probability, _ in row) for row in table]
+    order = sorted(numbers, key=lambda number: (-odds[number], number))
+    candidates = []
+    for number in order:
+        # without what it encloses and what stands before it as a target of its own; a thing that lies on it stays
+        outline = described[number].outline
+        for other in numbers:
+            border = borders[other].get(number)
+            if border and border.is_step and table[other][number][0] >= 0.5 and encloses(number, other):
+                outline = outline & ~grown(surfaces.filled[other], surfaces.reach_px)
+        candidates.append(replace(described[number], outline=outline))
+    against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
+    doubts = [
+        f"{why} (--target {place} takes the other)"
+        for place, probability, why in against
+        if probability < DOUBTFUL_BELOW
+    ]
+    return tuple(candidates), doubts
+
+
+def _probability(odds_base: float) -> float:
+    odds = max(odds_base, 1e-9) ** STEEPNESS
+    return min(max(odds / (1.0 + odds), 1e-4), 1.0 - 1e-4)
+
+
+def _described(surfaces: Surfaces, grid: Cloud, number: int) -> Candidate:
+    own, filled = surfaces.own[number], surfaces.filled[number]
+    places = np.flatnonzero(own)
+    some = grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
+    near, median, far = np.quantile(some[:, 2], (0.01, 0.5, 0.99)).tolist()
+    centred = some - some.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    facing = min(abs(float(axes[2, 0])), 1.0)
+    # the smallest rectangle around it in its own plane, without the outermost hundredth
+    plan = centred @ axes[:, 1:]
+    turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
+    along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    low, high = np.quantile(along, (0.005, 0.995), axis=0)
+    short, long = sorted(((high - low) / 0.99).tolist())
+    # pixels weighted by a Gaussian about the picture's centre
+    row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in own.shape)
+    weight = float(row @ own @ column / (row.sum() * column.sum())) * min(1.0, (facing / GRAZING) ** 2)
+    # the picture's edge; without a pixel grid, what no point lies beyond
+    outline = filled & ~(cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
+    if grid.organised:
+        edge = np.ones(filled.shape, dtype=bool)
+        edge[1:-1, 1:-1] = False
+    else:
+        edge = grown(~holes_filled(grown(grid.valid, 2)), 3)
+    cut_off = int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
+    share, tilt_deg = len(places) / own.size, math.degrees(math.acos(facing))
+    return Candidate(filled, len(places), median, near, far, (long, short), share, weight, tilt_deg, cut_off)
+
+
+def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]:
+    """Return the borders on the surfaces beyond this one's outline, by their numbers."""
+    apart, nearest = nearest_pixel(surfaces.own[number])
+    ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~surfaces.filled[number])
+    z, seeds = grid.points_m[..., 2].reshape(-1), nearest.reshape(-1)
+    outline = len(np.unique(seeds[ring]))
+    found = {}
+    for other in range(len(surfaces.own)):
+        there = ring[surfaces.own[other].reshape(-1)[ring]]
+        part = len(np.unique(seeds[there])) / max(outline, 1)
+        if other != number and part >= BORDERING:
+            steps = z[there] - z[seeds[there]]
+            behind = steps[steps > surfaces.contact_m]
+            ahead, back = len(behind) / len(steps), float((steps < -surfaces.contact_m).mean())
+            away = float(np.median(behind)) if len(behind) else 0.0
+            found[other] = _Border(part, ahead >= STEP_PART and ahead > 2.0 * back, away)
+    return found
+
 
 RIM_PX = 3
-"""Width of the rim where a depth pixel mixes target and background: a 5 x 5 window (Azure Kinect's engine, OpenK4A)
-reaches 2 pixels, and the edge itself passes through a third. Kinect v2's 3 x 3 window leaves 2. Depth aligned to a
-finer colour camera needs as many *depth* pixels: 2.4 times as many for the Azure Kinect's binned WFOV at 1280 x 720."""
+"""Width of the rim where a depth pixel mixes target and background: a 5 x 5 window reaches 2 pixels, and the edge
+passes through a third."""
 
 
 class _Crop(Config):
@@ -34,11 +256,9 @@ class NoCrop(_Crop):
 
 
 class BoxCrop(_Crop):
-    """Points inside an open box in the camera's frame; the defaults are the thesis'.
-
-    ``range_max_m`` limits sqrt(x^2 + z^2). ``keep_fraction`` then multiplies the remaining points' extreme x and y, as
-    the thesis' fit script does with 0.75: it shortens a target that surrounds the optical axis on all four sides.
-    """
+    """Points inside an open box in the camera's frame; the defaults are the thesis'. ``range_max_m`` limits sqrt(x^2 +
+    z^2). ``keep_fraction`` then multiplies the remaining points' extreme x and y, as the thesis' fit script does with
+    0.75."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
@@ -64,18 +284,12 @@ class PolygonCrop(_Crop):
 
 
 class AutoCrop(_Crop):
-    """The nearest large smooth surface (`detectors.target`), or candidate number ``target`` of those that a run lists.
+    """The nearest large smooth surface, or candidate number ``target`` of those that a run lists.
 
     Neighbours are joined where the step in z is no more than a tilted surface and noise explain and the surface does
-    not bend by more than ``crease_deg`` over ``smooth_px`` (`detectors.smooth_surfaces` says when that is another
-    number); then its holes are filled, so that damage and whatever lies on it or inside its outline stay; then
-    ``inset_px`` comes off its rim (`RIM_PX` says why 3). A background so close behind that the camera's blur leaves no
-    crease is taken for target (13 mm behind the face, at 0.7 m with a 5 x 5 window; at 33 mm it is not).
-
-    Without a pixel grid: the same on a raster of x/z, y/z (of x, y where the cloud cannot have been recorded from its
-    origin) that holds the nearest point of each cell; all points of a kept cell are kept. ``smooth_px`` counts
-    distances between neighbours, ``inset_px`` is the least number of them that is taken off, and the image's edge,
-    which such a cloud does not tell, is a rim. Several views laid over one another have closer neighbours than one.
+    not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, and ``inset_px`` comes off its
+    rim. A background so close behind that the camera's blur leaves no crease is taken for target (13 mm behind the
+    face, at 0.7 m with a 5 x 5 window). Without a pixel grid: the same on a raster of the nearest points.
     """
 
     kind: Literal["auto"] = "auto"
@@ -91,10 +305,8 @@ CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
 
 
 def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
-    """Return (h, w) bool: the valid pixels that belong to the target.
-
-    Raises UserError where nothing is left, with the cloud's actual extent, and for a polygon on a cloud without a grid.
-    """
+    """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError where nothing is left, with the
+    cloud's extent, and for a polygon on a cloud without a grid."""
     if not cloud.valid.any():
         raise UserError("the cloud has no valid point to crop", fix="check the capture")
     if isinstance(config, AutoCrop):
@@ -138,18 +350,16 @@ def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
     x, y, z = np.moveaxis(cloud.points_m, -1, 0)
-    inside = cloud.valid
+    limits = [(v, low * MM, high * MM) for v, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm))]
     with np.errstate(invalid="ignore"):
-        for values, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm)):
-            inside = inside & (values > low * MM) & (values < high * MM)
+        inside = np.logical_and.reduce([cloud.valid, *((v > low) & (v < high) for v, low, high in limits)])
         if config.range_max_m is not None:
             inside &= np.hypot(x, z) < config.range_max_m
         if config.keep_fraction < 1.0 and inside.any():
             part = config.keep_fraction
             limits = [(v, part * v[inside].min(), part * v[inside].max()) for v in (x, y)]
-            for values, low, high in limits:
-                inside = inside & (values > low) & (values < high)
-    return inside
+            inside = np.logical_and.reduce([inside, *((v > low) & (v < high) for v, low, high in limits)])
+    return np.asarray(inside)
 
 
 def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:

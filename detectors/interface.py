@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Cloud
 
 
 @dataclass(frozen=True)
 class Evidence:
     """A detector's knowledge about each pixel of a cloud before any threshold is applied.
 
-    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion
-    (invalid, cropped). ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted
-    surface. ``surface_z_m`` (h, w): the fitted surface. ``scale_m``: the standard deviation that one unit of score is.
-    ``warnings``: full sentences on what makes these numbers unreliable (the surface does not fit, ...); every program
-    shows them before anything else. ``behind`` (h, w) bool: whether the score speaks for something behind the surface;
-    None where the residual's own sign says so. ``unit``: what a unit of score is, in words, where scores are not
-    residuals over a deviation; ``scale_m`` is then the least that a unit is at a typical point.
+    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion.
+    ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted surface, ``surface_z_m``
+    (h, w). ``scale_m``: the standard deviation that one unit of score is. ``warnings``: full sentences on what makes
+    these numbers unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score speaks for
+    something behind the surface; None where the residual's own sign says so. ``unit``: what a unit of score is, in
+    words, where scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point.
     """
 
     score: np.ndarray
@@ -50,13 +48,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class MissingReturns:
-    """Pixels without a return inside the target's outline.
+    """Pixels without a return inside the target's ``outline`` (h, w) bool.
 
-    ``outline`` (h, w) bool. ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing.
-    ``blind``: share of the outline's pixels that returned nothing in any frame. ``dropouts``: rate of scattered missing
-    pixels on the target. ``least_points``: connected pixels from which on a cluster is a finding, ``expected`` the
-    number of chance clusters of that size and more. ``detections``: kind "no return", largest first; the score is the
-    Gaussian deviation that is as improbable as the expected number of chance clusters as large, at most 37.
+    ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing. ``blind``: share of the
+    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: connected
+    pixels from which on a cluster is a finding, ``expected`` the number of chance clusters of that size and more.
+    ``detections``: kind "no return", largest first; the score is the Gaussian deviation that is as improbable as the
+    expected number of chance clusters as large, at most 37.
     """
 
     outline: np.ndarray
@@ -80,12 +78,8 @@ class MissingReturns:
     @property
     def facts(self) -> dict[str, float]:
         """Figures as plain data."""
-        return {
-            "blind_share": self.blind,
-            "scattered_dropouts": self.dropouts,
-            "least_points": self.least_points,
-            "expected_by_chance": self.expected,
-        }
+        facts = {"blind_share": self.blind, "scattered_dropouts": self.dropouts}
+        return {**facts, "least_points": self.least_points, "expected_by_chance": self.expected}
 
 
 @dataclass(frozen=True)
@@ -128,15 +122,6 @@ class ToldTheTruth(Protocol):
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
-        ...
-
-
-@runtime_checkable
-class FindsAtOnce(Protocol):
-    """A detector that returns the findings of many thresholds in one pass; no detector need implement this."""
-
-    def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
-        """Return for each threshold the centres (m, 3) of what `Detector.find` finds at it, strongest first."""
         ...
 
 

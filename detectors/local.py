@@ -7,13 +7,11 @@ pattern and texture raise the threshold where they are, and only there. Findings
 neighbouring holes stay apart.
 
 Not modelled: the noise's spectrum (filters are not prewhitened), damage that is narrower than a pixel or wider than the
-widest filter, what texture has in common with damage, and steps of the noise: within a window of one, the quiet side's
-noise is taken for larger and the loud side's for smaller than it is.
+widest filter, what texture has in common with damage, and steps of the noise within a window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -24,7 +22,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from detectors.background import background
-from detectors.clusters import root_of
+from detectors.clusters import PLAIN
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, measure_detection
@@ -32,40 +30,34 @@ from detectors.noise import median_of, rounding_variances, sigma_of
 from detectors.score_map import above, on_grid
 from detectors.smooth_surfaces import raster
 from detectors.surface import SurfaceConfig
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
+from harness.vocabulary.geometry import Cloud
 
 HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)
 """Half-widths of the filters in pixels: a tent of half-width h is as wide at half of its height as a hole of 2 h + 1
 pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two."""
-SURROUNDINGS = 3
-"""The filter so many steps wider, 3.4 times as wide, is a filter's surroundings."""
-WIDEST_SHARE = 6.0
-"""The target is at least so many times as wide as the widest filter."""
+SURROUNDINGS, WIDEST_SHARE = 3, 6.0
+"""The filter so many steps wider, 3.4 times as wide, is a filter's surroundings; the target is at least so many times
+as wide as the widest filter."""
 FAINT = 0.02
 """Weight that 0 has in every mean."""
-CLIP_SIGMAS = 6.0
-"""Deviations of the local noise beyond which no single pixel counts for more: a flying pixel alone is no finding."""
-LEVEL_SIGMAS = 2.0
-"""The same for the local level and for surroundings, which damage must not draw."""
+CLIP_SIGMAS, LEVEL_SIGMAS = 6.0, 2.0
+"""Deviations of the local noise beyond which no single pixel counts for more: a flying pixel alone is no finding; and
+the same for the local level and for surroundings, which damage must not draw."""
 STRONG = 4.0
 """Pixels with such scores are kept out of surroundings and noise; from there to twice as much, by and by, out of the
 wider means of other pixels too."""
 GATE_SHARE, GATE_SIGMAS = 0.5, 1.5
 """Share of a wider filter's signal that narrower ones must confirm, and the noise that is granted to them."""
-WINDOW_WIDTHS, LEAST_WINDOW = 6, 32
+WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
 """Half of the window of the local noise: so many times the filter's half-width, and pixels at least: some 200
-independent means, which give a standard deviation to 8 %."""
-SAMPLES_SIDE = 14
-"""Samples from the middle of such a window to its edge: neighbours in a mean tell nothing new."""
+independent means, which give a standard deviation to 8 %; samples from its middle to its edge, as neighbours in a mean
+tell nothing new; and fewest finite samples of a local median."""
 SADDLE, PROMINENCE = 0.75, 1.5
 """Two peaks are one finding where the saddle between them is higher than this share of the lower, or fewer units of
 score below it than that."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
 """Frames from which on their scatter weighs pixels, averaged over a square: known to 12 % from 49 x 3 differences."""
-LEAST_SAMPLES = 32
-"""Finite samples of a local median; with fewer it is NaN."""
-PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 CORE = 0.5
 """A finding's size is taken of the pixels with this share of its score or more."""
 
@@ -117,7 +109,7 @@ class LocalDetector:
             rows, columns = rows - rows.min(), columns - columns.min()
         else:
             _, rows, columns, _ = raster(cloud.points_m[judged], cloud)
-        shape = (int(rows.max()) + 1, int(columns.max()) + 1)
+        shape = int(rows.max()) + 1, int(columns.max()) + 1
         place = rows * shape[1] + columns
         share = _shares(cloud, judged, ground.residual_m)
         weights = np.bincount(place, share, shape[0] * shape[1])
@@ -125,7 +117,7 @@ class LocalDetector:
         share, weights = share / typical, (weights / typical).reshape(shape).astype(np.float32)
         sums = np.bincount(place, share * ground.residual_m[judged], weights.size).reshape(shape)
         rounding_m2 = rounding_variances(cloud, judged)
-        signed, widths, typical_m = _scored(sums / np.maximum(weights, 1e-12), weights, rounding_m2)
+        signed, typical_m, unit = self.scored(sums / np.maximum(weights, 1e-12), weights, rounding_m2)
         cell = np.full(mask.shape, -1, dtype=np.int64)
         cell[judged] = place
         scores = on_grid(signed.ravel()[place], judged)
@@ -134,19 +126,22 @@ class LocalDetector:
             residual_m=ground.residual_m,
             surface_z_m=ground.surface_z_m,
             scale_m=typical_m,
-            notes={
-                **ground.notes,
-                "surface": ground.description,
-                "points": int(judged.sum()),
-                "filters_px": widths,
-            },
-            warnings=() if ground.fits else (ground.warning,),
+            notes={**ground.notes, "surface": ground.description, "points": len(rows)},
+            warnings=(ground.warning,) if ground.warning else (),
             behind=scores > 0,
-            unit=f"the local noise of means over {widths[0]} to {widths[-1]} pixels,"
-            f" {1e3 * typical_m:.3g} mm of the narrowest at a typical point",
+            unit=unit,
             signed=signed,
             cell=cell,
         )
+
+    def scored(
+        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    ) -> tuple[np.ndarray, float, str]:
+        """Return signed scores (r, c) of a picture of residuals with weights, 0 where nothing is known; the deviation
+        in metres of the narrowest filter at a typical point; and what a unit of score is, in words."""
+        signed, widths, typical_m = _scored(residual_m, weights, rounding_m2)
+        text = f"the local noise of means over {widths[0]} to {widths[-1]} pixels"
+        return signed, typical_m, f"{text}, {1e3 * typical_m:.3g} mm of the narrowest at a typical point"
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return peaks of the score with the pixels above the threshold that belong to each, strongest first. The
@@ -170,11 +165,6 @@ class LocalDetector:
             found.append(Detection(float(scores.max()), group, centre))
         return tuple(found)
 
-    def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
-        """Return the centres (m, 3) of the findings at each threshold."""
-        found = ([each.centre_m for each in self.find(cloud, evidence, float(k))] for k in thresholds)
-        return tuple(np.array(centres).reshape(-1, 3) for centres in found)
-
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the highest score."""
         return float(np.nanmax(evidence.score, initial=0.0))
@@ -188,10 +178,7 @@ class LocalDetector:
 
 def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:
     """Return the weight (n,) of each judged point: the median variance over its own, 4 at most; 1 where variances are
-    not known. The cloud's maker states them, or the frames' scatter round about and what is fixed in all frames.
-
-    The frames tell of a louder patch to the pixel, the local noise only to half a window.
-    """
+    not known. The cloud's maker states them, or the frames' scatter round about and what is fixed in all frames."""
     if cloud.mean_variance_m2 is not None:
         variances = cloud.mean_variance_m2[judged]
     else:
@@ -214,7 +201,7 @@ def _scored(
 ) -> tuple[np.ndarray, list[int], float]:
     """Return signed scores (r, c) of a picture ``residual`` (r, c) metres with ``weights`` (r, c), 0 where nothing is
     known; the filters' widths in pixels; and the deviation of the narrowest at a typical point, metres.
-    ``rounding_m2``: variances that rounding leaves, the same in all neighbours and different in each.
+    ``rounding_m2``: variances that rounding leaves, as `detectors.noise.rounding_variances` has them.
 
     From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
     wider ones of other pixels, over which it would spread; a strong pixel takes no part in surroundings and noise. A
@@ -233,7 +220,7 @@ def _scored(
     known, level = _tent(weights, widest) + FAINT, np.zeros_like(values)
     for _ in range(3):
         rest = values - level
-        sigma = _local_sigma(np.where(seen, rest, np.nan), LEAST_WINDOW, 1e-3)
+        sigma = local_sigma(np.where(seen, rest, np.nan), LEAST_WINDOW, 1e-3)
         limit = LEVEL_SIGMAS * sigma
         level = level + _tent(np.clip(rest, -limit, limit) * weights, widest) / known
     rest = values - level
@@ -253,7 +240,7 @@ def _scored(
             around, _ = _mean(modest, quiet * weights, wide)
             # differences are brought to the noise of a whole window
             difference = (mean - around) * worth
-            sigma = _local_sigma(np.where(seen & (quiet > 0), difference, np.nan), window, floor)
+            sigma = local_sigma(np.where(seen & (quiet > 0), difference, np.nan), window, floor)
             score = np.where(seen, difference / sigma, 0.0)
             quiet = np.minimum(quiet, np.clip(STRONG - np.abs(score), 0.0, 1.0))
         typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
@@ -262,7 +249,8 @@ def _scored(
         mean, covered = _mean(clipped, weights, half)
         kept.append((mean, around, sigma / np.sqrt(np.maximum(_worth(weights, covered, half), FAINT))))
     means, surroundings, deviations = (np.stack(images) for images in zip(*kept, strict=True))
-    grown = _strongest(means, surroundings, deviations, sure > 0, GATE_SHARE, GATE_SIGMAS)
+    grown = np.zeros_like(best)
+    grown[sure > 0] = _strongest(*(each[:, sure > 0] for each in (means, surroundings, deviations)))
     signed = np.where(grown * np.sign(best) > np.abs(best), best + sure * (grown - best), best)
     return signed.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
 
@@ -292,10 +280,21 @@ def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
     return np.asarray((covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)).astype(np.float32))
 
 
-def _local_sigma(values: np.ndarray, half: int, floor: float) -> np.ndarray:
+def local_sigma(values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0) -> np.ndarray:
     """Return the robust standard deviation (r, c) of the values' finite neighbours, interpolated between nodes ``half``
     apart."""
-    rows, columns = (_nodes(length, half) for length in values.shape)
+
+    def nodes_of(length: int) -> np.ndarray:
+        """Return the middles of equal parts, where `cv2.resize` takes its samples to lie, moved to pixels such that
+        they lie alike from both ends."""
+        count = max(1, round(length / half))
+        count += (length - count) % 2 if length % 2 == 0 else 0
+        half_pixel = 0.5 if length % 2 == 0 else 0.0
+        from_middle = (np.arange(count) + 0.5) * length / count - 0.5 * length
+        moved = np.sign(from_middle) * (np.round(np.abs(from_middle) - half_pixel) + half_pixel)
+        return np.asarray(np.round(moved + 0.5 * (length - 1)).astype(np.int64))
+
+    rows, columns = (nodes_of(length) for length in values.shape)
     sizes = np.abs(values).astype(np.float32)
     nodes = _local_medians(sizes, rows, columns, half, max(1, half // SAMPLES_SIDE)) / 0.6745
     known = np.isfinite(nodes)
@@ -304,20 +303,6 @@ def _local_sigma(values: np.ndarray, half: int, floor: float) -> np.ndarray:
     h, w = values.shape
     even = cv2.blur(nodes, (3, 3), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_LINEAR))
-
-
-def _nodes(length: int, spacing: int) -> np.ndarray:
-    """Return the middles of equal parts of about ``spacing`` pixels, where `cv2.resize` takes its samples to lie, moved
-    to pixels such that they lie alike from both ends."""
-    count = max(1, round(length / spacing))
-    count += (length - count) % 2 if length % 2 == 0 else 0
-    half_pixel = 0.5 if length % 2 == 0 else 0.0
-    from_middle = (np.arange(count) + 0.5) * length / count - 0.5 * length
-    moved = np.sign(from_middle) * (np.round(np.abs(from_middle) - half_pixel) + half_pixel)
-    return np.asarray(np.round(moved + 0.5 * (length - 1)).astype(np.int64))
-
-
-# ---------------------------------------------------------------- compiled loops
 
 
 @numba.njit(**PLAIN)
@@ -343,45 +328,36 @@ def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, ha
     return medians
 
 
-@numba.njit(**PLAIN)
-def _strongest(
-    means: np.ndarray, around: np.ndarray, deviation: np.ndarray, seen: np.ndarray, share: float, margin: float
-) -> np.ndarray:
-    """Return the largest (h, w) (mean - around) / deviation in size, with its sign, over filters (k, h, w) from narrow
-    to wide; 0 where no filter has its say.
-
-    A wide filter reaches over what lies beside it. So it has its full say only where all narrower means, ``means[:k]``,
-    depart from the same surroundings by ``share`` of what its own does, less ``margin`` of their deviations; and none
-    where one departs by half as much.
-    """
-    filters, h, w = means.shape
-    best = np.zeros((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            if not seen[y, x]:
-                continue
-            for k in range(filters):
-                signal = means[k, y, x] - around[k, y, x]
-                score = signal / deviation[k, y, x]
-                say = 1.0
-                for j in range(k):
-                    if abs(score) * say <= abs(best[y, x]):
-                        break
-                    confirmed = (means[j, y, x] - around[k, y, x]) / signal + margin * deviation[j, y, x] / abs(signal)
-                    say = min(say, max(2.0 * confirmed / share - 1.0, 0.0))
-                if abs(score) * say > abs(best[y, x]):
-                    best[y, x] = score * say
+def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Return the largest (n,) (mean - around) / deviation in size, with its sign, over filters (k, n) from narrow to
+    wide; 0 where no filter has its say. A wide filter, which reaches over what lies beside it, has its full say only
+    where all narrower means depart from the same surroundings by `GATE_SHARE` of what its own does, less `GATE_SIGMAS`
+    of their deviations; and none where one departs by half as much."""
+    best = np.zeros(means.shape[1], np.float32)
+    for k in range(len(means)):
+        signal = means[k] - around[k]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            confirmed = (means[:k] - around[k]) / signal + GATE_SIGMAS * deviation[:k] / np.abs(signal)
+            say = np.maximum(2.0 * confirmed / GATE_SHARE - 1.0, 0.0).min(axis=0, initial=1.0)
+            score = signal / deviation[k] * say
+            best = np.where(np.abs(score) > np.abs(best), score, best)
     return best
+
+
+@numba.njit(**PLAIN)
+def _root_of(parents: np.ndarray, i: int) -> int:
+    """Return the root of the set that holds ``i``, each member pointing to a parent (Tarjan 1975)."""
+    while parents[i] != i:
+        parents[i] = parents[parents[i]]
+        i = parents[i]
+    return i
 
 
 @numba.njit(**PLAIN)
 def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: float) -> np.ndarray:
     """Return (n,) for each of the pixels ``order`` (n,), flat indices in falling order of size of the score (h, w), the
-    place in ``order`` of the peak that it belongs to.
-
-    Pixels join the highest neighbouring peak of their sign. Two peaks that meet become one where the pixel at which
-    they meet is higher than ``saddle`` times the lower peak, or lies less than ``prominence`` below it.
-    """
+    place in ``order`` of the peak that it belongs to. Pixels join the highest neighbouring peak of their sign; two
+    peaks that meet become one as `SADDLE` and `PROMINENCE` say."""
     h, w = score.shape
     place = np.full(h * w, -1, np.int64)
     parents = np.empty(len(order), np.int64)
@@ -397,7 +373,7 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
             for x in range(max(column - 1, 0), min(column + 2, w)):
                 neighbour = place[y * w + x]
                 if neighbour >= 0 and neighbour != n and (flat[y * w + x] > 0) == (flat[pixel] > 0):
-                    met[count] = root_of(parents, neighbour)
+                    met[count] = _root_of(parents, neighbour)
                     count += 1
         if count == 0:
             continue
@@ -410,5 +386,5 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
             if other != highest and (height > saddle * top or top - height < prominence):
                 parents[other] = highest
     for n in range(len(order)):
-        parents[n] = root_of(parents, n)
+        parents[n] = _root_of(parents, n)
     return parents

@@ -64,11 +64,8 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the sets of nodes (h, w) that links to the right and downwards (both (h, w)) join.
-
-    Returns the number of each pixel's set (h, w), 0 for none, and the sizes of the sets, largest first, of equal ones
-    the first in the order of the pixels: set number i has the size ``sizes[i - 1]``.
-    """
+    """Number the sets of nodes (h, w) that links to the right and downwards join, largest first; return each pixel's
+    number (h, w), 0 for none, and the sizes."""
     h, w = nodes.shape
     # links are pixels between the nodes of a picture twice as fine
     fine = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)

@@ -1,26 +1,17 @@
 """Missing returns as evidence: connected pixels inside the target's outline from which no light came back.
 
-A deep hole before a far background, a mirror, or black tape sends nothing back, and no depth departs from the surface.
-What tells such a place from chance is its size: cameras lose scattered pixels anywhere, connected ones now and then.
-
-The outline is that of the pixels that a detector judged, with small gaps closed and everything inside filled. A place
-that touches the outline's edge or that of the image is not enclosed: a notch or a hole cut by the rim cannot be told
-from the target's own shape there, so it is no finding. The pixels that an automatic crop takes off the rim lie outside.
-
-Chance is simulated. Scattered dropouts are taken for places where a random field, white noise averaged over a square of
-1 to 5 pixels, falls below a level: the square is chosen to give the share of missing neighbours that was measured, no
-wider than the widest filter that depth cameras are known to apply to their pixels (5 x 5, Azure Kinect), and the level
-gives the local rate. Clusters of simulated fields say how many of each size to expect on the whole target. Rate and
-square come from the clusters that are too small to be findings; whatever then is a finding is left out, and the bound
-is raised from the least size until it no longer changes. Not modelled: dropouts that come in equal blobs wider than 3
-pixels, which nothing in a single frame tells from small holes.
+What tells a hole from chance is its size: cameras lose scattered pixels anywhere. A place that touches the outline's
+edge or that of the image is no finding. Chance is simulated: scattered dropouts are places where white noise averaged
+over a square of 1 to 5 pixels falls below a level; the square gives the share of missing neighbours, the level the
+local rate, both from the clusters that are too small to be findings. Not modelled: dropouts that come in equal blobs
+wider than 3 pixels.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,52 +20,47 @@ from scipy.special import ndtri, ndtri_exp, owens_t
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from detectors.masks import grown, holes_filled
 from detectors.measure import local_plane
-from harness.vocabulary.capture import Cloud, Reason
+from harness.vocabulary.geometry import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
 
-ALPHA = 0.01
-"""Expected chance findings in one capture: what the least size of a finding is set by."""
+ALPHA = 0.01  # expected chance findings in one capture: what the least size of a finding is set by
 LEAST_POINTS = 9
-"""Fewer connected pixels are never a finding: 3 x 3, the narrowest filter that depth cameras are known to apply, turns
-one bad sample into as many."""
+"""Fewer connected pixels are never a finding: 3 x 3, the narrowest filter of depth cameras, makes as many of one."""
 SELDOM = 0.2
 """A pixel that returned in no more than this share of the frames counts as missing: its depth rests on stray light."""
-SQUARES = (1, 2, 3, 4, 5)
-"""Sides in pixels of the square that correlates dropouts."""
-RATE_WINDOW_PX = 65
-RATE_PRIOR_PX = 200.0
+SQUARES = (1, 2, 3, 4, 5)  # sides in pixels of the square that correlates dropouts
+RATE_WINDOW_PX, RATE_PRIOR_PX = 65, 200.0
 """The local rate of dropouts is that of a window of this side, drawn towards the target's own by so many pixels."""
-SIMULATED_PX = 1e6
-FEWEST_FIELDS, MOST_FIELDS = 10, 100
+SIMULATED_PX, FEWEST_FIELDS, MOST_FIELDS = 1e6, 10, 100
 """Fields are simulated until they hold so many pixels: enough to reach well under one cluster a target."""
-TAIL_CLUSTERS = 60
-"""Largest simulated clusters from which the fall of their number with size is taken."""
-SLOWEST_FALL = 0.5
-"""Fall without simulated clusters to tell each further pixel multiplies a cluster's chance by this: in fields averaged
-over 5 x 5 pixels at a rate of 1e-4, 0.3 % of the clusters have 9 pixels and more."""
-REACH_PX = 2
-"""A depth finding so near to pixels without return belongs to the same damage: half of a 5 x 5 window."""
-RING_PX = 4
-"""Width of the ring of judged pixels that places the surface at a hole."""
-HIGHEST_SCORE = 37.0
-"""Standard deviations; beyond it float64 knows no probability."""
+TAIL_CLUSTERS = 60  # largest simulated clusters from which the fall of their number with size is taken
+SLOWEST_FALL = math.log(2.0)  # fall without simulated clusters to tell: each further pixel halves a cluster's chance
+REACH_PX = 2  # A depth finding so near to pixels without return belongs to the same damage: half of a 5 x 5 window
+RING_PX = 4  # width of the ring of judged pixels that places the surface at a hole
+HIGHEST_SCORE = 37.0  # standard deviations; beyond it float64 knows no probability
+REASONS: dict[int, str] = {
+    Reason.SATURATED: "the sensor is saturated",
+    Reason.LOW_AMPLITUDE: "too little light came back",
+    Reason.LOW_REFLECTIVITY: "too little light came back",
+    Reason.AMPLITUDE_RATIO: "near and far mix",
+    Reason.EDGE: "near and far mix",
+    Reason.UNWRAP: "the phases fit no single distance",
+    Reason.OUT_OF_RANGE: "what lies there is out of range",
+}
 
 
 def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
-    """Look for missing returns inside the outline of what was judged; None for a cloud without a pixel grid, which does
-    not tell what it lacks. Deterministic.
-
-    The outline (h, w) bool: judged pixels, gaps narrower than 3 pixels between them, and all that these enclose. Beyond
-    the image's edge there is no target.
-    """
+    """Look for missing returns inside the outline of what was judged: these pixels, gaps narrower than 3 pixels, and
+    all that they enclose. None for a cloud without a pixel grid. Deterministic."""
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
     closed = cv2.morphologyEx(np.pad(judged.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     outline = holes_filled(closed > 0)[2:-2, 2:-2]
-    is_map = cloud.projection == "parallel"
-    frames = max(cloud.n_frames, 1)
-    unseen = (~cloud.valid).astype(float) if is_map else 1.0 - np.clip(cloud.count / frames, 0.0, 1.0)
+    if cloud.projection == "parallel":
+        unseen = (~cloud.valid).astype(float)
+    else:
+        unseen = 1.0 - np.clip(cloud.count / max(cloud.n_frames, 1), 0.0, 1.0)
     missing = (~cloud.valid | (unseen >= 1.0 - SELDOM)) & outline
     blind = float((~cloud.valid)[outline].mean())
     labels, sizes = _clusters(missing)
@@ -101,13 +87,8 @@ def one_damage_once(
     shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
     """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest
-    first; where two of them touch (`REACH_PX`) they are the same damage, and the larger of them stands for it.
-
-    A hole's floor with a few pixels lost at its wall stays a depth finding, which has a depth and whose size takes in
-    pixels without a range that touch it; a hole that returns nothing but along its rim becomes a missing return.
-    """
-    kept = list(missing)
-    depth = list(found)
+    first; where two of them touch (`REACH_PX`) they are the same damage, and the larger stands for it."""
+    kept, depth = list(missing), list(found)
     for hole in missing:
         area = _filled(shape, hole.pixels)
         near = grown(area, REACH_PX).ravel()
@@ -115,17 +96,13 @@ def one_damage_once(
         if any(len(other.pixels) >= area.sum() for other in touching):
             kept.remove(hole)
         else:
-            depth = [other for other in depth if not any(other is gone for gone in touching)]
+            depth = [other for other in depth if not near[other.pixels].any()]
     return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
 
 
 def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-    """Measure place and size of pixels without return, on the surface: the diameter of a circle of the same area, what
-    they enclose included, and the centre of their pixels. No depth, no volume; no allowance for the camera's blur.
-
-    The surface at the hole is a plane through the fitted surface around it: on a face of radius r the centre of a hole
-    of diameter d is d^2 / 8r off.
-    """
+    """Measure place and size of pixels without return, on a plane through the fitted surface around: the diameter of a
+    circle of the same area, and the centre. No depth, no volume; no allowance for the camera's blur."""
     area = _filled(cloud.valid.shape, detection.pixels)
     rows, columns = np.nonzero(area)
     placed = _surface_at(cloud, evidence, area)
@@ -140,22 +117,8 @@ def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> M
         score=detection.score,
         extent_diameter_m=2.0 * float(np.sqrt(len(rows) * pixel_m2 / np.pi)),
         extent_centre_m=centre,
-        model_note=f"no return: {_REASONS.get(int(reasons.argmax()), 'no light came back')}",
+        model_note=f"no return: {REASONS.get(int(reasons.argmax()), 'no light came back')}",
     )
-
-
-_REASONS: dict[int, str] = {
-    Reason.SATURATED: "the sensor is saturated",
-    Reason.LOW_AMPLITUDE: "too little light came back",
-    Reason.LOW_REFLECTIVITY: "too little light came back",
-    Reason.AMPLITUDE_RATIO: "near and far mix",
-    Reason.EDGE: "near and far mix",
-    Reason.UNWRAP: "the phases fit no single distance",
-    Reason.OUT_OF_RANGE: "what lies there is out of range",
-}
-
-
-# ---------------------------------------------------------------- clusters and their places
 
 
 def _clusters(missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,8 +137,7 @@ def _filled(shape: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
 
 
 def _surface_at(cloud: Cloud, evidence: Evidence, area: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the surface's point (3,) at an area's centroid and the surface that one pixel covers there, m2; None where
-    too little was judged around it. Directions come from the judged pixels' own points, so that no lens is needed."""
+    """Return the surface's point (3,) at an area's centroid and the surface that one pixel covers there, m2."""
     rows, columns = np.nonzero(area)
     h, w = area.shape
     cut = np.s_[
@@ -192,19 +154,13 @@ def _surface_at(cloud: Cloud, evidence: Evidence, area: np.ndarray) -> tuple[np.
     return centre, float(np.linalg.norm(np.cross(per_px[0], per_px[1])))
 
 
-# ---------------------------------------------------------------- what chance brings about
-
-
-@dataclass(frozen=True)
-class _Chance:
-    """Scattered dropouts of one target. ``rate``: their share of it. ``least_points``: size from which on fewer than
-    `ALPHA` clusters are expected. A line through (``at``, ``log_at``) falling by ``fall`` a pixel tells the logarithm
-    of the expected number of clusters of a size and more."""
+class _Chance(NamedTuple):
+    """Scattered dropouts: ``rate``, and a line through (``at``, ``log_at``) of the log number of clusters."""
 
     rate: float
     at: int = 1
     log_at: float = 0.0
-    fall: float = -math.log(SLOWEST_FALL)
+    fall: float = SLOWEST_FALL
 
     def log_expected(self, points: int) -> float:
         """Return the logarithm of the expected number of clusters of so many pixels and more on the whole target."""
@@ -212,9 +168,8 @@ class _Chance:
 
     @property
     def least_points(self) -> int:
-        """Least size of a finding, `LEAST_POINTS` or more."""
-        needed = self.at + (self.log_at - np.log(ALPHA)) / self.fall
-        return max(LEAST_POINTS, int(np.ceil(needed)))
+        """Least size of a finding: `LEAST_POINTS` or more, such that fewer than `ALPHA` clusters are expected."""
+        return max(LEAST_POINTS, math.ceil(self.at + (self.log_at - math.log(ALPHA)) / self.fall))
 
 
 def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Chance:
@@ -223,6 +178,7 @@ def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Cha
     cut = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels, outline = labels[cut], outline[cut]
     (h, w), count = outline.shape, int(np.clip(SIMULATED_PX / outline.size, FEWEST_FIELDS, MOST_FIELDS))
+    window = (RATE_WINDOW_PX, RATE_WINDOW_PX)
 
     @cache
     def fields(side: int) -> list[np.ndarray]:
@@ -234,33 +190,28 @@ def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Cha
         first = beyond // 2
         return [z[first : first + h, first : first + w].copy() for z in blurred]
 
-    def chance_of(scattered: np.ndarray, known: np.ndarray) -> _Chance:
-        """Return chance by scattered dropouts (h, w) among known pixels (h, w), findings left out."""
-        rate = float(scattered.sum() / max(known.sum(), 1))
-        if not scattered.any():
-            return _Chance(0.0)
-        window = (RATE_WINDOW_PX, RATE_WINDOW_PX)
-        near, of = (
-            cv2.boxFilter(part.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-            for part in (scattered, known)
-        )
-        local = (near + RATE_PRIOR_PX * rate) / (of + RATE_PRIOR_PX)
-        level = ndtri(np.clip(local, 1e-7, 0.999)).astype(np.float32)
-        sizes = [_clusters((z < level) & outline)[1][1:] for z in fields(_square(scattered, known, rate))]
-        return _tail(rate, np.sort(np.concatenate(sizes)), count)
-
     least = LEAST_POINTS
     while True:
         scattered = (sizes < least)[labels] & (labels > 0)
-        chance = chance_of(scattered, outline & (scattered | (labels == 0)))
+        known = outline & (scattered | (labels == 0))
+        rate = float(scattered.sum() / max(known.sum(), 1))
+        chance = _Chance(0.0)
+        if scattered.any():
+            near, of = (
+                cv2.boxFilter(part.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+                for part in (scattered, known)
+            )
+            local = (near + RATE_PRIOR_PX * rate) / (of + RATE_PRIOR_PX)
+            level = ndtri(np.clip(local, 1e-7, 0.999)).astype(np.float32)
+            drawn = [_clusters((z < level) & outline)[1][1:] for z in fields(_square(scattered, known, rate))]
+            chance = _tail(rate, np.sort(np.concatenate(drawn)), count)
         if not ((sizes >= least) & (sizes < chance.least_points)).any():
             return chance
         least = chance.least_points
 
 
 def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
-    """Return the side of the least square whose fields have as many missing neighbours of missing pixels as these
-    dropouts, to within two standard errors; 5 where none has."""
+    """Return the side of the least square whose fields have as many missing neighbours, to two standard errors."""
     pairs = both = 0
     for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         pairs += int((scattered[a] & known[b]).sum())
@@ -278,8 +229,7 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
 
 
 def _tail(rate: float, sizes: np.ndarray, fields: int) -> _Chance:
-    """Return the fall of the number of clusters with size, from the largest of simulated ``sizes``, ascending; its mean
-    excess is taken two standard errors high, as the fall slows down a little with size."""
+    """Return the fall of the number of clusters with size, from the largest of simulated ``sizes``, ascending."""
     if len(sizes) < 2:
         return _Chance(rate, log_at=float(np.log(max(len(sizes), 1) / fields)))
     largest = sizes[-min(TAIL_CLUSTERS, len(sizes)) :]
@@ -288,4 +238,4 @@ def _tail(rate: float, sizes: np.ndarray, fields: int) -> _Chance:
     excess = float(sizes[-of_size:].mean() - at) * (1.0 + 2.0 / np.sqrt(of_size))
     # of a geometric distribution with the mean excess m, m / (1 + m) go on to the next size
     fall = float(np.log1p(1.0 / max(excess, 1e-9)))
-    return _Chance(rate, at, float(np.log(of_size / fields)), min(fall, -np.log(SLOWEST_FALL)))
+    return _Chance(rate, at, float(np.log(of_size / fields)), min(fall, SLOWEST_FALL))

@@ -8,54 +8,27 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from harness.vocabulary.capture import Cloud, Frame
+from harness.vocabulary.geometry import Cloud, Frame
 
-REACH_FRAMES = 6
-REACH_WINDOW_PX = 384
-"""Side of the window, about the middle of the valid pixels, that is looked at."""
-FARTHEST_LAG_PX = 30
-SHARED = 0.1
-"""Correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels."""
-REACH_PIXELS = 5000
-"""Pixels that must be valid in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
+REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
+"""Frames that are looked at, the side of the window about the middle of the valid pixels, and pixels that must be valid
+in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
+SHARED = 0.1  # correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels
 
 
 def median_of(values: np.ndarray) -> float:
-    """Return the median of finite values (n,), n >= 1: numpy's, bit by bit, at a fraction of its cost. A NaN among them
-    is not noticed."""
-    middle = len(values) // 2
-    parted = np.partition(values, middle)
-    upper = float(parted[middle])
-    return upper if len(values) % 2 else 0.5 * (float(parted[:middle].max()) + upper)
-
-
-def median_size_of(values: np.ndarray) -> float:
-    """Return `median_of` the absolute values."""
-    return median_of(np.abs(values))
+    """Return the median of finite values (n,), n >= 1."""
+    return float(np.median(values))
 
 
 def sigma_of(values: np.ndarray) -> float:
-    """Return the robust standard deviation of finite values (n,) about 0: `median_size_of` over 0.6745."""
-    return median_size_of(values) / 0.6745
-
-
-def quantile_of(values: np.ndarray, part: float) -> float:
-    """Return the quantile of finite values (n,), n >= 1, between the two that are nearest, as numpy's default."""
-    place = part * (len(values) - 1)
-    below = int(place)
-    above = min(below + 1, len(values) - 1)
-    parted = np.partition(values, (below, above))
-    low, high = float(parted[below]), float(parted[above])
-    share = place - below
-    return high - (high - low) * (1.0 - share) if share >= 0.5 else low + (high - low) * share
+    """Return the robust standard deviation of finite values (n,) about 0: the median size over 0.6745."""
+    return float(np.median(np.abs(values))) / 0.6745
 
 
 def rounding_left_m2(step_m: float, dither_m2: float) -> float:
-    """Return the variance that rounding to a step q leaves in the average of endless frames, whose noise before the
-    rounding has the variance s^2 = ``dither_m2``: that of a fixed pattern.
-
-    (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2: q^2 / 12 without noise, next to nothing from s = q / 2.
-    """
+    """Return the variance of the fixed pattern that rounding to a step q leaves in the average of endless frames, whose
+    noise before has the variance s^2: (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
     left = (step_m / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2) / k**2).sum())
     return min(left, step_m**2 / 12.0)
@@ -65,11 +38,9 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
     """Return the variances that the rounding of z leaves in the average where ``mask`` (h, w) is true, square metres:
     of a fixed pattern, which neighbours may share, and of what differs from pixel to pixel.
 
-    Rounding to a step q errs by q / sqrt(12). Noise of deviation s before the rounding (a dither) turns part of that
-    into noise, which averages out, and leaves a fixed pattern with the variance b^2 (`rounding_left_m2`). So after n
-    frames the rounding's variance is b^2 + (q^2 / 12 - b^2) / n. s^2 is the frames' median variance less q^2 / 12; on a
-    surface so quiet that most pixels never change it is 0 and the rest stays q / sqrt(12), 0.29 mm for 1 mm; likewise
-    where the averaged z still lies on the steps, as a median does. Without a step, z is taken to have been stored as
+    Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into noise, which averages
+    out, and leaves a fixed pattern b^2 (`rounding_left_m2`): after n frames b^2 + (q^2 / 12 - b^2) / n. All stays where
+    the averaged z still lies on the steps, as a median does. Without a step, z is taken to have been stored as
     float32.
     """
     z = cloud.points_m[..., 2][mask]
@@ -87,19 +58,14 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
-    """Return the standard deviation that the rounding of z leaves in the average, metres (`rounding_variances`): the
-    least credible scale."""
+    """Return the standard deviation in metres that rounding leaves in the average: the least credible scale."""
     return float(np.sqrt(sum(rounding_variances(cloud, mask))))
 
 
 def noise_reach_px(frames: Sequence[Frame]) -> float:
-    """Return the lag, in pixels, at which the noise of neighbours along rows and columns stops being alike; 0 for
-    unknown.
-
-    Differences of successive frames hold noise alone. A filter over b x b pixels correlates them over b - 1 pixels,
-    interpolation to a grid f times finer over f b. The median over pairs of frames and both axes. Unknown with one
-    frame, without noise beyond the rounding step, or where the correlation does not end (something moves).
-    """
+    """Return the lag, in pixels, at which the noise of neighbours along rows and columns stops being alike: the median
+    over pairs of successive frames; 0 for unknown (one frame, no noise beyond the rounding step, or something
+    moves)."""
     lags: list[int] = []
     for first, second in pairwise(frames):
         difference = second.z_m.astype(np.float64) - first.z_m
@@ -115,8 +81,8 @@ def noise_reach_px(frames: Sequence[Frame]) -> float:
         level = cv2.boxFilter(np.where(known, difference, 0.0), -1, side) / np.maximum(weight, 1e-9)
         noise = np.where(known, difference - level, 0.0)
         lags += [_first_unlike_lag(noise, known), _first_unlike_lag(noise.T, known.T)]
-    known_lags = [lag for lag in lags if lag]
-    return float(np.median(known_lags)) if len(known_lags) > len(lags) / 2 else 0.0
+    ends = [lag for lag in lags if lag]
+    return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:

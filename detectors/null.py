@@ -1,21 +1,14 @@
 """The threshold that a capture sets itself: noise seen towards the camera tells how often noise looks like damage.
 
-Damage lies behind the surface. What stands out before it is noise, fixed pattern or texture, once objects that lie on
-the target are set aside. So the peaks towards the camera are a sample of the null for both sides. Their tail is
-extrapolated to the threshold at which the wanted number of false calls is expected in the capture, bumps and hole-like
-calls together.
+Damage lies behind the surface. What stands out before it is noise, fixed pattern or texture, once objects on the target
+(regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are left
+out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is expected,
+bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s. The data weigh the exponents, starting
+from `PRIOR`; rates and scales are integrated out.
 
-Objects are regions that stand before the surface as a whole, and edges in the colour picture or the amplitude: tags,
-print, another material. They and a margin are left out, and so are peaks that reach into them: the expected number is
-of calls beside them.
-
-The tail above a floor is exponential in (s^q - 1) / q of the score s. q = 2 is normal noise, 1 is Laplace's, 0 a power
-law. The data weigh the exponents, starting from `PRIOR`; rates and scales are integrated out, so that the mean of the
-expected number is right although few peaks are known.
-
-Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core, and damage that is itself towards the
-camera and no larger than the noise. On clouds without a grid objects are not looked for. Things on the target that are
-neither proud of it nor seen in a picture raise the threshold.
+Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
+larger than the noise; objects on clouds without a grid. Things on the target that are neither proud of it nor seen in a
+picture raise the threshold.
 """
 
 from __future__ import annotations
@@ -26,60 +19,41 @@ import cv2
 import numpy as np
 from scipy import ndimage, optimize, stats
 
-from detectors.interface import Detection, Detector, Evidence, FindsAtOnce
+from detectors.interface import Detection, Detector, Evidence
 from detectors.masks import grown, holes_filled, parts_with
 from detectors.measure import extents
-from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Cloud
 
 EXPONENTS = np.array([3.0, 2.0, 1.5, 1.0, 0.5, 0.0])
 PRIOR = np.array([0.40, 0.45, 0.07, 0.04, 0.02, 0.02])
-"""Averages of a camera's noise are near normal; peaks that merge at the floor make a tail look lighter (3). Chosen on
-simulated hole-free boards of three cameras; 80 peaks of Student's t with 4 degrees of freedom find their power law in
-spite of it."""
-WANTED_PEAKS = 60
-"""Peaks above the floor: their mean excess is then known to 13 %, and the floor is as high as it can be."""
-FEWEST_PEAKS = 8
-"""Least number that tells a tail: the mean excess is known to 35 %, and the threshold is twice as far away as
-the floor."""
-CROWDED = 0.6
-"""Share of the most findings that any threshold gives: with more, neighbouring peaks have merged."""
-LADDER = 1.06
-"""Ratio of the thresholds that are tried for the floor."""
+"""Averages of a camera's noise are near normal. Chosen on simulated hole-free boards of three cameras."""
+WANTED_PEAKS, FEWEST_PEAKS = 60, 8
+"""Peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to 35 %."""
+CROWDED, LADDER = 0.6, 1.06
+"""Share of the most findings that any threshold gives, and the ratio of the thresholds that are tried for the floor."""
 LEAST = 3.0
-"""Units of score below which no threshold goes, whatever is expected there: errors that are bounded, as those of
-rounded numbers without noise, end so near that a tail extrapolated from one side says nothing of the other."""
-OBJECT_MARGIN_PX = 6
-"""Margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it. Smoothed depth reaches
-further, by half of the square that it was smoothed over."""
-PATCH_PX = 5
-"""Side of the square that residual and picture are smoothed over before objects are looked for."""
-LEAST_OBJECT_PX = 100
-"""Four such squares: a point that flies alone raises no more than one."""
+"""Units of score below which no threshold goes: bounded errors end so near that one side says nothing of the other."""
+OBJECT_MARGIN_PX = 6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
+PATCH_PX, LEAST_OBJECT_PX = 5, 100
+"""Side of the square that residual and picture are smoothed over, and pixels of an object: four such squares."""
 PROUD, PROUD_FOOT = 6.0, 3.0
 """An object stands so many deviations of the smoothed residual before the surface somewhere, and so many everywhere."""
 MARKED = 8.0
 """An edge in the picture is so many times as steep as half of the picture is: a tag, print, another material."""
-MOST_MASKED = 0.5
-"""Share of the judged area that objects may cover before what is left no longer stands for it."""
-RIM_PX = 10
-"""Reach of the target's rim into what was judged. Depth aligned to a finer camera mixes the farthest: 8 pixels."""
-RIM_CALLS = 2
-"""Calls behind the surface along the rim that chance does not give: where 1 is expected on the whole target, 2 fall on
-a twentieth of it once in 800 captures."""
-CONTRADICTED = 0.1
-"""Chance of so many peaks above the threshold at which a tail no longer holds."""
+MOST_MASKED = 0.5  # share of the judged area that objects may cover before what is left no longer stands for it
+RIM_PX, RIM_CALLS = 10, 2
+"""Reach of the target's rim into what was judged, and calls behind the surface along it that chance does not give."""
+CONTRADICTED = 0.1  # chance of so many peaks above the threshold at which a tail no longer holds
 MOST_SKEW = 0.15
 """Difference of the quartiles' distances from the median, over their sum: 0.15 are 1.35 times as far to one side."""
 DRAWS = 4000
-"""Draws of rate and scale, for the interval."""
 
 
 @dataclass(frozen=True)
 class OwnThreshold:
-    """``threshold`` in units of score, at which ``expected`` false calls (both signs) are expected in the capture, with
-    the 95 % interval ``low`` to ``high``; ``peaks`` above ``floor`` towards the camera told it. ``evidence``: what is
-    to be searched, without the ``rim_pixels`` that mix in what lies behind the target. ``doubts``: full sentences on
-    why the numbers cannot be trusted."""
+    """``threshold`` in units of score, at which ``expected`` false calls are expected, with the 95 % interval ``low``
+    to ``high``; ``peaks`` above ``floor`` told it. ``evidence``: what is to be searched, without the ``rim_pixels``
+    that mix in what lies behind the target. ``doubts``: full sentences on why the numbers cannot be trusted."""
 
     threshold: float
     expected: float
@@ -94,9 +68,8 @@ class OwnThreshold:
 
 
 def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float) -> OwnThreshold:
-    """Find the threshold at which ``false_calls`` (above 0) are expected beside objects, by the capture's own peaks
-    towards the camera, or `LEAST`, with fewer expected. With too few of them, threshold, expected number and interval
-    are NaN, and ``doubts`` says so."""
+    """Find the threshold at which ``false_calls`` (above 0) are expected, by the capture's own peaks towards the
+    camera, or `LEAST`. With too few of them the numbers are NaN, and ``doubts`` says so."""
     known = np.isfinite(evidence.score)
     covered = np.zeros(known.shape, bool)
     if cloud.organised:
@@ -116,8 +89,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
             f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
             f" ({FEWEST_PEAKS} at least)"
         )
-        unknown = (float("nan"),) * 4
-        return OwnThreshold(*unknown, len(peaks), floor, objects, 0, evidence, tuple(doubts))
+        nan = float("nan")
+        return OwnThreshold(nan, nan, nan, nan, len(peaks), floor, objects, 0, evidence, tuple(doubts))
     # all peaks, or the higher half, and again, while too many lie above the threshold: a few wide waves of a fixed
     # pattern are then higher than the noise of many pixels, and one tail does not hold both
     falling, number = np.sort(peaks)[::-1], false_calls / 2.0
@@ -136,50 +109,35 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
             f"{100 * hidden / known.sum():.0f} % of what is judged lies under or beside objects before the surface,"
             " and the rest may not stand for the whole"
         )
-    return OwnThreshold(
-        threshold=threshold,
-        expected=2.0 * tail.expected(threshold),
-        low=low,
-        high=high,
-        peaks=tail.peaks,
-        floor=tail.floor,
-        objects=objects,
-        rim_pixels=int(rim.sum()),
-        evidence=_only(evidence, ~rim),
-        doubts=tuple(doubts),
-    )
+    expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
+    told = (tail.peaks, tail.floor, objects, int(rim.sum()))
+    return OwnThreshold(threshold, expected, low, high, *told, searched, tuple(doubts))
 
 
 def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:
-    """Return the findings with each object that lies on the target as one of them, strongest first.
-
-    The edges of an object shadow the surface beside it and disturb filters there: findings that reach its margin and
-    are weaker than the object itself are its own. An object with a single finding keeps that finding as it is. Nothing
-    is joined without a pixel grid, or where objects would cover more than `MOST_MASKED` of what was judged.
-    """
+    """Return the findings with each object that lies on the target as one of them, strongest first: findings that reach
+    its margin and are weaker than the object are its own. An object with a single finding keeps it. Nothing is joined
+    without a pixel grid, or where objects would cover more than `MOST_MASKED`."""
     if not cloud.organised or not found:
         return found
     proud, known = _proud(cloud, evidence), np.isfinite(evidence.score)
     if (proud & known).sum() > MOST_MASKED * known.sum():
         return found
     labels, count = ndimage.label(proud, np.ones((3, 3)))
-    kept, margin = list(found), _margin(cloud)
+    kept = list(found)
     for number in range(1, count + 1):
         region = labels == number
-        near = grown(region, margin, cv2.MORPH_ELLIPSE).ravel()
-        bumps = [each for each in kept if region.ravel()[each.pixels].any()]
-        height = max((each.score for each in bumps), default=0.0)
-        own = [each for each in kept if each.score <= height and near[each.pixels].any()]
-        if len(own) < 2:
-            continue
-        pixels = np.flatnonzero(region & cloud.valid)
-        kept = [each for each in kept if not any(each is gone for gone in own)]
-        kept.append(Detection(height, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1], "object"))
+        near = grown(region, _margin(cloud), cv2.MORPH_ELLIPSE).ravel()
+        height = max((each.score for each in kept if region.ravel()[each.pixels].any()), default=0.0)
+        rest = [each for each in kept if each.score > height or not near[each.pixels].any()]
+        if len(kept) - len(rest) >= 2:
+            pixels = np.flatnonzero(region & cloud.valid)
+            thing = Detection(height, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1], "object")
+            kept = [*rest, thing]
     return tuple(sorted(kept, key=lambda each: -each.score))
 
 
 def _margin(cloud: Cloud) -> int:
-    """Return the number of pixels around an object that it disturbs."""
     return OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
 
 
@@ -192,20 +150,15 @@ def behind(evidence: Evidence) -> np.ndarray:
 
 
 def skew_of(evidence: Evidence) -> float:
-    """Return Bowley's skewness of the residual, -1 to 1: damage on less than a quarter of the target hardly moves
-    it."""
+    """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly moves it."""
     known = evidence.residual_m[np.isfinite(evidence.residual_m)]
     low, middle, high = np.quantile(known, (0.25, 0.5, 0.75))
     return float((high + low - 2 * middle) / max(high - low, 1e-12))
 
 
-# ---- the tail --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Tail:
-    """Peaks above a floor. ``sums`` (e,): of their transformed excesses, by exponent; ``weights`` (e,): what the data
-    leave of each exponent."""
+    """Peaks above a floor: ``sums`` (e,) of their transformed excesses, ``weights`` (e,) of the exponents."""
 
     floor: float
     peaks: int
@@ -232,17 +185,17 @@ class Tail:
         return float((self.weights * self.peaks * (1.0 + excesses / self.sums) ** -self.peaks).sum())
 
     def threshold(self, number: float) -> float:
-        """Return the threshold at which so many peaks are expected; the floor where fewer are expected there
-        already."""
+        """Return the threshold at which so many peaks are expected; the floor where fewer are expected there."""
         if number >= self.peaks:
             return self.floor
+
+        def excess(log_ratio: float) -> float:
+            return float(np.log(self.expected(float(np.exp(log_ratio)) * self.floor) / number))
+
         high = 2.0
         while self.expected(high * self.floor) > number:
             high *= 2.0
-        log_ratio = optimize.brentq(
-            lambda log: np.log(self.expected(float(np.exp(log)) * self.floor) / number), 0.0, np.log(high)
-        )
-        return float(np.exp(log_ratio)) * self.floor
+        return float(np.exp(optimize.brentq(excess, 0.0, np.log(high)))) * self.floor
 
     def interval(self, threshold: float) -> tuple[float, float]:
         """Return the central 95 % of the expected number of peaks above a threshold."""
@@ -257,9 +210,6 @@ class Tail:
 
 def _excess(ratios: np.ndarray, exponent: float) -> np.ndarray:
     return np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
-
-
-# ---- peaks and objects -----------------------------------------------------------------------------------------------
 
 
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
@@ -277,12 +227,11 @@ def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
 
 
 def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: long steep edges of the colour picture or the amplitude: where the material changes, range
-    that depends on brightness steps too. The target's own outline is none."""
+    """Return (h, w) bool: long steep edges of the colour picture or the amplitude."""
     inside = _depth_px(holes_filled(np.isfinite(evidence.score))) > 2 * PATCH_PX
     edges = np.zeros(cloud.valid.shape, bool)
     channels = [] if cloud.rgb is None else list(np.moveaxis(np.asarray(cloud.rgb, np.float64), -1, 0))
-    for channel in (*channels, *(() if cloud.amplitude is None else (cloud.amplitude,))):
+    for channel in channels + ([] if cloud.amplitude is None else [cloud.amplitude]):
         known = np.isfinite(channel) & inside
         if not known.any():
             continue
@@ -302,19 +251,14 @@ def _depth_px(whole: np.ndarray) -> np.ndarray:
 
 
 def _peaks(detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return a floor with about `WANTED_PEAKS` findings above it, and their scores; a higher floor where they would
-    merge. What reaches into the ``covered`` (h, w) bool is left out: it may be the flank of a peak there."""
+    """Return a floor with about `WANTED_PEAKS` findings above it, and their scores."""
     evidence = _only(before, ~covered)
     known = evidence.score[np.isfinite(evidence.score)]
     if not (len(known) and known.max() > 0):
         return 1.0, np.zeros(0)
     least = max(float(np.median(known)), 1e-3 * float(known.max()))
     thresholds = least * LADDER ** np.arange(np.log(known.max() / least) / np.log(LADDER) + 1)
-    if isinstance(detector, FindsAtOnce):
-        found = detector.centres_at(cloud, evidence, thresholds.tolist())
-        counts = np.array([len(centres) for centres in found])
-    else:
-        counts = np.array([len(detector.find(cloud, evidence, threshold)) for threshold in thresholds.tolist()])
+    counts = np.array([len(detector.find(cloud, evidence, threshold)) for threshold in thresholds.tolist()])
     crowd = int(counts.argmax())
     free = [n for n in range(crowd, len(counts)) if counts[n] <= CROWDED * counts[crowd]]
     enough = [n for n in free if counts[n] >= WANTED_PEAKS]
@@ -324,12 +268,8 @@ def _peaks(detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarr
     return floor, np.array(peaks)
 
 
-# ---- the rim ---------------------------------------------------------------------------------------------------------
-
-
 def _mixed_rim(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> np.ndarray:
-    """Return (h, w) bool: a band along the target's outline as deep as the calls behind the surface that touch it
-    reach, where there are more of these than chance gives: pixels that mix in what lies behind the target."""
+    """Return (h, w) bool: a band along the outline as deep as calls behind the surface reach where they are many."""
     known = np.isfinite(evidence.score)
     whole = holes_filled(known)
     depth = _depth_px(whole).reshape(-1)

@@ -1,4 +1,4 @@
-"""Open3D where it is needed: files of points, ICP, odometry, volumes. Importing it takes seconds: nothing else does."""
+"""Open3D where it is needed: files of points, odometry, volumes. Importing it takes seconds: nothing else does."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ class MissingLibrary(UserError):
 
 
 def load_open3d() -> Any:
-    """Return the module open3d. Raises MissingLibrary that names the Debian package where a system library is
-    missing."""
+    """Return the module open3d. Raises MissingLibrary with the Debian package of a missing system library."""
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -35,11 +34,7 @@ def load_open3d() -> Any:
 
 @contextmanager
 def open3d_on_one_thread() -> Iterator[Any]:
-    """Give the module open3d, silent and on one OpenMP thread within the block: sums in one order, hence the same bits
-    whatever the number of cores. Raises MissingLibrary where it cannot start.
-
-    On pictures of a target's size a second thread gains nothing, and loses tenfold where cores are shared.
-    """
+    """Give the module open3d, silent and on one OpenMP thread within the block: the same bits on any machine."""
     import threadpoolctl
 
     o3d = load_open3d()

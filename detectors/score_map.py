@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from bisect import bisect_left
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 from pydantic import Field
 
-from detectors.clusters import cluster_centres, euclidean_clusters
+from detectors.clusters import euclidean_clusters
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import on_grid as on_grid
 from detectors.measure import HoleModelConfig, extents, measure_detection
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.config import Config
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud
 
 
 class ScoreMapConfig(Config):
@@ -58,21 +56,6 @@ class ScoreMapDetector(ABC, Generic[S]):
         found = [self._detection(cloud, evidence, cluster) for cluster in clusters]
         return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
 
-    def centres_at(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> tuple[np.ndarray, ...]:
-        """Return the centres (m, 3) of the findings at each of the thresholds: in one pass, unless a subclass finds its
-        own way.
-
-        Implements `detectors.interface.FindsAtOnce`. Of findings with equal strength the order may not be `find`'s.
-        """
-        own = type(self)
-        if (own.find, own._detection, own._clusters) != _FINDING:
-            at_each = (self.find(cloud, evidence, float(threshold)) for threshold in thresholds)
-            return tuple(np.array([found.centre_m for found in each]).reshape(-1, 3) for each in at_each)
-        distance_m, min_points = self.settings.cluster_distance_mm * MM, self.settings.min_points
-        points, scores = cloud.points_m.reshape(-1, 3), evidence.score.reshape(-1)
-        pixels = above(evidence, min(thresholds, default=np.inf))
-        return cluster_centres(points[pixels], scores[pixels], np.asarray(thresholds, float), distance_m, min_points)
-
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
         return self._strength(cloud, evidence, above(evidence, 0.0))
@@ -90,11 +73,8 @@ class ScoreMapDetector(ABC, Generic[S]):
         return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
 
     def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
-        """Return the lowest threshold at which no cluster of ``min_points`` is left among these pixels.
-
-        Raising the threshold only takes points away and only splits clusters, so the answer is the score of the point,
-        in falling order, that completes the first cluster: found by doubling and bisection.
-        """
+        """Return the lowest threshold at which no cluster of ``min_points`` is left among these pixels: the score
+        of the point, in falling order, that completes the first cluster, found by doubling and bisection."""
         least = self.settings.min_points
         if len(pixels) < least:
             return 0.0
@@ -113,10 +93,6 @@ class ScoreMapDetector(ABC, Generic[S]):
             low, high = high + 1, min(2 * high, len(pixels))
         count = bisect_left(range(high), True, lo=low, key=completes)
         return float(scores[falling[count - 1]])
-
-
-_FINDING = (ScoreMapDetector.find, ScoreMapDetector._detection, ScoreMapDetector._clusters)
-"""Methods that `ScoreMapDetector.centres_at` stands for in one pass."""
 
 
 def above(evidence: Evidence, threshold: float) -> np.ndarray:

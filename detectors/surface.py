@@ -1,55 +1,50 @@
-"""A polynomial surface z(x, y) through a cloud of which some points are damage: the thesis' "robust cubic", and others.
+"""The shapes that a target may have, fitted to points of which some are damage: polynomials z(x, y) (the thesis'
+"robust cubic" and others), quadrics (sphere, cylinder, cone, ...), and a smooth free form added to either.
 
-Scaled co-ordinates (x and y to [-1, 1]) and Chebyshev products keep the normal equations well conditioned; the space of
-surfaces is that of the plain polynomial. Large clouds are solved on an even sample first and finished on all points.
-
-Not modelled: errors in x and y, correlated noise, several sheets. Damage of one to three sigma bends every point-wise
-robust fit by about a third of a sigma.
+Scaled co-ordinates (x and y to [-1, 1]) and Chebyshev products keep the normal equations well conditioned. Large clouds
+are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated noise,
+overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of a
+sigma.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebval2d, chebvander
 from pydantic import Field
+from scipy import sparse
+from scipy.linalg import cho_solve, eigh, solveh_banded
 
-from detectors import surface_kernels as kernels
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 
 SAMPLE_POINTS = 2048
-"""First steps are taken on about this many points, evenly strided: their solution is off by a few standard errors."""
-BISQUARE_TUNING = 4.685
-"""95 % efficiency for Gaussian noise; MATLAB's default."""
-LTS_SAMPLE, LTS_SMALL, LTS_STARTS, LTS_KEPT = 8192, 600, 500, 10
-"""FAST-LTS: points in the large and in the first sample, elemental starts, and starts carried to the end.
+BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
+LTS_SAMPLE, LTS_SMALL, LTS_STARTS, LTS_KEPT, LTS_STEPS = 8192, 600, 500, 10, 10
+"""FAST-LTS: points in the large and in the first sample, elemental starts, starts carried on and their steps."""
+LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: up to 45 % damage is survived
+LTS_SEED = 20201102
+LAR_THINNING, LAR_STEPS, HALVINGS = 12, 60, 12
+KNEES = np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])  # knees of Huber's function, in units of the median |r|
+BISQUARE_CONVERGED, GAP_CONVERGED = 1e-2, 1e-6
+"""Bisquare stops below this part of a standard error of the fit, LAR when the duality gap is within this part."""
+TINY_M = 1e-9  # residuals below a nanometre are rounding of the arithmetic
 
-With 35 % damage a start of 10 points is clean with probability 0.65^10 = 1.3 %, so 500 starts miss with 0.1 %."""
-LTS_COVERAGE = 0.55
-"""Fraction of points that the fit must explain: up to 45 % damage is survived."""
-SEED = 20201102
-"""Seed of the elemental starts: fixed, so that the same cloud gives the same surface."""
-LAR_SAMPLE, LAR_THINNING = 2048, 12
-"""Points below which LAR starts from least squares, and the thinning that gives the start above it."""
-BISQUARE_CONVERGED = 1e-2
-"""Stop when no point of the surface moves by more than this part of a standard error of the fit."""
-GAP_CONVERGED = 1e-6
-"""LAR stops when the duality gap puts its sum of |r| within this part of the least possible."""
-TINY_M = 1e-9
-"""Residuals below a nanometre are rounding of the arithmetic."""
+Solution = tuple[np.ndarray, int, bool, str]  # coefficients (p,), steps, whether these converged, and what was done
 
 
 class SurfaceConfig(Config):
     """``shape``: ``polynomial`` of the stated degree; ``auto``: the simplest of plane, polynomials, quadric and free
-    form that the cloud's own evidence asks for (`detectors.background`), whatever ``degree`` says; ``free_form``: that
-    in any case. ``scale_mm``: the width above which a free form follows the cloud; chosen where none is given.
-
-    ``degree``: total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals;
-    ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a FAST-LTS start, then bisquare: the
-    one that survives contiguous damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: no term in
-    both x and y (the thesis' script sets p11, p21, p12 to zero)."""
+    form that the cloud's own evidence asks for, whatever ``degree`` says; ``free_form`` in any case. ``scale_mm``: the
+    width above which a free form follows the cloud. ``degree``: total degree; 3 has the 10 terms of MATLAB's poly33.
+    ``method``: ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics);
+    ``lts`` a FAST-LTS start, then bisquare, which survives damage of a third of the surface; ``least_squares``.
+    ``drop_cross_terms``: no term in both x and y (as the thesis' script)."""
 
     shape: Literal["polynomial", "auto", "free_form"] = "polynomial"
     scale_mm: float | None = Field(default=None, gt=0)
@@ -59,33 +54,44 @@ class SurfaceConfig(Config):
 
 
 @dataclass(frozen=True)
-class Scaling:
-    """Map of x and y, each between its extremes, to [-1, 1]."""
+class Chebyshev:
+    """Products T_a(u) T_b(v) for rows (a, b) of ``powers`` (p, 2); (u, v) = ((x, y) - ``middle_m``) / ``half_m``."""
 
-    x_middle_m: float
-    x_half_m: float
-    y_middle_m: float
-    y_half_m: float
+    powers: np.ndarray
+    middle_m: np.ndarray
+    half_m: np.ndarray
 
     @classmethod
-    def of(cls, x_m: np.ndarray, y_m: np.ndarray) -> Scaling:
-        """Return the map for places of which no two need differ."""
-        (x0, x1), (y0, y1) = (x_m.min(), x_m.max()), (y_m.min(), y_m.max())
-        return cls((x0 + x1) / 2, max((x1 - x0) / 2, TINY_M), (y0 + y1) / 2, max((y1 - y0) / 2, TINY_M))
+    def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
+        """Return the products up to a total degree over places (n, 2), of which no two need differ."""
+        orders = [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
+        low, high = xy_m.min(axis=0), xy_m.max(axis=0)
+        # separable polynomials f(x) + g(y) stay separable under scaling of each axis
+        powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
+        return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
-    def __call__(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return scaled x and y."""
-        return (x_m - self.x_middle_m) / self.x_half_m, (y_m - self.y_middle_m) / self.y_half_m
+    def basis(self, xy_m: np.ndarray) -> np.ndarray:
+        """Return the products (p, n) at places (n, 2)."""
+        u, v = (chebvander(each, self.powers.max()).T for each in self._scaled(xy_m))
+        return np.stack([u[a] * v[b] for a, b in self.powers])
+
+    def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
+        """Return the products' sum (n,) by coefficients (p,)."""
+        table = np.zeros((self.powers.max() + 1,) * 2)
+        table[self.powers[:, 0], self.powers[:, 1]] = coefficients
+        u, v = self._scaled(xy_m)
+        return np.asarray(chebval2d(u, v, table))
+
+    def _scaled(self, xy_m: np.ndarray) -> list[np.ndarray]:
+        return [(xy_m[:, k] - self.middle_m[k]) / self.half_m[k] for k in (0, 1)]
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A fitted surface. ``powers`` (p, 2) Chebyshev orders in scaled x and y, ``coefficients`` (p,) metres."""
+    """A fitted surface; ``coefficients`` (p,) metres."""
 
+    chebyshev: Chebyshev
     coefficients: np.ndarray
-    powers: np.ndarray
-    scaling: Scaling
-    method: str
     iterations: int
     converged: bool
     note: str
@@ -93,211 +99,337 @@ class Surface:
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return z in metres at x, y of one shape; NaN where they are NaN. Extrapolates as polynomials do: badly."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
-        u, v = self.scaling(x.ravel(), y.ravel())
-        return kernels.chebyshev_sum(u, v, self.powers, self.coefficients).reshape(x.shape)
+        return self.chebyshev.summed(self.coefficients, np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
 
 
 def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig) -> Surface:
-    """Fit z(x, y) to finite points, each (n,).
-
-    LAR is within 2e-6 of the least sum of absolute residuals (by the duality gap), which moves no point of the surface
-    by more than 0.2 sigma sqrt(p / n); bisquare is within 0.05 of that unit of the fixed point of all points.
-    Deterministic.
-
-    Raises UserError where there are fewer points than coefficients, or where all points lie on a line.
-    """
-    # separable polynomials f(x) + g(y) stay separable under scaling of each axis: dropping cross terms here and in
-    # metres is the same
-    top = range(config.degree + 1)
-    pairs = [(i, j) for i in top for j in top if i + j <= config.degree and not (config.drop_cross_terms and i and j)]
-    powers = np.array(sorted(pairs, key=lambda p: (p[0] + p[1], -p[0])), dtype=np.int64)
-    if len(z_m) < len(powers):
+    """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute residuals; bisquare is
+    within 0.05 of a standard error of the fixed point of all points. Deterministic. Raises UserError where there are
+    fewer points than coefficients, or where all points lie on a line."""
+    terms = (2 * config.degree + 1) if config.drop_cross_terms else (config.degree + 1) * (config.degree + 2) // 2
+    if len(z_m) < terms:
         raise UserError(
-            f"{len(z_m)} valid points cannot determine the {len(powers)} coefficients of a surface of degree"
-            f" {config.degree}",
-            legal=f"at least {len(powers)} points, and many more to be useful",
+            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}",
+            legal=f"at least {terms} points, and many more to be useful",
             fix="widen the crop, lower surface.degree, or check the capture",
         )
-    x, y, z = (np.ascontiguousarray(a, dtype=np.float64) for a in (x_m, y_m, z_m))
-    scaling = Scaling.of(x, y)
-    basis = kernels.chebyshev_basis(*scaling(x, y), powers)
-    middle = float(np.median(z[:: max(1, len(z) // SAMPLE_POINTS)]))
-    problem = _Problem.of(basis, z - middle)
-    if problem is None:
+    xy = np.column_stack([x_m, y_m]).astype(np.float64)
+    chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
+    basis = chebyshev.basis(xy)
+    middle = float(np.median(z_m[:: max(1, len(z_m) // SAMPLE_POINTS)]))
+    z = np.asarray(z_m, dtype=np.float64) - middle
+    plain = _solved(basis, z)
+    if plain is None:
         raise UserError(
             f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
             fix="widen the crop, or lower surface.degree",
         )
     if config.method == "lar":
-        solution = _lar(problem)
+        c, steps, converged, note = _lar(basis, z, plain[0])
     elif config.method == "bisquare":
-        solution = _bisquare(problem, None, "bisquare from a least-squares start")
+        c, steps, converged, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
     elif config.method == "lts":
-        start = _lts_start(problem.sample(LTS_SAMPLE) or problem)
-        solution = _bisquare(problem, start, "bisquare from a FAST-LTS start")
+        start = _lts_start(*_thinned(basis, z, LTS_SAMPLE))
+        c, steps, converged, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
     else:
-        solution = _SurfaceSolution(problem.least_squares, 1, True, "least squares")
-    coefficients = solution.coefficients.copy()
-    coefficients[0] += middle
-    method, iterations, converged = config.method, solution.iterations, solution.converged
-    return Surface(coefficients, powers, scaling, method, iterations, converged, solution.note)
+        c, steps, converged, note = plain[0], 1, True, "least squares"
+    c = c.copy()
+    c[0] += middle
+    return Surface(chebyshev, c, steps, converged, note)
 
 
-@dataclass(frozen=True)
-class _SurfaceSolution:
-    coefficients: np.ndarray
-    iterations: int
-    converged: bool
-    note: str
+def _solved(
+    basis: np.ndarray, z: np.ndarray, weights: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p, p), or None."""
+    weighted = basis if weights is None else basis * weights
+    factor = _factor(weighted @ basis.T)
+    return None if factor is None else (cho_solve((factor, True), weighted @ z, check_finite=False), factor)
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """``basis`` (p, n), ``z`` (n,), the Cholesky factor of the plain Gram matrix, the least-squares solution (p,)."""
-
-    basis: np.ndarray
-    z: np.ndarray
-    factor: np.ndarray
-    least_squares: np.ndarray
-
-    @classmethod
-    def of(cls, basis: np.ndarray, z: np.ndarray) -> _Problem | None:
-        """None where the points do not determine the coefficients to working precision."""
-        found = _weighted(basis, z, np.ones(len(z)))
-        return None if found is None else cls(basis, z, *found)
-
-    def sample(self, points: int) -> _Problem | None:
-        """Return the problem on about ``points`` of its points; None where it has few or the sample is degenerate."""
-        stride = len(self.z) // points
-        if stride < 2:
-            return None
-        return _Problem.of(np.ascontiguousarray(self.basis[:, ::stride]), np.ascontiguousarray(self.z[::stride]))
-
-    def residuals(self, coefficients: np.ndarray) -> np.ndarray:
-        """Return z less the surface (n,)."""
-        return kernels.residuals(self.basis, self.z, coefficients)
+def _factor(gram: np.ndarray) -> np.ndarray | None:
+    """Return Cholesky's factor, lower; None where the matrix is singular to working precision."""
+    try:
+        factor = np.linalg.cholesky(gram)
+    except np.linalg.LinAlgError:
+        return None
+    size = factor.diagonal()
+    return factor if size.min() > 1e-7 * size.max() else None
 
 
-def _weighted(basis: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the Cholesky factor of the weighted Gram matrix and the weighted solution (p,); None where singular."""
-    gram, right = kernels.weighted_gram(basis, z, weights)
-    factor, regular = kernels.lower_factor(gram)
-    return (factor, kernels.solved(factor, right)) if regular else None
+def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return about so many of the points, evenly strided; all where there are few or these would not determine it."""
+    stride = len(z) // points
+    if stride < 2 or _solved(basis[:, ::stride], z[::stride]) is None:
+        return basis, z
+    return np.ascontiguousarray(basis[:, ::stride]), np.ascontiguousarray(z[::stride])
 
 
-# ---------------------------------------------------------------- least absolute residuals
-
-
-def _lar(problem: _Problem) -> _SurfaceSolution:
-    """Find the L1 solution by smoothing (Madsen and Nielsen 1993): Huber's function with a knee that shrinks, by
-    Newton.
-
-    The sub-gradient of the smoothed optimum is feasible for the dual linear program, so the gap to the least possible
-    sum of |r| is known, not guessed. Most points keep the sign of their residual: they enter as one constant vector,
-    and only those near the surface are iterated (Portnoy and Koenker 1997). The start is the solution of every 12th
-    point, found the same way.
-    """
-    terms, n = problem.basis.shape
-    sample = problem.sample(max(LAR_SAMPLE, n // LAR_THINNING))
-    c, margin, knees = problem.least_squares, np.inf, np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])
-    if sample is not None:
-        c, knees = _lar(sample).coefficients, knees[2:]
+def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray) -> Solution:
+    """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
+    c, margin, knees = start, np.inf, KNEES
+    few_basis, few_z = _thinned(basis, z, max(SAMPLE_POINTS, len(z) // LAR_THINNING))
+    if len(few_z) < len(z):
+        c, knees = _lar(few_basis, few_z, start)[0], KNEES[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
-        margin = 5.0 * 1.25 / 0.6745 * np.sqrt(terms / len(sample.z))
-    r = problem.residuals(c)
+        margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
+    r = z - c @ basis
     scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
-    iterations, gap = 0, np.inf
+    steps, gap = 0, np.inf
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
-        c, r, spent = kernels.lar_stage(problem.basis, problem.z, c, r, reach, knee, enough)
-        iterations += spent
-        margin = min(margin, 5.0 * knee / scale)
-        _, lost, _ = kernels.huber_state(r, knee)
-        gap = lost / max(float(np.abs(r).sum()), TINY_M)
+        while True:
+            near = np.abs(r) < reach
+            far_pull = basis @ np.where(near, 0.0, np.sign(r))
+            new, spent = _smoothed_descent(basis[:, near], z[near], far_pull, c, knee, enough)
+            after, steps = z - new @ basis, steps + spent
+            # a far point may have crossed the surface, or come within the knee of it
+            if not (~near & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
+                break
+            reach *= 3.0
+        c, r, margin = new, after, min(margin, 5.0 * knee / scale)
+        sizes = np.abs(r)
+        inside = sizes[sizes <= knee]
+        gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
-    note = f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
-    return _SurfaceSolution(c, iterations, gap <= GAP_CONVERGED, note)
+    return c, steps, gap <= GAP_CONVERGED, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
 
 
-# ---------------------------------------------------------------- bisquare
+def _smoothed_descent(
+    basis: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
+) -> tuple[np.ndarray, int]:
+    """Minimise sum huber(r, knee) - c' far_pull: Newton, or where it fails a majorising step, which always descends."""
+
+    def state(c: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        r = z - c @ basis
+        sizes = np.abs(r)
+        capped = np.minimum(sizes, knee)
+        return c, r, float(capped @ (sizes - 0.5 * capped)) / knee - float(c @ far_pull)
+
+    def lower(way: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Return the first of the full, half, quarter ... step that lowers the value."""
+        trials = (state(c + way * 0.5**halvings) for halvings in range(HALVINGS))
+        return next((trial for trial in trials if trial[2] < value), None)
+
+    c, r, value = state(start)
+    for step in range(1, LAR_STEPS + 1):
+        pull = basis @ np.clip(r / knee, -1.0, 1.0) + far_pull
+        inside = basis[:, np.abs(r) <= knee]
+        factor, moved = _factor(inside @ inside.T), None
+        if factor is not None:
+            way = knee * cho_solve((factor, True), pull, check_finite=False)
+            if way @ pull < enough:
+                return c, step
+            moved = lower(way)
+        if moved is None:
+            # reweighted least squares: each |r| beyond the knee under its tangent parabola
+            weighted = basis / np.maximum(np.abs(r), knee)
+            moved = lower(np.linalg.lstsq(weighted @ basis.T, pull, rcond=1e-12)[0])
+        if moved is None or value - moved[2] < enough:
+            return c, step
+        c, r, value = moved
+    return c, LAR_STEPS
 
 
-def _bisquare(problem: _Problem, start: np.ndarray | None, note: str) -> _SurfaceSolution:
-    """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points; from the
-    least-squares solution where no ``start`` is given."""
-    sample = problem.sample(SAMPLE_POINTS)
-    if sample is None:
-        return _reweighted(problem, problem.least_squares if start is None else start, 50, note)
-    inner = _reweighted(sample, sample.least_squares if start is None else start, 50, note)
-    full = _reweighted(problem, inner.coefficients, 8, note)
-    return _SurfaceSolution(full.coefficients, inner.iterations + full.iterations, full.converged, note)
+def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
+    """Return Tukey's weights (1 - (r / limit)^2)^2 inside the limit, 0 outside."""
+    return np.asarray(np.maximum(1.0 - (r / limit) ** 2, 0.0) ** 2)
 
 
-def _reweighted(problem: _Problem, start: np.ndarray, steps: int, note: str) -> _SurfaceSolution:
-    inverse = np.linalg.inv(problem.factor)
-    leverage = np.minimum(kernels.leverages(problem.basis, inverse), 0.9999)
-    adjust = 1.0 / np.sqrt(1.0 - leverage)
-    c, terms = start, len(start)
+def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: str) -> Solution:
+    """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points."""
+    few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
+    inner = _reweighted(few_basis, few_z, start, 50, note)
+    if len(few_z) == len(z):
+        return inner
+    c, steps, converged, note = _reweighted(basis, z, inner[0], 8, note)
+    return c, inner[1] + steps, converged, note
+
+
+def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str) -> Solution:
+    plain = _solved(basis, z)
+    assert plain is not None
+    c, terms = plain[0] if start is None else start, len(basis)
+    leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
+    adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
     for step in range(1, steps + 1):
-        adjusted = problem.residuals(c) * adjust
+        adjusted = (z - c @ basis) * adjust
         # MATLAB's robust sigma: median of |r| without as many of the smallest as there are terms, over 0.6745
         sizes = np.abs(adjusted)
         place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
-        found = _weighted(problem.basis, problem.z, kernels.bisquare_weights(adjusted, BISQUARE_TUNING * scale))
+        found = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
         if found is None:
-            return _SurfaceSolution(c, step, False, note + "; stopped: too few points kept weight")
-        factor, new = found
+            return c, step, False, note + "; stopped: too few points kept weight"
+        new, factor = found
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
         if moved < BISQUARE_CONVERGED * np.sqrt(terms):
-            return _SurfaceSolution(c, step, True, note)
-    return _SurfaceSolution(c, steps, False, note)
+            return c, step, True, note
+    return c, steps, False, note
 
 
-# ---------------------------------------------------------------- least trimmed squares
+def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return FAST-LTS's coefficients (p,) (Rousseeuw and Van Driessen 2006)."""
+    few_basis, few_z = _thinned(basis, z, LTS_SMALL)
+    terms, points = few_basis.shape
+    ridge = 1e-12 * np.eye(terms)
+
+    def concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
+        """Return coefficients (m, p) after so many steps, those with the least sum of the smallest squares first."""
+        kept = min(len(z), max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2))
+        for _ in range(steps):
+            squares = (z - c @ basis) ** 2
+            chosen = squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept]
+            weighted = chosen[:, None, :] * basis
+            c = np.linalg.solve(weighted @ basis.T + len(z) * ridge, (weighted @ z)[..., None])[..., 0]
+        sums = np.partition((z - c @ basis) ** 2, kept - 1, axis=1)[:, :kept].sum(axis=1)
+        return np.asarray(c[np.argsort(sums, kind="stable")])
+
+    picks = np.argsort(np.random.default_rng(LTS_SEED).random((LTS_STARTS, points)), axis=1)[:, :terms]
+    starts = np.linalg.solve(few_basis.T[picks] + ridge, few_z[picks][..., None])[..., 0]
+    best = concentrated(few_basis, few_z, starts, 2)[:LTS_KEPT]
+    return np.asarray(concentrated(basis, z, best, LTS_STEPS)[0])
 
 
-def _lts_start(problem: _Problem) -> np.ndarray:
-    """Return FAST-LTS's coefficients (p,) (Rousseeuw and Van Driessen 2006): concentration steps from elemental starts
-    on few points, the best of them carried on to all."""
-    random = np.random.default_rng(SEED)
-    terms, n = problem.basis.shape
-    small = problem.sample(LTS_SMALL) or problem
-    points = len(small.z)
-    picks = np.argsort(random.random((LTS_STARTS, points)), axis=1)[:, :terms]
-    kept, ridge = _kept(points, terms), 1e-12 * np.eye(terms)
-    c = np.linalg.solve(small.basis.T[picks] + ridge, small.z[picks][..., None])[..., 0]
-    for _ in range(2):
-        squares = (small.z - c @ small.basis) ** 2
-        chosen = squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept]
-        weighted = chosen[:, None, :] * small.basis
-        gram, right = weighted @ small.basis.T + points * ridge, weighted @ small.z
-        c = np.linalg.solve(gram, right[..., None])[..., 0]
-    sums = np.partition((small.z - c @ small.basis) ** 2, kept - 1, axis=1)[:, :kept].sum(axis=1)
-    finalists = [_concentrate(problem, c[i], _kept(n, terms)) for i in np.argsort(sums, kind="stable")[:LTS_KEPT]]
-    return min(finalists, key=lambda finalist: finalist[1])[0]
+Fit = Callable[[np.ndarray], np.ndarray]
+"""Measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
+RIDGE = 1e-9  # share of the largest diagonal element that is added to each: keeps normal equations regular
+KNOTS_PER_WAVELENGTH = 4.0
+"""Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the penalty in charge."""
+MOST_KNOTS = 64  # most knots along one side: a limit to time and memory; the free form is then smoother than asked for
 
 
-def _kept(points: int, terms: int) -> int:
-    return min(points, max(int(LTS_COVERAGE * points), (points + terms + 1) // 2))
+def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
+    """Fit Chebyshev products of total degree ``degree`` by weighted least squares; regular for any points."""
+    chebyshev, level = Chebyshev.over(points[:, :2], degree), float(points[:, 2].mean())
+    basis = chebyshev.basis(points[:, :2])
+    coefficients = _ridged(basis.T, points[:, 2] - level, weights)
+    coefficients[0] += level
+    return lambda p: chebyshev.summed(coefficients, p[:, :2])
 
 
-def _concentrate(problem: _Problem, c: np.ndarray, kept: int) -> tuple[np.ndarray, float]:
-    """Take concentration steps until the sum of the ``kept`` smallest squares stays: (coefficients, sum)."""
-    best = np.inf
-    for _ in range(30):
-        squares = problem.residuals(c) ** 2
-        chosen = squares <= np.partition(squares, kept - 1)[kept - 1]
-        total = float(squares[chosen].sum())
-        if total >= best * (1.0 - 1e-9):
-            break
-        best = total
-        found = _weighted(problem.basis, problem.z, chosen.astype(np.float64))
-        if found is None:
-            break
-        c = found[1]
-    return c, best
+def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted least-squares solution (p,) of a design (n, p), regular by `RIDGE`."""
+    weighted = weights[:, None] * design
+    gram = design.T @ weighted
+    gram[np.diag_indices_from(gram)] += RIDGE * gram.diagonal().max()
+    return np.asarray(np.linalg.solve(gram, weighted.T @ z))
+
+
+def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
+    """Fit the quadric with the least weighted squares of distances along the rays, to first order: Taubin's algebraic
+    fit (1991), then Gauss-Newton steps. None where the points lie on no single sheet. ``central``: rays leave the
+    origin; else they are parallel to z."""
+    middle = np.average(points, axis=0, weights=weights)
+    size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
+    scaled = (points - middle) / size
+    along = (points / points[:, 2:] if central else np.broadcast_to([0.0, 0.0, 1.0], points.shape)) / size
+    (x, y, z), (dx, dy, dz) = scaled.T, along.T
+    zero = np.zeros_like(x)
+    terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, zero + 1.0], axis=1)
+    products = [2 * x * dx, 2 * y * dy, 2 * z * dz, x * dy + y * dx, x * dz + z * dx, y * dz + z * dy]
+    slopes = np.stack([*products, dx, dy, dz, zero], axis=1)
+
+    # Taubin's fit: the least sum of F^2 for a given sum of (dF/dray)^2
+    means = np.average(terms[:, :9], axis=0, weights=weights)
+    centred = terms[:, :9] - means
+    squares = centred.T @ (weights[:, None] * centred)
+    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
+    sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
+    algebraic = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
+    c = np.append(algebraic, -means @ algebraic)
+    c /= np.linalg.norm(c)
+    for _ in range(4):
+        steep = slopes @ c
+        sheet = np.sign(np.average(np.sign(steep), weights=weights)) or 1.0
+        floor = 0.02 * float(np.median(np.abs(steep)))
+        steep = np.where(np.abs(steep) < floor, sheet * max(floor, 1e-300), steep)
+        c = c - _ridged(terms / steep[:, None], (terms @ c) / steep, weights)
+        c /= np.linalg.norm(c)
+    sheet = float(np.sign(np.average(np.sign(slopes @ c), weights=weights)))
+    if sheet == 0.0:
+        return None
+    matrix = np.array([[c[0], c[3] / 2, c[4] / 2], [c[3] / 2, c[1], c[5] / 2], [c[4] / 2, c[5] / 2, c[2]]])
+
+    def z_at(q: np.ndarray) -> np.ndarray:
+        """Return t at which start + t ray meets the quadric where F grows along the ray with the sheet's sign."""
+        if central:
+            start, ray = np.broadcast_to(-middle / size, q.shape), q / q[:, 2:] / size
+        else:
+            start, ray = (q * [1.0, 1.0, 0.0] - middle) / size, np.broadcast_to([0.0, 0.0, 1.0 / size], q.shape)
+        a = np.einsum("ni,ij,nj->n", ray, matrix, ray)
+        b = 2 * np.einsum("ni,ij,nj->n", start, matrix, ray) + ray @ c[6:9]
+        k = np.einsum("ni,ij,nj->n", start, matrix, start) + start @ c[6:9] + c[9]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            root = sheet * np.sqrt(b * b - 4 * a * k)
+            # of the two equal forms the one without cancellation
+            return np.where(b * sheet > 0, 2 * k / (-b - root), (-b + root) / (2 * a))
+
+    return z_at
+
+
+def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: float, cell: float, central: bool) -> Fit:
+    """Fit a base shape plus tensor-product cubic B-splines in the picture's plane, penalised on third derivatives
+    (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones less (as its sixth power); in units of
+    x/z (central) or metres, as ``cell``, the spacing of the points."""
+    places = picture_places(points, central)
+    low, extent = places.min(axis=0), np.ptp(places, axis=0)
+    spacing = max(wavelength / KNOTS_PER_WAVELENGTH, float(extent.max()) / MOST_KNOTS)
+    counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 3
+    residual = points[:, 2] - base(points)
+    w = np.where(np.isfinite(residual), weights, 0.0)
+    values, numbers = _splines((places - low) / spacing, counts)
+    starts = np.arange(0, values.size + 1, 16)
+    design = sparse.csr_array((values.ravel(), numbers.ravel(), starts), shape=(len(points), int(counts.prod())))
+    # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the factor
+    stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
+    weighted = sparse.diags_array(w) @ design
+    gram = sparse.coo_array(sparse.triu(design.T @ weighted + stiffness * _penalty(int(counts[0]), int(counts[1]))))
+    # LAPACK's upper bands
+    width = int(3 * counts[1] + 3)
+    banded = np.zeros((width + 1, design.shape[1]))
+    banded[width + gram.row - gram.col, gram.col] = gram.data
+    banded[-1] += RIDGE * float(banded[-1].max())
+    coefficients = solveh_banded(banded, weighted.T @ np.where(w > 0, residual, 0.0), check_finite=False)
+
+    def z_at(q: np.ndarray) -> np.ndarray:
+        values, numbers = _splines((picture_places(q, central) - low) / spacing, counts)
+        return base(q) + np.einsum("nk,nk->n", values, coefficients[numbers])
+
+    return z_at
+
+
+def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
+    """Return (n, 2) x/z and y/z, or x and y where rays are parallel."""
+    return points[:, :2] / points[:, 2:] if central else points[:, :2]
+
+
+def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 16 products of cubic splines that reach each place (n, 2)."""
+    x = np.clip(np.nan_to_num(places), 0.0, counts - 3.0)
+    first = np.minimum(x.astype(np.int64), counts - 4)
+    t = x - first
+    s = 1.0 - t
+    each = np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6.0
+    rows, columns = np.moveaxis(first[..., None] + np.arange(4), 1, 0)
+    values = each[:, 0, :, None] * each[:, 1, None, :]
+    numbers = rows[:, :, None] * counts[1] + columns[:, None, :]
+    return values.reshape(-1, 16), numbers.reshape(-1, 16)
+
+
+@lru_cache(maxsize=32)
+def _penalty(rows: int, columns: int) -> sparse.csr_array:
+    """Return the sum of squared third differences of (rows, columns) coefficients, mixed ones three times."""
+
+    def squared(count: int, order: int) -> np.ndarray:
+        differences = np.diff(np.eye(count), order, axis=0)
+        return np.asarray(differences.T @ differences)
+
+    return sum(
+        factor * sparse.csr_array(sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr"))
+        for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
+    )

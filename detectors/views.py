@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from detectors.marks.mark import MarkSet
-from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Cloud
 
 
 @dataclass(frozen=True)
 class View:
-    """One view. ``T_reference_view_guess`` (4, 4): where it is thought to stand, this view's camera frame to the first
-    view's, good to some degrees and centimetres; the identity for the first; None where nothing is known."""
+    """One view. ``T_reference_view_guess`` (4, 4): its camera frame to the first view's, roughly; None: unknown."""
 
     name: str
     cloud: Cloud

@@ -4,14 +4,9 @@ The study is run and compared with a baseline that lies in the repository, by `h
 set-up fails if its a90 or its rate of false calls has grown by more than 10 % and the tests over boards say that it is
 not by chance (0.1 % for the whole check); or if it has no limit any more, more failed trials, or is missing.
 
-What it sees, by `tests/validation/gate_power.py`, for 40 boards of ten holes, 40 hole-free boards, 40 to calibrate on,
-two set-ups: with another draw of all noise 0.4 % of 500 checks fail (0.05 to 1.4 %). Of 20 checks each, 10 % fail where
-a90 grows by 5 %, 75 % by 10 %, 95 % by 15 % and all by 20 % and more; where the curve flattens about the same a50,
-30 % fail where a90 grows by 10 % and all by 20 % and more.
-A detector that finds below the threshold that it was calibrated to, at 0.85 (0.67) of it, fails in 85 % (all), above,
-at 1.15 (1.5), in 30 % (all): a90 grows by 7 % (22 %). With the same seed and code the frames are the baseline's, and
-nothing fails that has not changed; a rise of false calls shows better there if the threshold is the baseline's too,
-since few calibration boards leave much to luck.
+What it sees, by `tests/validation/gate_power.py`, for 40 boards of ten holes, 40 hole-free boards, 40 to calibrate on:
+with another draw of all noise 0.4 % of 500 checks fail (0.05 to 1.4 %); of 20 checks each, 10 % fail where a90 grows by
+5 %, 75 % by 10 %, 95 % by 15 % and all by 20 % and more. With the same seed and code nothing fails that is the same.
 """
 
 from __future__ import annotations
@@ -22,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.engine.options import add_engine_options, engine_options
+from harness.engine.work import add_engine_options, engine_options
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
@@ -33,8 +28,7 @@ BASELINES = Path(__file__).resolve().parents[1] / "results" / "baselines"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user (a missing baseline, one
-    measured with another stick), 130 after Ctrl-C."""
+    """The program. Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(given)
     return exit_code_of(lambda: _run(options, "python -m harness.check " + shlex.join(given)))
@@ -50,14 +44,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file with a `study`, such as experiments/regression.yaml")
-    add(
-        "--set",
-        dest="overrides",
-        metavar="PATH=VALUE",
-        action="append",
-        default=[],
-        help="change one value of the file, such as seed=7 for another draw of the noise; may be repeated",
-    )
+    change = "change one value of the file, such as seed=7 for another draw of the noise; may be repeated"
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
     add("--update", action="store_true", help="write the baseline anew, and print what changes")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
@@ -81,7 +69,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
         raise UserError(
             f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail",
-            legal=f"at least {needed} boards for {set_ups} set-up{'s' if set_ups > 1 else ''}",
+            legal=f"at least {needed} boards for {set_ups} set-up{'s' * (set_ups > 1)}",
             fix="raise study.boards: 40 are needed to see a90 grow by 15 %",
         )
     asked = engine_options(options)
@@ -93,20 +81,19 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if code not in (0, 1):
         return code
     folder = experiment.folder(options.out)
-    found, comparison = read_record(folder), None
-    if baseline is not None:
-        comparison = compare_studies(baseline, found)
+    found = read_record(folder)
+    comparison = None if baseline is None else compare_studies(baseline, found)
+    if comparison is not None:
         print()
         print_comparison(comparison)
         write_comparison(comparison, folder, command)
         print(f"comparison with the baseline: {folder / FILES[1]}")
-    if options.update:
+    if options.update or comparison is None:
         if code == 1:
             raise UserError(f"{path}: is left as it was, since trials failed", fix="mend what makes them fail first")
         write_text(path, record_text(found))
         print(f"wrote {path}")
         return 0
-    assert comparison is not None
     missing = [row.label for row in comparison.marked("only in first")]
     if missing:
         print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
@@ -127,12 +114,10 @@ def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
 
     if path.is_dir():
         raise UserError(f"{path}: is a folder", fix="name the baseline's file with --baseline, such as regression.json")
-    if not path.exists():
-        if update:
-            return None
+    if not path.exists() and not update:
         raise UserError(f"{path}: there is no such baseline", fix="write one with --update, and commit it")
     try:
-        return read_record(path)
+        return read_record(path) if path.exists() else None
     except UserError as mistake:
         if not update:
             raise UserError(mistake.message, legal=mistake.legal, fix="write it anew with --update") from mistake

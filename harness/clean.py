@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
@@ -48,68 +47,63 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _clean_cache(options: argparse.Namespace) -> int:
-    from harness.listing.removal import cache_removal, checked_inside
-    from harness.listing.text import bytes_of, cache_folder, many, seconds_of, size_text
+    from harness.listing import bytes_of, cache_removal, refuse_links, seconds_of, size_text
+    from harness.tables.text import many
     from scenes.render.cache import alone, removed
 
     limit = None if options.limit is None else bytes_of(options.limit)
     older_s = None if options.older_than is None else seconds_of(options.older_than)
     if limit is None and older_s is None and not options.damaged and not options.all:
         raise UserError("no renders were chosen", legal="--limit SIZE, --older-than AGE, --damaged, --all; or several")
-    folder = cache_folder(options.out)
+    folder = options.out / ".cache" / "renders"
     if not folder.is_dir():
         print(f"{folder}: there is no cache")
         return 0
-    checked_inside(options.out, folder)
+    refuse_links(folder, folder.parent)
     if not options.dry_run:
         with alone(folder):  # a sweep that runs is told before anything is asked
             pass
     wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
-    size = sum(one.size_bytes for one in wanted)
-    if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size_text(size)}", len(wanted)):
+    size = size_text(sum(file.size_bytes for file in wanted))
+    if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
     with alone(folder):  # not while the question waits for its answer: that would block every sweep
         gone = removed(wanted)
-    return _concluded(len(gone), len(wanted), sum(one.size_bytes for one in gone))
+    return _concluded(len(gone), len(wanted), sum(file.size_bytes for file in gone))
 
 
 def _clean_results(options: argparse.Namespace) -> int:
-    from harness.listing.removal import chosen_results, removable, remove_files
-    from harness.listing.text import many, size_text
+    from harness.listing import chosen_results, removable, remove_results, size_text
+    from harness.tables.text import many
 
     folders = chosen_results(options.out, options.name)
     if not options.dry_run:
-        for folder in folders:
-            with _held(folder):  # a sweep that runs is told before anything is asked
-                pass
-    files = [one for folder in folders for one in removable(folder, journal_only=options.journal_only)]
-    size = sum(one.size_bytes for one in files)
-    for folder in folders:
-        print(folder)
+        with ExitStack() as held:  # a sweep that runs is told before anything is asked
+            _hold(held, folders)
+    files = [file for folder in folders for file in removable(folder, journal_only=options.journal_only)]
+    print("\n".join(map(str, folders)))
     what = "files of journals" if options.journal_only else "files"
-    if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size_text(size)}", len(files)):
+    size = size_text(sum(file.size_bytes for file in files))
+    if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size}", len(files)):
         return 0 if options.dry_run or not files else 1
-    with ExitStack() as held:
-        for folder in folders:  # not while the question waits for its answer: that would block every sweep
-            held.enter_context(_held(folder))
-        gone = remove_files(folders, files)
+    with ExitStack() as held:  # not while the question waits for its answer: that would block every sweep
+        _hold(held, folders)
+        gone = remove_results(folders, files)
     for folder in folders:
         if not options.journal_only and folder.exists():
             print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
-    return _concluded(len(gone), len(files), sum(one.size_bytes for one in gone))
+    return _concluded(len(gone), len(files), sum(file.size_bytes for file in gone))
 
 
-@contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Hold a folder of results. Raises UserError where a sweep does, or where it cannot be written."""
-    from harness.engine.shard import locked
+def _hold(held: ExitStack, folders: list[Path]) -> None:
+    """Hold folders of results. Raises UserError where a sweep holds one, or where it cannot be written."""
+    from harness.engine.work import locked
 
-    with ExitStack() as held:
+    for folder in folders:
         try:
             held.enter_context(locked(folder))
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
-        yield
 
 
 def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
@@ -127,10 +121,11 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
         return False
 
 
-def _concluded(gone: int, wanted: int, freed: int) -> int:
-    from harness.listing.text import many, size_text
+def _concluded(gone: int, wanted: int, freed_bytes: int) -> int:
+    from harness.listing import size_text
+    from harness.tables.text import many
 
-    print(f"removed {many(gone, 'file')}, {size_text(freed)}")
+    print(f"removed {many(gone, 'file')}, {size_text(freed_bytes)}")
     if gone < wanted:
         print(f"{many(wanted - gone, 'file')} could not be removed", file=sys.stderr)
     return 0 if gone == wanted else 1

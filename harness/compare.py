@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -36,40 +37,25 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
     add("second", type=Path, metavar="B", help="likewise; what is asked is whether B is worse or better than A")
-    add(
-        "--alpha",
-        type=_level,
-        default=0.05,
-        metavar="P",
-        help="level of the tests, all set-ups together (default: 0.05)",
-    )
+    level = "level of the tests, all set-ups together (default: 0.05)"
+    add("--alpha", type=float, default=0.05, metavar="P", help=level)
     add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
     return parser
-
-
-def _level(text: str) -> float:
-    try:
-        level = float(text)
-    except ValueError:
-        level = 0.0
-    if not 1e-6 <= level <= 0.5:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a level from 1e-6 to 0.5")
-    return level
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
 
+    if not 1e-6 <= options.alpha <= 0.5:
+        raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
         both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
-        raise UserError(
-            f"nothing could be paired: no set-up of the two has the same name and frames: {both}",
-            legal="set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each",
-            fix="run both studies with the same `sweep`, or each with a single set-up",
-        )
+        said = f"nothing could be paired: no set-up of the two has the same name and frames: {both}"
+        legal = "set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each"
+        raise UserError(said, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
     comparison = compare_studies(first, second, options.alpha)
     print_comparison(comparison, as_json=options.json)
     if options.out is not None:
@@ -81,30 +67,23 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
     """Print the table, in colour on a terminal; or JSON."""
-    from harness.report.compare import compare_parts
-    from harness.tables.grid import show
+    from harness.report.compare import compare_data, compare_parts
+    from harness.tables.text import show
 
     if as_json:
-        print(_json(comparison))
+        print(json.dumps(compare_data(comparison), indent=2, allow_nan=False))
     else:
         show(compare_parts(comparison))
 
 
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
     """Write `FILES` into ``folder``."""
-    from harness.report.compare import compare_html
+    from harness.report.compare import compare_data, compare_html
     from harness.vocabulary.files import write_text
 
-    write_text(folder / FILES[0], _json(comparison) + "\n")
+    data = json.dumps(compare_data(comparison), indent=2, allow_nan=False)
+    write_text(folder / FILES[0], data + "\n")
     write_text(folder / FILES[1], compare_html(comparison, command))
-
-
-def _json(comparison: Comparison) -> str:
-    import json
-
-    from harness.report.compare import compare_data
-
-    return json.dumps(compare_data(comparison), indent=2, allow_nan=False)
 
 
 if __name__ == "__main__":

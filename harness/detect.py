@@ -6,15 +6,20 @@ import argparse
 import sys
 from pathlib import Path
 
-from harness.inspection.arguments import LEGAL_CROP, MARKS, MERGES, METHODS
-from harness.inspection.judging import DEFAULT_FALSE_CALLS
+from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP, MARKS, MERGES, METHODS
 from harness.vocabulary.errors import exit_code_of
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the program; returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
     arguments = _parser().parse_args(argv)
-    return exit_code_of(lambda: _run(arguments))
+
+    def run() -> int:
+        from harness.inspection.run import inspect
+
+        return inspect(arguments)
+
+    return exit_code_of(run)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -26,75 +31,43 @@ def _parser() -> argparse.ArgumentParser:
         "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
     )
     add = parser.add_argument
-    add(
-        "paths",
-        nargs="+",
-        type=Path,
-        metavar="PATH",
-        help="folder or list of depth .png, .ply, .pcd, .xyz; .npy .npz .mat .mkv .r3d .bin; a ROS bag (folder, .mcap,"
-        " .db3, .bag); a Stray Scanner folder; with --pitch a height map",
+    formats = (
+        "folder or list of depth .png, .ply, .pcd, .xyz; .npy .npz .mat .mkv .r3d .bin; a ROS bag (folder, .mcap,"
+        " .db3, .bag); a Stray Scanner folder; with --pitch a height map"
     )
-    add(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="write findings.csv, findings.json, annotated.png, targets.png (the surfaces to choose from), blind.png"
+    add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
+    files = (
+        "write findings.csv, findings.json, annotated.png, targets.png (the surfaces to choose from), blind.png"
         " (where nothing returned) and cloud.ply here; of several views merged.ply, registrations.json and view3d.html"
-        " (turns in the browser) too",
+        " (turns in the browser) too"
     )
-    add(
-        "--unit",
-        help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: what the file, the camera or"
-        " the data say, which is printed",
-    )
-    add(
-        "--intrinsics",
-        metavar="FILE|CAMERA",
-        help="the lens of the depth pixels: a file, or a camera's nominal lens by name",
-    )
-    add(
-        "--crop",
-        default="auto",
-        metavar="KIND",
-        help=f"which part is the target: {LEGAL_CROP}; default auto, the nearest large smooth surface less the 3 pixels"
+    add("--out", type=Path, metavar="DIR", help=files)
+    unit = "unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: what the file, the camera or"
+    add("--unit", help=f"{unit} the data say, which is printed")
+    lens = "the lens of the depth pixels: a file, or a camera's nominal lens by name"
+    add("--intrinsics", metavar="FILE|CAMERA", help=lens)
+    crop = (
+        f"which part is the target: {LEGAL_CROP}; default auto, the nearest large smooth surface less the 3 pixels"
         " of its rim where the camera mixes in what is behind (depth aligned to a finer colour camera:"
-        " --set crop.inset_px=8)",
+        " --set crop.inset_px=8)"
     )
-    add(
-        "--target",
-        type=_number,
-        metavar="N",
-        help="with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows",
-    )
+    add("--crop", default="auto", metavar="KIND", help=crop)
+    target = "with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows"
+    add("--target", type=_number, metavar="N", help=target)
     add("--detector", default="local", help="detector's name (default: local)")
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="detector's setting by dotted path: surface.degree=5",
-    )
-    add(
-        "--average",
-        choices=("mean", "median", "clipped"),
-        default="mean",
-        help="how frames are averaged (default: mean)",
-    )
+    setting = "detector's setting by dotted path: surface.degree=5"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
+    averages = ("mean", "median", "clipped")
+    add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
     add("--max-frames", type=_number, metavar="N", help="use the first N frames only")
-    add(
-        "--false-calls",
-        type=float,
-        metavar="N",
-        help="set the threshold so that N false calls are expected in this capture, by the noise that it shows towards"
-        f" the camera (default: {DEFAULT_FALSE_CALLS:g})",
+    calls = (
+        "set the threshold so that N false calls are expected in this capture, by the noise that it shows towards"
+        f" the camera (default: {DEFAULT_FALSE_CALLS:g})"
     )
+    add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    add(
-        "--quiet-capture",
-        type=Path,
-        metavar="PATH",
-        help="calibrate the threshold on this capture of an undamaged target",
-    )
+    quiet = "calibrate the threshold on this capture of an undamaged target"
+    add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
     add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
     add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
@@ -109,20 +82,16 @@ def _parser() -> argparse.ArgumentParser:
     ).add_argument
     add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
     add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
-    add(
-        "--marks",
-        choices=MARKS,
-        metavar="KIND",
-        help="the fiducial marks: colour (strips of any colour that stands apart; default), red (the thesis' rule),"
-        " coded (ArUco, AprilTag)",
+    marks = (
+        "the fiducial marks: colour (strips of any colour that stands apart; default), red (the thesis' rule),"
+        " coded (ArUco, AprilTag)"
     )
-    add(
-        "--poses",
-        type=Path,
-        metavar="FILE",
-        help="where the views are thought to stand: JSON, a list of 4x4 matrices to one common frame in metres, or"
-        " lines of TUM's groundtruth.txt, one a view; only a start for the registration",
+    add("--marks", choices=MARKS, metavar="KIND", help=marks)
+    poses = (
+        "where the views are thought to stand: JSON, a list of 4x4 matrices to one common frame in metres, or"
+        " lines of TUM's groundtruth.txt, one a view; only a start for the registration"
     )
+    add("--poses", type=Path, metavar="FILE", help=poses)
     return parser
 
 
@@ -130,12 +99,6 @@ def _number(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number of 1 or more")
     return int(text)
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    from harness.inspection.run import inspect
-
-    return inspect(arguments)
 
 
 if __name__ == "__main__":

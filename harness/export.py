@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 from harness.vocabulary.errors import UserError, exit_code_of
 
 if TYPE_CHECKING:
-    from harness.exchange.views import ExportedView
-    from harness.experiment.points import Experiment
-    from harness.experiment.schema import SimulatedSource
+    from harness.exchange import ExportedView
+    from harness.experiment.schema import Experiment, SimulatedSource
     from scenes.sensor.source import SimulatedCapture
     from scenes.target.custom import TargetConfig
 
@@ -41,24 +40,13 @@ def _parser() -> argparse.ArgumentParser:
     add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment with a simulated source")
     add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag a view")
     add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
-    add(
-        "--set",
-        dest="overrides",
-        metavar="PATH=VALUE",
-        action="append",
-        default=[],
-        help="change one value of the file, such as source.target.distance_m=0.9; may be repeated",
-    )
+    change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--views", type=_count, metavar="N", help="the first N views only (default: all)")
     add("--frames", type=_count, metavar="N", help="frames of each view (default: the experiment's capture.frames)")
     add("--hole-free", action="store_true", help="the same target without its damage")
-    add(
-        "--results",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="where experiments' results go: renders are taken from there, and kept there (default: results)",
-    )
+    results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
+    add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     return parser
 
 
@@ -69,7 +57,7 @@ def _count(text: str) -> int:
 
 
 def _run(arguments: argparse.Namespace, given: list[str]) -> int:
-    from harness.exchange.views import in_turn
+    from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import SimulatedSource
     from harness.vocabulary.files import atomic_folder
@@ -93,14 +81,9 @@ def _run(arguments: argparse.Namespace, given: list[str]) -> int:
         rate = camera_of(source.camera).unit.frames_per_second.value
         views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
         if arguments.format == "tum":
-            from harness.exchange.tum import write_tum
-
             write_tum(folder, views)
-        else:
-            from harness.exchange.bags import write_bag
-
-            for view in views:
-                write_bag(folder / view.name, view, "mcap" if arguments.format == "mcap" else "sqlite3")
+        for view in () if arguments.format == "tum" else views:
+            write_bag(folder / view.name, view, "mcap" if arguments.format == "mcap" else "sqlite3")
         _write_beside(folder, arguments, experiment, source, targets, views, given)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
@@ -119,8 +102,7 @@ def _captured(
     from scenes.sensor.source import SimulatedUnit
 
     camera = camera_of(source.camera)
-    cache = arguments.results / ".cache" / "renders"
-    view, found = cached_view(target, camera.optics, source.render, cache)
+    view, found = cached_view(target, camera.optics, source.render, arguments.results / ".cache" / "renders")
     print(f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}")
     labels: tuple[str | int, ...] = (_role(arguments), REPEAT, *(("view", number) if number else ()))
     frames = arguments.frames or experiment.config.capture.frames
@@ -141,20 +123,19 @@ def _write_beside(
     given: list[str],
 ) -> None:
     """Write the truth, the nominal poses that a registration may start from, the declaration, and the provenance."""
+    import numpy as np
+
     from harness.experiment.load import resolved_yaml
-    from harness.inspection.poses import POSES_KEY
+    from harness.inspection.arguments import POSES_KEY
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.provenance import record
-    from harness.vocabulary.versions import RESULTS_VERSION
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.perspectives import guessed_T_reference_view
     from scenes.target.truth import truth_of
 
-    nominal = [[[float(row == column) for column in range(4)] for row in range(4)]]
+    nominal, poses = [np.eye(4)], tuple(target.pose for target in targets)
     if source.views is not None:
-        poses = tuple(target.pose for target in targets)
-        numbers = range(len(poses))
         role = _role(arguments)
-        nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT).tolist() for n in numbers]
+        nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT) for n in range(len(poses))]
     files: dict[str, dict[str, Any]] = {
         "truth.json": {
             "frames": {
@@ -164,7 +145,7 @@ def _write_beside(
             "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
             "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
-        "nominal_poses.json": {POSES_KEY: nominal},
+        "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},
         "provenance.json": {
             **record("python -m harness.export " + shlex.join(given)),
             "experiment": experiment.config.name,
@@ -175,8 +156,7 @@ def _write_beside(
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [
-                "The room stands still before the camera and the target is turned, as on a table: only the target"
-                " agrees with the poses from view to view, what is behind it does not.",
+                "The target is turned as on a table: it alone agrees with the poses from view to view, not the room.",
                 "Outside the simulated region of each image there is no range and black.",
                 "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
             ],

@@ -6,7 +6,7 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
@@ -33,7 +33,7 @@ def _parser() -> argparse.ArgumentParser:
         "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
         epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
     )
-    add = parser.add_argument
+    add, switch = parser.add_argument, argparse.BooleanOptionalAction
     add("file", type=Path, metavar="FILE.csv", help="a header row, then one row an inspection; comma, semicolon or tab")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
     add("--hit", metavar="COL", help="column of 1 (found) and 0 (missed)")
@@ -41,38 +41,28 @@ def _parser() -> argparse.ArgumentParser:
     add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
     add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
     add("--out", type=Path, default=Path("results/pod"), metavar="DIR", help="default: results/pod")
-    add(
-        "--log",
-        action=argparse.BooleanOptionalAction,
-        help="the curve against the sizes' logarithm, or not (default: what gives less deviance)",
-    )
-    hits = parser.add_argument_group("with --hit")
-    put = hits.add_argument
+    least = "(default: what gives less deviance)"
+    add("--log", action=switch, help=f"the curve against the sizes' logarithm, or not {least}")
+    put = parser.add_argument_group("with --hit").add_argument
     put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
     put("--bound", choices=BOUNDS, help="how a90/95 is found (default: likelihood-ratio, 3.841)")
     put("--bounded", choices=BOUNDED, help="fit hits by chance (floor), misses at any size (ceiling) or both as well")
-    signals = parser.add_argument_group("with --ahat")
-    put = signals.add_argument
+    put = parser.add_argument_group("with --ahat").add_argument
     put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
     put("--left", type=float, metavar="Y", help="signals at or below this are known to be no more than that (noise)")
     put("--right", type=float, metavar="Y", help="signals at or above this are known to be no less (saturation)")
-    put(
-        "--log-signal",
-        action=argparse.BooleanOptionalAction,
-        help="the straight line is of the signals' logarithm, or not (default: what gives less deviance)",
-    )
+    put("--log-signal", action=switch, help=f"the straight line is of the signals' logarithm, or not {least}")
     return parser
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
     import json
 
-    _refuse_what_does_not_belong(options)
     statement = _stated(options)
     from harness.report.pod import pod_html, pod_parts, save_pod_png
-    from harness.tables.grid import show
+    from harness.tables.text import show
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.versions import RESULTS_VERSION
+    from harness.vocabulary.provenance import RESULTS_VERSION
 
     show(pod_parts(statement))
     data, picture, page = (options.out / name for name in FILES)
@@ -84,57 +74,33 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
-    if (options.hit is None) == (options.ahat is None):
-        both = options.hit is not None
-        raise UserError(
-            "--hit and --ahat: " + ("one of them, not both" if both else "which column tells what was found?"),
-            legal="--hit COL with 0 and 1, or --ahat COL with signals and --decision Y",
-            fix="leave one out" if both else "name the column; none is guessed",
-        )
-    foreign = ("decision", "left", "right", "log_signal") if options.hit is not None else ("link", "bound", "bounded")
-    for name in foreign:
-        if getattr(options, name) is not None:
-            other = "--ahat" if options.hit is not None else "--hit"
-            raise UserError(f"--{name.replace('_', '-')} belongs to {other}", fix="leave it out")
-    if options.ahat is not None and options.decision is None:
-        raise UserError(
-            "--ahat needs --decision: the POD is that of a signal above it",
-            legal="a signal, in the column's unit",
-            fix="add --decision Y; a value for a wanted rate of false calls comes from hole-free runs",
-        )
-
-
 def _stated(options: argparse.Namespace) -> PodStatement:
-    from harness.evaluation.pod.inspection_file import read_inspections, require_hits, require_positive
-    from harness.evaluation.pod.statement import state_hits, state_signals
+    from harness.evaluation.pod import statement as pod
 
-    of_hits = options.hit is not None
-    read = read_inspections(options.file, options.size, options.hit if of_hits else options.ahat, options.target)
+    of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
+    if of_hits == (options.ahat is not None):
+        said = "one of them, not both" if of_hits else "which column tells what was found?"
+        raise UserError(f"--hit and --ahat: {said}", legal=legal, fix="name one column; none is guessed")
+    other = "--ahat" if of_hits else "--hit"
+    for name in ("decision", "left", "right", "log_signal") if of_hits else ("link", "bound", "bounded"):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')} belongs to {other}", fix="leave it out")
+    if not of_hits and options.decision is None:
+        legal = "a signal, in the column's unit"
+        fix = "add --decision Y; a value for a wanted rate of false calls comes from hole-free runs"
+        raise UserError("--ahat needs --decision: the POD is that of a signal above it", legal=legal, fix=fix)
+    read = pod.read_inspections(options.file, options.size, options.hit if of_hits else options.ahat, options.target)
     if of_hits:
-        require_hits(read)
+        pod.require_hits(read)
     if options.log:
-        require_positive(read, response=False, why="--log")
+        pod.require_positive(read, response=False, why="--log")
     if of_hits:
-        return state_hits(
-            read,
-            link=options.link,
-            log_size=options.log,
-            bounded=options.bounded or "none",
-            method=(options.bound or BOUNDS[0]).replace("-", " "),
-            unit=options.unit,
-        )
+        told: dict[str, Any] = {"link": options.link, "log_size": options.log, "bounded": options.bounded or "none"}
+        return pod.state_hits(read, **told, method=(options.bound or BOUNDS[0]).replace("-", " "), unit=options.unit)
     if options.log_signal and options.left is None:
-        require_positive(read, response=True, why="--log-signal")
-    return state_signals(
-        read,
-        decision=options.decision,
-        left=options.left,
-        right=options.right,
-        log_size=options.log,
-        log_signal=options.log_signal,
-        unit=options.unit,
-    )
+        pod.require_positive(read, response=True, why="--log-signal")
+    names = ("decision", "left", "right", "log_signal", "unit")
+    return pod.state_signals(read, log_size=options.log, **{name: getattr(options, name) for name in names})
 
 
 if __name__ == "__main__":

@@ -8,47 +8,32 @@ import signal
 import sys
 from pathlib import Path
 
-from harness.engine.options import add_engine_options, engine_options
+from harness.engine.work import add_engine_options, engine_options
 from harness.vocabulary.errors import exit_code_of
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    if arguments is None:
-        # what batch systems and containers send first is to end as Ctrl-C does
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_code_of(lambda: _run(options, given))
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m harness.sweep",
         description="Run an experiment: render its targets, simulate the camera, detect, measure, report.",
         epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
     )
-    parser.add_argument("experiment", type=Path, help="a YAML file, such as experiments/averaging.yaml")
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        metavar="PATH=VALUE",
-        action="append",
-        default=[],
-        help="change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated",
-    )
-    parser.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated",
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
+    add = parser.add_argument
+    add("experiment", type=Path, help="a YAML file, such as experiments/averaging.yaml")
+    help = "change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
+    help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
+    add("--calibration", type=Path, metavar="FILE", help=help)
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
+    add("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
     add_engine_options(parser)
-    return parser
+    options = parser.parse_args(given)
+    if arguments is None:
+        # what batch systems and containers send first is to end as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    return exit_code_of(lambda: _run(options, given))
 
 
 def _run(options: argparse.Namespace, given: list[str]) -> int:
@@ -58,7 +43,7 @@ def _run(options: argparse.Namespace, given: list[str]) -> int:
     experiment = load_experiment(options.experiment, options.overrides, options.calibration)
     command = "python -m harness.sweep " + shlex.join(given)
     if not isinstance(experiment.config.source, SimulatedSource):
-        from harness.engine.captures import judge_captures
+        from harness.engine.study import judge_captures
 
         return judge_captures(experiment, options.out, command, dry_run=options.dry_run)
     if options.dry_run:

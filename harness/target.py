@@ -27,15 +27,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Build a damage target from its declaration; print its truth, write its mesh.",
         epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
     )
-    parser.add_argument(
-        "target", help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one"
-    )
-    parser.add_argument("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
-    parser.add_argument("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
-    parser.add_argument(
-        "--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)"
-    )
-    parser.add_argument("--hole-free", action="store_true", help="leave out holes and dents")
+    add = parser.add_argument
+    add("target", help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one")
+    add("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
+    add("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
+    add("--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)")
+    add("--hole-free", action="store_true", help="leave out holes and dents")
     return parser
 
 
@@ -65,8 +62,8 @@ def _declared(name_or_path: str, board: int) -> TargetConfig:
     """Read a declaration, and draw the board asked for where it declares a family."""
     from harness.vocabulary.declaration.diagnose import read_as
     from harness.vocabulary.declaration.yaml_source import read_yaml
-    from scenes.target.declaration import TARGETS
     from scenes.target.drawn import DrawnTargetConfig
+    from scenes.target.thesis import TARGETS
 
     if name_or_path in NAMED_TARGETS:
         config = TARGETS[name_or_path].from_data({"name": name_or_path})

@@ -55,10 +55,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if options.capture:
         for name in ("quick", "update_baseline", "figures", "baseline"):
             if getattr(options, name):
-                raise UserError(
-                    f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture", fix="leave it out"
-                )
-        from harness.scorecard.capture_program import run_capture
+                raise UserError(f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture")
+        from harness.scorecard.capture import run_capture
 
         return run_capture(options, command)
     for name in ("unit", "intrinsics", "frames", "mask"):

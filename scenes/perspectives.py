@@ -1,23 +1,62 @@
-"""Several views of one target: where the camera stands for each, and how well that is known beforehand.
+"""Several views of one target: its pose for each, how well that is known beforehand, and whether a camera sees it.
 
-A view is a pose of the target before the camera; the room moves with the camera, as if the target were turned on a
-table before a camera that stands still.
-"""
+The room moves with the camera, as if the target were turned on a table before a camera that stands still."""
 
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import count
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.geometry import invert
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Region, invert, transform_points
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
-from scenes.target.custom import PoseConfig
+from scenes.optics import Optics
+from scenes.target.custom import PoseConfig, TargetConfig
+from scenes.target.truth import OUTLINE_STEPS, face_grid_m, outline_board_m
+
+NEAREST_M = 0.05
+"""Least distance of the face from the lens' plane, whatever the camera."""
+
+
+def check_in_view(config: TargetConfig, optics: Optics) -> None:
+    """Raise UserError where a part of the face is out of the camera's field of view, or all of it out of its range. A
+    face partly out of range is legal: its pixels there have no range, as they would have in the real camera."""
+    outline = transform_points(config.pose.T_camera_board, outline_board_m(config.board))
+    seen_region(outline, optics)
+    face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
+    range_m = face[..., 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
+    if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
+        raise UserError(
+            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
+            legal=f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}",
+            fix="change target.pose.distance_m (or target.distance_m)",
+        )
+
+
+def seen_region(outline_camera_m: np.ndarray, optics: Optics) -> Region:
+    """Return the pixels on which an outline (n, 3) lies. Raises UserError where part is off the sensor or behind it."""
+    lens = optics.lens
+    nearest_m = float(outline_camera_m[:, 2].min())
+    if nearest_m <= NEAREST_M:
+        raise UserError(
+            f"the target reaches to {nearest_m:.3f} m before the lens",
+            legal=f"all of the face at least {NEAREST_M:g} m in front of the camera",
+            fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
+        )
+    uv = lens.project(outline_camera_m)
+    low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
+    if low.min() < 0 or high[0] > lens.width or high[1] > lens.height:
+        raise UserError(
+            f"the target covers columns {low[0]}..{high[0]} and rows {low[1]}..{high[1]}",
+            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {optics.title}",
+            fix="move the target away (distance), towards the axis (offset), or make it smaller",
+        )
+    return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
+
 
 MAX_VIEWS = 200
 
@@ -35,11 +74,14 @@ class _Guess(Config):
 class _Spread(_Guess):
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
     spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="from the outermost view to the opposite")
-    distance_jitter_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(
-        0.0, description="standard deviation of each view's distance; the first keeps its own"
+    distance_jitter_mm: float = Field(
+        0.0, ge=0.0, le=500.0, description="standard deviation of each view's distance; the first keeps its own"
     )
-    aim_jitter_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(
-        0.0, description="standard deviation of where each view looks, sideways and upwards; the first keeps its own"
+    aim_jitter_mm: float = Field(
+        0.0,
+        ge=0.0,
+        le=500.0,
+        description="standard deviation of each view's aim, sideways and upwards; not of the first",
     )
 
 
@@ -82,22 +124,25 @@ def view_count(views: AnyViews) -> int:
 
 
 def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
-    """The target's pose before the camera for each view; the first is ``pose`` itself unless poses are listed.
-
-    Raises pydantic.ValidationError where a tilt would pass what a pose may have.
-    """
+    """Return the target's pose before the camera for each view; the first is ``pose`` itself unless poses are listed.
+    Raises pydantic.ValidationError where a tilt would pass what a pose may have."""
     if isinstance(views, ListedViews):
         return views.poses
     if isinstance(views, HandHeldViews):
         return tuple(_moved(pose, *shift) for shift in _walk(views))
-    half = views.spread_deg / 2
+    half, poses = views.spread_deg / 2, []
     if isinstance(views, ArcViews):
-        turns = [(share * half, 0.0) if views.about == "x" else (0.0, share * half) for share in _shares(views.count)]
+        turns = [(share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)]
     else:
-        turns = [(x * half, y * half) for x, y in _grid(views.count)]
-    return tuple(
-        _moved(pose, turn_x, turn_y, 0.0, *_jitter_mm(views, number)) for number, (turn_x, turn_y) in enumerate(turns)
-    )
+        turns = _grid(views.count)
+    for number, (turn_x, turn_y) in enumerate(turns):
+        aside = up = distance = 0.0
+        if number > 0:  # the first view keeps its own place
+            distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
+            aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
+        shifts = aside * views.aim_jitter_mm, up * views.aim_jitter_mm, distance * views.distance_jitter_mm
+        poses.append(_moved(pose, turn_x * half, turn_y * half, 0.0, *shifts))
+    return tuple(poses)
 
 
 def T_reference_view_of(poses: tuple[PoseConfig, ...], number: int) -> np.ndarray:
@@ -109,6 +154,8 @@ def guessed_T_reference_view(
     views: AnyViews, poses: tuple[PoseConfig, ...], number: int, *labels: str | int
 ) -> np.ndarray:
     """4x4: the nominal pose, wrong by what ``views`` says in directions drawn from its seed and ``labels``."""
+    from scipy.spatial.transform import Rotation
+
     T_reference_view = T_reference_view_of(poses, number)
     if number == 0:
         return T_reference_view
@@ -116,48 +163,29 @@ def guessed_T_reference_view(
     axis, shift = (vector / np.linalg.norm(vector) for vector in rng.standard_normal((2, 3)))
     centre = poses[0].T_camera_board[:3, 3]
     error = np.eye(4)
-    error[:3, :3] = _rotation(axis * np.deg2rad(views.guess_error_deg))
+    error[:3, :3] = Rotation.from_rotvec(axis * np.deg2rad(views.guess_error_deg)).as_matrix()
     error[:3, 3] = centre - error[:3, :3] @ centre + shift * views.guess_error_mm * MM
     return error @ T_reference_view
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    matrix: np.ndarray = Rotation.from_rotvec(vector).as_matrix()
-    return matrix
-
-
-def _shares(count_: int) -> list[float]:
-    """0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ...: of half the spread, odd multiples of ever smaller powers of two."""
-    shares = [0.0, 1.0, -1.0]
-    for level in count(1):
-        if len(shares) >= count_:
-            return shares[:count_]
-        step = 0.5**level
-        shares += [sign * step * odd for odd in range(1, 2**level, 2) for sign in (1.0, -1.0)]
-    raise AssertionError("endless")
+def _shares(wanted: int) -> list[float]:
+    """Return 0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ...: of half the spread, odd multiples of powers of two."""
+    shares, step = [0.0, 1.0, -1.0], 0.5
+    while len(shares) < wanted:
+        shares += [sign * step * odd for odd in range(1, round(1 / step), 2) for sign in (1.0, -1.0)]
+        step /= 2
+    return shares[:wanted]
 
 
-def _grid(count_: int) -> list[tuple[float, float]]:
-    """Grids of 3 x 3, 5 x 5, 9 x 9 ... places in -1..1, each after the coarser ones; corners before edges."""
-    places: dict[tuple[float, float], None] = {(0.0, 0.0): None}
-    for level in count(0):
-        if len(places) >= count_:
-            return list(places)[:count_]
-        ticks = np.linspace(-1.0, 1.0, 2 ** (level + 1) + 1).tolist()
+def _grid(wanted: int) -> list[tuple[float, float]]:
+    """Return grids of 3 x 3, 5 x 5, 9 x 9 ... places in -1..1, each after the coarser ones; corners before edges."""
+    places, side = [(0.0, 0.0)], 3
+    while len(places) < wanted:
+        ticks = np.linspace(-1.0, 1.0, side).tolist()
         new = [(x, y) for x in ticks for y in ticks if (x, y) not in places]
-        places |= dict.fromkeys(sorted(new, key=lambda place: (-(place[0] ** 2) - place[1] ** 2, place)))
-    raise AssertionError("endless")
-
-
-def _jitter_mm(views: ArcViews | GridViews, number: int) -> tuple[float, float, float]:
-    """Shifts along the camera's x, y and z; none for the first view."""
-    if number == 0:
-        return 0.0, 0.0, 0.0
-    distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
-    aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
-    return aside * views.aim_jitter_mm, up * views.aim_jitter_mm, distance * views.distance_jitter_mm
+        places += sorted(new, key=lambda place: (-(place[0] ** 2) - place[1] ** 2, place))
+        side = 2 * side - 1
+    return places[:wanted]
 
 
 @lru_cache(maxsize=16)
@@ -175,14 +203,8 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
 
 
-def _moved(
-    pose: PoseConfig, turn_x: float, turn_y: float, turn_z: float, shift_x: float, shift_y: float, shift_z: float
-) -> PoseConfig:
-    return PoseConfig(
-        distance_m=pose.distance_m + shift_z * MM,
-        offset_x_mm=pose.offset_x_mm + shift_x,
-        offset_y_mm=pose.offset_y_mm + shift_y,
-        tilt_x_deg=pose.tilt_x_deg + turn_x,
-        tilt_y_deg=pose.tilt_y_deg + turn_y,
-        roll_deg=pose.roll_deg + turn_z,
-    )
+def _moved(pose: PoseConfig, turn_x: float, turn_y: float, turn_z: float, *shift_mm: float) -> PoseConfig:
+    x_mm, y_mm, z_mm = shift_mm
+    moves = {"distance_m": z_mm * MM, "offset_x_mm": x_mm, "offset_y_mm": y_mm}
+    moves |= {"tilt_x_deg": turn_x, "tilt_y_deg": turn_y, "roll_deg": turn_z}
+    return PoseConfig(**{key: getattr(pose, key) + moved for key, moved in moves.items()})

@@ -10,9 +10,7 @@ import numpy as np
 from detectors.marks.mark import Mark, MarkSet
 from detectors.registration.registered import Registration
 from detectors.views import PreparedView, View
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import invert, rotation_xyz_deg, transform_points
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, invert, rotation_xyz_deg, transform_points
 
 LENS = Lens(220, 160, 300.0, 300.0, 109.5, 79.5)
 HALF_X_M, HALF_Y_M = 0.15, 0.09

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from detectors.open3d_library import MissingLibrary
-from scenes.render.variant import load_mitsuba
+from scenes.render.scene import load_mitsuba
 
 
 def pytest_configure() -> None:
-    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.variant`)."""
+    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`)."""
     load_mitsuba()
 
 
@@ -32,3 +32,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no folder of real captures beside the checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished sweep before the thesis' target, with tiny.yaml beside the folder; not to be changed."""
+    from tiny_sweep import TINY, finished
+
+    return finished(tmp_path_factory.mktemp("sweep"), TINY)
+
+
+@pytest.fixture(scope="session")
+def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished study of random boards, likewise."""
+    from tiny_sweep import STUDY, finished
+
+    return finished(tmp_path_factory.mktemp("study"), STUDY)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR
 from scenes.optics import FWHM_PER_DEVIATION
-from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import MRAD, ScannedLidar
+from scenes.sensor.lidar.kernels import strongest_peaks
 from scenes.sensor.lidar.scanner import smear_weights
 
 

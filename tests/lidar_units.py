@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Region
+from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
-from scenes.view import NoiseFreeView
 
 CAMERA = load_camera("realsense_l515")
 QUIET = CameraConfig(

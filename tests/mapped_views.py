@@ -11,9 +11,7 @@ import numpy as np
 from detectors.marks.mark import MarkSet
 from detectors.registration.registered import Registration, reference_registration
 from detectors.views import PreparedView, View
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import invert, rotate_vectors, rotation_xyz_deg, transform_points
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, invert, rotate_vectors, rotation_xyz_deg, transform_points
 
 LENS = Lens(160, 120, 500.0, 500.0, 79.5, 59.5)
 DISTANCE_M = 0.7

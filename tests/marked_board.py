@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from harness.vocabulary.geometry import invert, rotation_xyz_deg, transform_points
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens, invert, rotation_xyz_deg, transform_points
 
 LENS = Lens(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 DISTANCE_M, HALF_WIDTH_M, HALF_HEIGHT_M = 0.5, 0.2, 0.1

@@ -9,9 +9,7 @@ import numpy as np
 
 from detectors.marks.mark import MarkSet
 from detectors.views import PreparedView, View
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region, invert, rotation_xyz_deg, transform_points
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, Region, invert, rotation_xyz_deg, transform_points
 
 LENS = Lens(width=400, height=140, fx=500.0, fy=500.0, cx=199.5, cy=69.5)
 TAPES = np.array([[-0.2, 0.038], [0.2, 0.038], [0.2, -0.038], [-0.2, -0.038]])

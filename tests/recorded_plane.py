@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens
 
 LENS = Lens(width=96, height=72, fx=150.0, fy=151.0, cx=47.0, cy=36.0)
 HOLE_U, HOLE_V, HOLE_RADIUS_PX, HOLE_DEPTH_MM = 60, 30, 6.0, 14.0

@@ -10,7 +10,7 @@ import pandas as pd
 from synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.examples import FindingSeen, HoleSeen, MappedExample, ShownView
+from harness.report.clouds import FindingSeen, HoleSeen, MappedExample
 
 MAP_AXES = pd.DataFrame(
     [
@@ -225,17 +225,5 @@ def map_example(views: int = 2, merge: str = "grid", points: int = 6000, registr
         view_of=rng.integers(0, views, points) if merge == "grid" else np.full(points, -1),
         holes=tuple(holes),
         findings=tuple(findings),
-        placed=tuple(_placed(number, rng) for number in range(views)),
+        view_names=tuple(f"view {number}" for number in range(views)),
     )
-
-
-def _placed(number: int, rng: np.random.Generator) -> ShownView:
-    corners = [(sx * 200, sy * 38) for sx in (-1, 1) for sy in (-1, 1)]
-    marks = np.vstack([[cx, cy, 0] + rng.uniform(-1, 1, (150, 3)) * [20, 6, 0.3] for cx, cy in corners])
-    shifts = {"truth": 0.0} | ({} if number == 0 else {"guess": 9.0, "icp": 1.5, "cpd": 0.4, "marks": 0.2})
-    poses = {}
-    for method, shift in shifts.items():
-        poses[method] = np.eye(4)
-        poses[method][:3, 3] = np.array([shift, -0.7 * shift, 0.5 * shift])
-    failures = {"nominal": "no guess"} if number else {}
-    return ShownView(f"view {number}", marks, np.full((len(marks), 3), 180, np.uint8), marks, poses, failures)

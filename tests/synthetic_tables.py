@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation.profile import HoleInView
-from harness.report.examples import ExampleCloud
+from harness.report.clouds import ExampleCloud
 
 
 @dataclass(frozen=True)
@@ -156,13 +156,9 @@ def example(frames: int = 50, shape: str = "bowl", variant: str = "main", noise_
     residual[:3, :5] = np.nan
     inside = np.ones((height, width), bool)
     inside[:, :2] = False
-    z = z_mm + residual
-    points = np.stack([(u - width / 2) / 500 * z, (v - height / 2) / 500 * z, z], axis=-1) * 1e-3
-    rgb = np.broadcast_to(np.array([205, 170, 120], np.uint8), (height, width, 3)).copy()
-    rgb[:, 100:106] = (200, 30, 30)
     turn = np.linspace(0, 2 * np.pi, 33)[:, None]
     rims = tuple([h.u_px, h.v_px] + h.radius_px * np.hstack([np.cos(turn), np.sin(turn)]) for h in truth)
-    return ExampleCloud(frames, variant, points, rgb, residual, detected, inside, tuple(truth), z_truth, rims)
+    return ExampleCloud(frames, variant, residual, detected, inside, tuple(truth), z_truth, rims)
 
 
 def provenance() -> dict[str, object]:

@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, Region
 
 CAMERAS = {
     "azure nfov": (640, 576, 504.6),

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import WIDEST_PX, AmcwCamera
@@ -131,7 +130,7 @@ def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
         ({"modulation__frequencies_hz": [1e6, 2e6, 3e6, 4e6]}, "4 frequencies_hz"),
         ({"modulation__contrast": [0.5, 0.5]}, "contrast needs one value for each of the 1 frequencies_hz"),
         ({"modulation__phases": 2}, "3 or more"),
-        (TWO | {"modulation__frequencies_hz": [100e6, 100e6]}, "names a frequency twice"),
+        (TWO | {"modulation__frequencies_hz": [100e6, 100e6]}, "all different"),
         ({"modulation__contrast": [0.0]}, "above 0 and at most 1"),
         ({"engine__window_px": 1001}, "an odd number from 1 to 31"),
         ({"lens__distortion": [0.0, 0.0, 0.9, 0.0]}, "distortion folds the image"),

@@ -17,12 +17,10 @@ from scipy import ndimage, stats
 from detectors.average import AverageConfig, prefix_averages
 from detectors.crop import NoCrop
 from detectors.thesis import ThesisConfig, ThesisDetector
-from harness.engine import averages
-from harness.engine.averages import averages_of
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region
+from harness.engine import trial as averages
+from harness.engine.trial import averages_of
+from harness.vocabulary.geometry import MM, Cloud, Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -33,7 +31,7 @@ from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.source import SimulatedUnit
 
-REGIONS = {"azure_kinect_nfov": Region(300, 344, 290, 358), "kinect_v2": Region(190, 234, 220, 288)}
+REGIONS = {"azure_kinect_nfov": Region(306, 338, 296, 352), "kinect_v2": Region(196, 228, 226, 282)}
 STILL = EffectsConfig(frame_jumps=False)
 FRONT = Plane(0.7, 0.08, 0.05)
 NOTHING_BEHIND_M = 8.0
@@ -41,7 +39,7 @@ NOTHING_BEHIND_M = 8.0
 PLAIN = AverageConfig()
 FEWEST_FRAMES = 6
 """For these tests; as many as `averages.FEWEST_FRAMES` would only take longer."""
-CAPTURES = 120
+CAPTURES = 60
 FRAMES = 8
 SURE = 5.0
 
@@ -128,7 +126,7 @@ def compared(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     "behind_mm",
-    [20.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (2.0, 9.5, 200.0, NOTHING_BEHIND_M / MM))],
+    [200.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (2.0, 9.5, 20.0, NOTHING_BEHIND_M / MM))],
 )
 @pytest.mark.parametrize("name", REGIONS)
 def test_averages_drawn_at_once_have_the_distribution_of_those_of_frames(name: str, behind_mm: float):
@@ -136,7 +134,7 @@ def test_averages_drawn_at_once_have_the_distribution_of_those_of_frames(name: s
     assert_alike(unit_before_hole(name, behind_mm), *clouds_of(name, behind_mm))
 
 
-@pytest.mark.parametrize("name", REGIONS)
+@pytest.mark.parametrize("name", ["azure_kinect_nfov", pytest.param("kinect_v2", marks=pytest.mark.slow)])
 def test_so_have_those_of_a_dim_and_distant_face(name: str):
     """Phase noise of 0.06 to 0.1 rad in the noisiest frequency: there the filter's weights hang on the noise."""
     config = CameraConfig(name=name, effects=STILL)
@@ -205,9 +203,9 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
 
 
 def test_prefixes_nest_and_do_not_hang_on_what_else_is_asked_for():
-    unit = unit_before_hole("azure_kinect_nfov", 20.0)
+    unit = unit_before_hole("azure_kinect_nfov", 200.0)
     products, squares = [], []
-    for number in range(40):
+    for number in range(30):
         capture = unit.capture(80, 3, number)
         together = averages_of(capture, [1, 20, 40, 80], PLAIN, exact=False)
         for n, alone in ((n, averages_of(capture, [n], PLAIN, exact=False)[n]) for n in (1, 80)):
@@ -287,7 +285,7 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
     filtered = np.empty((3, 3, len(places.range), LANES), np.float32)
     edge = np.empty((3, len(places.range), LANES), np.float32)
-    kernels.filter_listed(planes, places.window, *imager.filter_settings, filtered, edge)
+    kernels.filter_listed(planes, places.window, imager.filter_settings, filtered, edge)
     by_plane = planes.reshape(-1, 3, 3, LANES)
     for lane in (0, LANES - 1):
         shape = unit.exposure.shape

@@ -12,11 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detectors.average import AverageConfig, RunningAverage, average, prefix_averages
-from harness.vocabulary.capture import Frame, Reason
+from detectors.average import AverageConfig, average, prefix_averages
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 METHODS = ("mean", "median", "clipped")
 
@@ -213,15 +211,6 @@ def test_colour_amplitude_and_xy_are_averaged() -> None:
     np.testing.assert_allclose(cloud.points_m[..., :2], extra["xy_m"].mean(axis=0), rtol=1e-12)
 
 
-def test_reading_while_adding_changes_nothing() -> None:
-    stack = noisy(9)
-    running = RunningAverage(stack, AverageConfig())
-    for frame in stack.frames():
-        running.add(frame)
-        running.cloud()
-    np.testing.assert_array_equal(running.cloud().points_m, average(stack, AverageConfig()).points_m)
-
-
 def test_mistakes_are_named() -> None:
     stack = noisy(6)
     with pytest.raises(UserError, match="7 frames to average, but there are 6"):
@@ -239,10 +228,10 @@ def test_mistakes_are_named() -> None:
 
 
 def test_frames_of_different_size_are_refused() -> None:
-    running = RunningAverage(replace(noisy(), slopes=None), AverageConfig())
-    running.add(Frame("a.png", np.ones((4, 5), np.float32), np.zeros((4, 5), np.uint8), xy_m=np.zeros((4, 5, 2))))
-    with pytest.raises(UserError, match=r"b.png: 6 x 4 pixels, but 5 x 4 pixels expected"):
-        running.add(Frame("b.png", np.ones((4, 6), np.float32), np.zeros((4, 6), np.uint8)))
+    stack = noisy(2, (4, 5))
+    stack.slopes, stack.z_m = None, [stack.z_m[0], np.ones((4, 6), np.float32)]  # type: ignore[assignment]
+    with pytest.raises(UserError, match=r"frame 1: 6 x 4 pixels, but 5 x 4 pixels expected"):
+        average(stack, AverageConfig())
 
 
 def read_pngs(folder: Path) -> Stack:

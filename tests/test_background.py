@@ -11,9 +11,8 @@ import pytest
 
 from detectors.background import Background, background, misfit
 from detectors.surface import SurfaceConfig
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Cloud, Region
 
 SHAPE, FOCAL_PX, NOISE_M = (144, 160), 140.0, 3e-4
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -88,7 +87,7 @@ def found(z: np.ndarray, **settings: object) -> Background:
 @pytest.mark.parametrize("correlated_px", [0.0, 1.2])
 def test_the_simplest_shape_that_explains_the_cloud_is_taken(z: np.ndarray, name: str, correlated_px: float) -> None:
     answer = found(measured(z, correlated_px=correlated_px))
-    assert answer.notes["shape"] == name and answer.scale_m is None and answer.fits and answer.warning == ""
+    assert answer.notes["shape"] == name and answer.scale_m is None and answer.warning == ""
     error = answer.surface_z_m - z
     assert np.nanquantile(np.abs(error), 0.9) < 0.5 * NOISE_M
     assert abs(error[71:73, 79:81]).max() < 0.5 * NOISE_M
@@ -98,7 +97,7 @@ def test_a_free_form_says_its_scale_and_does_not_swallow_damage() -> None:
     deep = ((0.0, 0.0, 0.06, 0.002), (0.15, 0.1, 0.04, -0.002), (-0.2, -0.12, 0.04, 0.002))
     z = face(lambda x, y: 0.7 + 0.01 * np.tanh(x / 0.2) + 0.004 * np.sin(y / 0.1))
     answer = found(measured(z, damage=deep))
-    assert answer.notes["shape"] == "free form" and answer.fits
+    assert answer.notes["shape"] == "free form" and not answer.warning
     assert answer.scale_m is not None and f"wider than {1e3 * answer.scale_m:.0f} mm" in answer.description
     for x, y, _, depth in deep:
         at = np.unravel_index(np.argmin(np.hypot(X * z - x, Y * z - y)), SHAPE)
@@ -111,7 +110,7 @@ def test_a_free_form_says_its_scale_and_does_not_swallow_damage() -> None:
 )
 def test_a_stated_degree_that_does_not_fit_is_warned_of(z: np.ndarray, degree: int) -> None:
     answer = found(measured(z), shape="polynomial", degree=degree)
-    assert not answer.fits and answer.warning.startswith("the surface does not fit here: degree")
+    assert answer.warning.startswith("the surface does not fit here: degree")
     assert answer.notes["misfit_share"] > 0.1 and answer.notes["misfit_rms_m"] > 0.5 * NOISE_M
     said = misfit(cloud_of(measured(z)), answer.residual_m, "it")
     assert said.startswith("the surface does not fit here: it leaves")
@@ -119,10 +118,10 @@ def test_a_stated_degree_that_does_not_fit_is_warned_of(z: np.ndarray, degree: i
 
 @pytest.mark.parametrize("correlated_px", [0.0, 1.2, 2.0])
 def test_flat_boards_stay_planes_and_without_warning(correlated_px: float) -> None:
-    answers = [found(measured(plane(), seed, correlated_px)) for seed in range(10)]
-    assert [answer.warning for answer in answers] == [""] * 10
-    # one seed in ten may look bent to a test that is not adjusted for ten boards
-    assert sum(answer.notes["shape"] == "plane" for answer in answers) >= 9
+    answers = [found(measured(plane(), seed, correlated_px)) for seed in range(5)]
+    assert [answer.warning for answer in answers] == [""] * 5
+    # one seed may look bent to a test that is not adjusted for five boards
+    assert sum(answer.notes["shape"] == "plane" for answer in answers) >= 4
     noise_m = np.array([np.nanmedian(answer.noise_m) for answer in answers])
     # noise that neighbours share is in part taken for level within a cell of 4 x 4 pixels
     assert (noise_m > 0.75 * NOISE_M).all() and (noise_m < 1.05 * NOISE_M).all()
@@ -168,7 +167,7 @@ def test_few_points_are_a_plane_and_said_to_be_few() -> None:
     few = np.full(SHAPE, np.nan)
     few[10:14, 10:14] = measured(plane())[10:14, 10:14]
     answer = found(few)
-    assert not answer.fits and "16 points are too few" in answer.warning
+    assert "16 points are too few" in answer.warning
     few[:] = np.nan
     few[5, 5] = 0.7
     with pytest.raises(UserError, match="1 valid points cannot determine"):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
-import json
-import multiprocessing
 import os
 import random
-import subprocess
-import sys
 import time
-import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +16,7 @@ import pytest
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
+from scenes.optics import NoiseFreeView, RenderConfig
 from scenes.render import cache
 from scenes.render.cache import (
     ARRAYS,
@@ -32,15 +30,11 @@ from scenes.render.cache import (
     stored_renders,
     stored_view,
     trim_cache,
-    view_bytes,
     write_view,
 )
-from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import load_camera
 from scenes.target.thesis import ThesisTargetConfig
-from scenes.view import NoiseFreeView
 
-ROOT = Path(__file__).resolve().parents[1]
 CAMERA = load_camera("azure_kinect_nfov")
 REGION = Region(200, 224, 300, 332)
 DAY_S = 86_400.0
@@ -73,29 +67,9 @@ def equal(a: NoiseFreeView, b: NoiseFreeView) -> bool:
     )
 
 
-def parts_of(path: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(path) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def put_together(path: Path, parts: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> None:
-    with zipfile.ZipFile(path, "w", kind) as archive:
-        for name, content in parts.items():
-            archive.writestr(name, content)
-
-
-ABSENT = object()
-
-
-def with_facts(path: Path, **changed: object) -> None:
-    """The same file with other facts, and a checksum that fits them."""
-    parts = parts_of(path)
-    facts = {**json.loads(parts["facts.json"]), **changed}
-    facts = {name: value for name, value in facts.items() if value is not ABSENT}
-    facts.pop("checksum")
-    arrays = {name: np.load(io.BytesIO(parts[f"{name}.npy"])) for name in ARRAYS}
-    parts["facts.json"] = json.dumps({**facts, "checksum": cache._checksum(facts, arrays)}).encode()
-    put_together(path, parts)
+def sealed(path: Path, content: bytes) -> None:
+    """Write a content with a checksum that fits it."""
+    path.write_bytes(content + hashlib.blake2b(content, digest_size=cache.CHECKSUM_BYTES).digest())
 
 
 # ---------------------------------------------------------------- one file
@@ -107,36 +81,19 @@ def test_a_view_comes_back_bit_by_bit_and_can_be_written_to(stored, view):
     assert all(getattr(found, name).flags.writeable and getattr(found, name).flags.c_contiguous for name in ARRAYS)
 
 
-def test_the_same_view_gives_the_same_bytes_and_about_the_size_foretold(stored, view, tmp_path):
+def test_the_same_view_gives_the_same_bytes(stored, view, tmp_path):
     again = tmp_path / "again.npz"
     write_view(again, view)
     assert again.read_bytes() == stored.read_bytes()
-    # a closed form has its surfaces, coverage and colour in larger types than a render
-    large = Region(100, 300, 100, 400)
-    rendered = plane_view(CAMERA, large, 0.8, 0.5)
-    small = {"surface": np.int16, "coverage": np.float32, "rgb": np.float32}
-    types = {name: getattr(rendered, name).astype(small.get(name, getattr(rendered, name).dtype)) for name in ARRAYS}
-    types |= {name: types[name].astype(np.complex64) for name in ("phasor", "phasor_direct")}
-    write_view(again, NoiseFreeView(**{**rendered.__dict__, **types}))
-    assert again.stat().st_size == pytest.approx(view_bytes(large, 3), rel=0.01)
 
 
 def test_flipped_bits_are_found_wherever_they_are(stored, view):
-    whole = stored.read_bytes()
-    rng = random.Random(1)
-    # every byte of the facts and of the archive's own directory, and places anywhere
-    directory = whole.rindex(b"PK\x01\x02", 0, len(whole))
-    places = [*range(0, 900), *range(directory - 100, len(whole)), *(rng.randrange(len(whole)) for _ in range(400))]
-    noticed = 0
-    for place in places:
+    whole, rng = stored.read_bytes(), random.Random(1)
+    for place in (0, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(60))):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.randrange(8)
         stored.write_bytes(bytes(spoilt))
-        found = stored_view(stored)
-        noticed += found is None
-        # a bit that means nothing, such as one of a date, may be passed over; a wrong view may not come out
-        assert found is None or equal(found, view), place
-    assert noticed > 0.8 * len(places)
+        assert stored_view(stored) is None, place
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])
@@ -146,100 +103,18 @@ def test_truncated_files_are_absent(stored, share):
     assert read_view(stored) is None
 
 
-def test_a_file_that_states_no_version_is_absent(stored):
-    parts = parts_of(stored)
-    facts = json.loads(parts["facts.json"])
-    del facts["version"]
-    put_together(stored, {**parts, "facts.json": json.dumps(facts).encode()})
-    assert stored_view(stored) is None
-
-
-def test_a_file_of_another_version_is_absent(stored):
-    with_facts(stored)
+def test_a_file_of_another_version_is_absent(stored, view, monkeypatch):
+    monkeypatch.setattr(cache, "VIEW_VERSION", cache.VIEW_VERSION + 1)
+    write_view(stored, view)
     assert read_view(stored) is not None
-    for version in (0, 2, None, "1"):
-        with_facts(stored, version=version)
-        assert read_view(stored) is None, version
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"region": {"row0": 0, "row1": 25, "col0": 0, "col1": 32}},
-        {"region": {"row0": 0, "row1": 10**9, "col0": 0, "col1": 10**9}},
-        {"region": {"row0": 0, "row1": -24, "col0": 0, "col1": -32}},
-        {"region": {"row0": 0.0, "row1": 24.0, "col0": 0, "col1": 32}},
-        {"region": None},
-        {"version": ABSENT},
-        {"seconds": ABSENT},
-        {"surface_names": ABSENT},
-        {"frequencies_hz": [1e8] * 4},
-        {"frequencies_hz": 3},
-        {"types": {}},
-        {"types": dict.fromkeys(ARRAYS, "|O")},
-        {"types": dict.fromkeys(ARRAYS, "<f8")},
-        {"types": [["<f8"]]},
-    ],
-)
-def test_facts_that_do_not_fit_the_arrays_are_refused(stored, changed):
-    with_facts(stored, **changed)
+    monkeypatch.undo()
     assert read_view(stored) is None
 
 
-@pytest.mark.parametrize("facts", [b"", b"[]", b"null", b"{}", b"\xff\xfe", b"[" * 100_000, b" " * (2 << 20) + b"{}"])
-def test_facts_that_are_none(stored, facts):
-    put_together(stored, {**parts_of(stored), "facts.json": facts})
+@pytest.mark.parametrize("content", [b"", b"x" * 1000, b"PK\x05\x06" + bytes(18)])
+def test_what_is_no_view_is_absent_whatever_its_checksum(stored, content):
+    sealed(stored, content)
     assert read_view(stored) is None
-
-
-def test_nothing_is_decompressed(stored, monkeypatch):
-    """A part of a kilobyte that would be a gigabyte is refused by what the archive says of it."""
-    parts = parts_of(stored)
-    put_together(stored, parts, zipfile.ZIP_DEFLATED)
-    assert read_view(stored) is None
-    bomb = {**parts, "phasor.npy": b"\x00" * (64 << 20)}
-    put_together(stored, bomb, zipfile.ZIP_DEFLATED)
-    assert stored.stat().st_size < 1 << 20
-    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("was read"))
-    assert read_view(stored) is None
-
-
-def test_a_part_that_claims_ten_gigabytes_takes_no_memory(stored):
-    """The archive's directory and the facts agree on a size that is not there; the process has a gigabyte."""
-    side = 40_000
-    facts = {
-        **json.loads(parts_of(stored)["facts.json"]),
-        "region": {"row0": 0, "row1": side, "col0": 0, "col1": side},
-    }
-    put_together(stored, {**parts_of(stored), "facts.json": json.dumps(facts).encode()})
-    for name in ARRAYS:
-        types = facts["types"][name]
-        lengths = {"f": 3, "h": side, "w": side, "2": 2, "3": 3}
-        shape = tuple(lengths[axis] for axis in cache.AXES.get(name, "hw"))
-        size = len(cache._header(np.dtype(types), shape)) + int(np.prod(shape)) * np.dtype(types).itemsize
-        _claim(stored, f"{name}.npy", size)
-    code = (
-        "import resource, sys; from pathlib import Path; from scenes.render.cache import read_view\n"
-        "used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30),) * 2)\n"
-        f"assert read_view(Path({str(stored)!r})) is None\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr
-
-
-def _claim(path: Path, name: str, size: int) -> None:
-    """Write a size of 4 GB less one (the most without an extension) or less into the directory's entry of a part."""
-    content = bytearray(path.read_bytes())
-    at = content.index(b"PK\x01\x02")
-    while True:
-        length = int.from_bytes(content[at + 28 : at + 30], "little")
-        if content[at + 46 : at + 46 + length] == name.encode():
-            break
-        at = content.index(b"PK\x01\x02", at + 4)
-    told = min(size, 0xFFFFFFFE).to_bytes(4, "little")
-    content[at + 20 : at + 28] = told + told
-    path.write_bytes(bytes(content))
 
 
 def test_an_object_array_is_not_unpickled(stored, tmp_path):
@@ -248,10 +123,17 @@ def test_an_object_array_is_not_unpickled(stored, tmp_path):
             return (Path.touch, (tmp_path / "was here",))
 
     content = io.BytesIO()
-    np.save(content, np.array([[Hostile()]], dtype=object), allow_pickle=True)
-    put_together(stored, {**parts_of(stored), "rgb.npy": content.getvalue()})
+    parts = {"facts": np.array("{}"), **dict.fromkeys(ARRAYS, np.array([[Hostile()]], dtype=object))}
+    np.savez(content, allow_pickle=True, **parts)
+    sealed(stored, content.getvalue())
     assert read_view(stored) is None
     assert not (tmp_path / "was here").exists()
+
+
+def test_a_file_larger_than_any_render_is_not_read(stored):
+    with stored.open("r+b") as file:
+        file.truncate(cache.MOST_BYTES + 1)  # takes no room on the disk
+    assert read_view(stored) is None
 
 
 def test_folders_links_and_pipes_under_a_renders_name(stored, view, tmp_path):
@@ -291,23 +173,13 @@ def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(tmp_path, vie
     assert cached_view(target, CAMERA.optics, config, tmp_path)[1] is True
 
 
-def _write_often(path: str, times: int) -> None:
-    view = plane_view(CAMERA, REGION, 0.8, 0.5, 0.1)
-    for _ in range(times):
-        write_view(Path(path), view)
-
-
-def test_two_processes_that_write_the_same_render_at_once(stored, view):
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=_write_often, args=(str(stored), 40)) for _ in range(2)]
-    for writer in writers:
-        writer.start()
-    reads = 0
-    while any(writer.is_alive() for writer in writers):
-        found = read_view(stored)
-        assert found is not None and equal(found, view)
-        reads += 1
-    assert [writer.exitcode for writer in writers] == [0, 0] and reads > 10
+def test_a_render_is_read_whole_while_two_write_it(stored, view):
+    with ThreadPoolExecutor(2) as pool:
+        writes = [pool.submit(lambda: [write_view(stored, view) for _ in range(10)]) for _ in range(2)]
+        while not all(write.done() for write in writes):
+            found = read_view(stored)
+            assert found is not None and equal(found, view)
+    assert [write.exception() for write in writes] == [None, None]
     assert [path.name for path in stored.parent.iterdir()] == [stored.name]
 
 
@@ -328,14 +200,13 @@ def test_the_longest_unused_go_first_and_those_to_keep_never(tmp_path, view):
     paths = shelf(tmp_path, view, {"a": 3, "b": 9, "c": 1, "d": 5})
     size = paths["a"].stat().st_size
     assert [one.path for one in stored_renders(tmp_path)] == [paths[k] for k in "bdac"]
-    done = trim_cache(tmp_path, 3 * size, keep={paths["b"]})
-    assert (done.renders, done.freed_bytes, done.left, done.left_bytes) == (1, size, 3, 3 * size)
+    assert trim_cache(tmp_path, 3 * size, keep={paths["b"]}) == 3
     assert {k for k in paths if paths[k].exists()} == set("abc")
     read_view(paths["a"])  # now the latest
     trim_cache(tmp_path, size)
     assert {k for k in paths if paths[k].exists()} == {"a"}
-    assert trim_cache(tmp_path, 0, keep=[paths["a"]]).left == 1
-    assert trim_cache(tmp_path, size).renders == 0
+    assert trim_cache(tmp_path, 0, keep=[paths["a"]]) == 1
+    assert trim_cache(tmp_path, size) == 1
 
 
 def test_a_render_that_cannot_be_touched_is_read_all_the_same(stored, monkeypatch):
@@ -355,8 +226,7 @@ def test_nothing_but_renders_and_old_leftovers_is_removed(tmp_path, view):
         path.write_bytes(b"x")
     os.utime(old, (time.time() - 2 * DAY_S,) * 2)
     assert [one.path for one in leftovers(tmp_path)] == [old]
-    done = trim_cache(tmp_path, 0)
-    assert (done.renders, done.leftovers) == (1, 1)
+    assert trim_cache(tmp_path, 0) == 0
     assert not paths["a"].exists() and not old.exists()
     assert new.exists() and linked.is_symlink() and outside.exists() and all(path.exists() for path in others)
 
@@ -364,16 +234,16 @@ def test_nothing_but_renders_and_old_leftovers_is_removed(tmp_path, view):
 def test_renders_in_use_by_a_sweep_stay(tmp_path, view):
     paths = shelf(tmp_path, view, {"a": 3})
     with in_use(tmp_path), in_use(tmp_path):  # two sweeps may share a cache
-        assert trim_cache(tmp_path, 0).left == 1
+        assert trim_cache(tmp_path, 0) == 1
         with pytest.raises(UserError, match="a sweep that is running"), alone(tmp_path):
             pass
     assert paths["a"].exists()
-    assert trim_cache(tmp_path, 0).renders == 1
+    assert trim_cache(tmp_path, 0) == 0
 
 
 def test_no_folder_and_damaged_renders(tmp_path, view):
     assert stored_renders(tmp_path / "none") == [] and leftovers(tmp_path / "none") == []
-    assert trim_cache(tmp_path / "none", 0).left == 0
+    assert trim_cache(tmp_path / "none", 0) == 0
     paths = shelf(tmp_path, view, {"a": 1, "b": 2})
     paths["b"].write_bytes(paths["b"].read_bytes()[:-100])
     before_s = paths["a"].stat().st_mtime

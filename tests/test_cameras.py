@@ -8,12 +8,12 @@ import pytest
 from harness.experiment.load import lens_numbers, load_experiment
 from harness.sweep import main
 from harness.vocabulary.errors import UserError
-from scenes.field_of_view import check_in_view
+from scenes.perspectives import check_in_view
 from scenes.sensor.calibration import _main as calibration_program
 from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, camera_of, load_camera, read_camera
 from scenes.sensor.facts import unfolded_slope
-from scenes.target.declaration import target_from_data
 from scenes.target.mesh import build_target
+from scenes.target.thesis import target_from_data
 
 AZURE = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
 SMOKE = "experiments/smoke.yaml"

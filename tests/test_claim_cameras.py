@@ -7,7 +7,7 @@ from synthetic_tables import World, cameras, joined, placed, set_up_name, tables
 
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
-from harness.thesis.cameras import claim_c11
+from harness.thesis.claims import claim_c11
 
 AXES = ["source.camera.name", "source.target.distance_m"]
 

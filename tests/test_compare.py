@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness import compare
-from harness.evaluation.pod.false_calls import threshold_for_rate
+from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.paired import calls_change, hits_change, limit_change, mcnemar, shared_rows, sign_flip
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
@@ -26,8 +26,8 @@ from harness.evaluation.study.verdict import (
     not_comparable,
     paired_set_ups,
 )
-from harness.report.compare import HEADS, compare_grid, compare_html, compare_parts
-from harness.tables.grid import text_of
+from harness.report.compare import COMPARED, compare_html, compare_parts
+from harness.tables.text import text_of
 from tests.synthetic_study import SetUp, Study, study_record
 
 FRAMES = count()
@@ -175,6 +175,7 @@ def test_luck_with_the_calibration_is_the_same_only_where_the_threshold_is():
     assert apart is not None and both.more_p == apart.more_p > signs.more_p == given.more_p
 
 
+@pytest.mark.slow
 def test_two_detectors_on_identical_frames_are_not_called_for_their_luck():
     """800 pairs of equally good detectors that score independently: signs alone are called at 1 % far oftener; the
     test that decides no oftener than 1 % (this test's own alpha 1e-4)."""
@@ -202,6 +203,7 @@ def test_counts_are_compared_by_area():
     assert change.counts_p == pytest.approx(stats.binomtest(10, 20, 2 / 3).pvalue)
 
 
+@pytest.mark.slow
 def test_calibration_draws_are_in_the_false_calls_test_and_not_in_that_of_counts():
     """2,000 pairs of honest studies, 60 boards to calibrate and 240 to judge: the test that decides is called at 5 % no
     oftener than 5 % (this test's own alpha 1e-4); that of counts, which takes thresholds as known, four times as often.
@@ -305,8 +307,8 @@ def test_a_curve_that_flattens_is_worse_by_the_test_of_a90():
     assert row.hits.fewer_p > 0.01
     # twice for two tests of one question; Holm's first of two questions
     assert row.limit_p[0] == pytest.approx(2 * 2 * row.swap.grown_p)
-    (cells,) = compare_grid(compare_studies(one, other)).rows
-    assert cells[HEADS.index("p")].text == f"{row.limit_p[0]:.2g} (a90)"
+    grid = COMPARED.grid(compare_studies(one, other).rows)
+    assert grid.rows[0][grid.heads.index("p")].text == f"{row.limit_p[0]:.2g} (a90)"
 
 
 def test_where_hits_decide_or_the_margin_holds_a90_is_not_asked():
@@ -391,9 +393,8 @@ def test_every_row_is_said_in_text_and_on_the_page(comparison):
         assert row.label in text and row.label in page and row.mark in text
     assert text.splitlines()[-1].startswith("1 of 4 set-ups is worse. 1 frame: a90 ")
     assert "what differs: other frames of the same boards (1 frame)" in text
-    assert page.count("<tr") == 1 + 4 + 1 + 4 + 1 + 3 and 'none">worse</td>' in page and "<svg" in page
-    grid = compare_grid(comparison)
-    assert {len(cells) for cells in grid.rows} == {len(HEADS)} and grid.rich().row_count == 4
+    assert page.count("<tr") == 1 + 4 + 1 + 3 and 'none">worse</td>' in page
+    assert COMPARED.grid(comparison.rows).rich().row_count == 4
     assert compare_html(comparison, "x") == compare_html(comparison, "x")
 
 

@@ -11,10 +11,8 @@ from target_scenes import SCENES, Scene
 from detectors import load_detector
 from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, choice_of, crop
 from detectors.masks import holes_filled
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, Region
 
 LENS = Lens(200, 150, 250.0, 250.0, 99.5, 74.5)
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.design import FILES, main
+from harness.evaluation.intervals import false_call_rate, threshold_for_rate
 from harness.evaluation.pod.curve import LINKS
 from harness.evaluation.pod.design import (
     CALLS,
@@ -22,14 +23,11 @@ from harness.evaluation.pod.design import (
     design,
     fixed_share,
     hole_free,
-    plans_by_frames,
     recommend,
     repeated_studies,
     repeats_are_not_targets,
 )
-from harness.evaluation.pod.false_calls import false_call_rate, threshold_for_rate
-from harness.evaluation.pod.hit_miss import fit_hit_miss
-from harness.evaluation.pod.likelihood_bounds import bound
+from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.vocabulary.errors import UserError
@@ -78,18 +76,16 @@ def test_the_fixed_share_by_hand() -> None:
         fixed_share(0.0, 0.0, 1)
 
 
-def test_frames_are_studied_with_the_same_targets_and_luck() -> None:
-    asked: dict[str, Any] = {"pod": 0.9, "confidence": 0.95, "studies": 20, "seed": 2}
-    share = fixed_share(0.8, 0.3, 50)
-    one, fifty = plans_by_frames(
-        GUESS, (10, 50), guessed_with=50, fixed_share=share, targets=60, range_of_sizes=(2, 12), **asked
-    )
+def test_frames_are_studied_with_the_same_targets_and_luck(capsys: pytest.CaptureFixture[str]) -> None:
+    frames = ["--frames", "10", "50", "--guessed-with", "50", "--white-mm", "0.8", "--fixed-mm", "0.3"]
+    said = answered(capsys, *TOLD, "--studies", "20", "--targets", "60", "--seed", "2", *frames)
+    one, fifty = said["frames"]
     ratio = np.sqrt((0.64 / 10 + 0.09) / (0.64 / 50 + 0.09))
-    assert one.curve.size_at(0.9) == pytest.approx(7.0 * ratio)
-    assert fifty.curve.size_at(0.9) == pytest.approx(7.0)
-    assert fifty.plan.bound == design(GUESS, (60,), (2, 12), placements=("uniform",), **asked)[0].bound
-    assert np.array_equal(one.plan.sizes, fifty.plan.sizes)
-    assert one.plan.bound > fifty.plan.bound
+    assert one["guess"]["a90"] == pytest.approx(7.0 * ratio)
+    assert fifty["guess"]["a90"] == pytest.approx(7.0)
+    alone = design(GUESS, (60,), (2, 12), placements=("uniform",), studies=20, seed=2)[0]
+    assert fifty["plan"]["bound"] == alone.bound and one["plan"]["sizes"] == fifty["plan"]["sizes"]
+    assert one["plan"]["bound"] > fifty["plan"]["bound"]
 
 
 # ---- what is recommended ---------------------------------------------------------------------------------------------
@@ -139,10 +135,9 @@ def test_repeats_make_the_wrong_limit_too_small_and_the_right_one_not() -> None:
 def test_the_wrong_limit_is_that_of_rows_without_names() -> None:
     """Also where hits and misses do not overlap, and a penalty takes the place of the likelihood."""
     size, hit = np.repeat(np.arange(3.0, 11.0), 10), np.repeat([0, 0, 0, 1, 1, 1, 1, 1], 10)
-    check = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 10))
-    assert check.fit.separated
-    assert check.wrong.value == bound(fit_hit_miss(size, hit)).value
-    assert check.wrong.value < check.right.value
+    right, wrong = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 10))
+    assert fit_hit_miss(size, hit).method == "Firth"
+    assert right.value > wrong.value == bound(fit_hit_miss(size, hit)).value
 
 
 # ---- hole-free boards ------------------------------------------------------------------------------------------------
@@ -204,7 +199,7 @@ def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> N
     assert "WRONG: a90/95 (furlong)" in printed
     assert "needs 4 hole-free boards of 0.25 m2" in printed
     assert "no false call on 2.996 m2, which is 12 other boards" in printed
-    assert "the guess for 1 frame has a90 = 18.65 furlong outside the sizes" in printed
+    assert "with N = 1 much of the guessed curve's rise lies outside the sizes" in printed
     assert printed.rstrip().splitlines()[-1].startswith("Make 60 targets, ")
     assert next(line for line in printed.splitlines() if line.startswith("* ")).split()[1] == "60"
 

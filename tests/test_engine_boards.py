@@ -15,11 +15,9 @@ from detectors.thesis import ThesisConfig, ThesisDetector
 from harness.engine.judge import FINDING_OCTAVES, PIXEL_OCTAVES, JudgedCloud, grid, study_rows
 from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, _eroded, highest_within, met_on_face, pixel_areas
 from harness.evaluation.match import match
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
-from scenes.target.face import face_of
-from scenes.target.truth import truth_of
+from scenes.target.truth import face_of, truth_of
 
 
 def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud]:
@@ -73,40 +71,40 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud
 def test_what_a_damaged_board_gives():
     known, judgement = sight_and_judgement()
     rows = study_rows(known, judgement, 0.01, hole_free=False)
-    assert [row["signal"] for row in rows.holes] == [9.0, 0.0]
-    assert rows.run["inspected_m2"] == pytest.approx(90 * 60e-6)  # ten columns of 100 were not judged
-    findings = rows.of_study["findings"]
+    assert [row["signal"] for row in rows["holes"]] == [9.0, 0.0]
+    assert rows["runs"][0]["inspected_m2"] == pytest.approx(90 * 60e-6)  # ten columns of 100 were not judged
+    findings = rows["findings"]
     assert [(one["hole"], one["score"]) for one in findings] == [("1", 9.0), ("", 5.0)]
     assert (findings[1]["x_mm"], findings[1]["y_mm"]) == pytest.approx((0.5, -19.5))
-    (operating,) = rows.of_study["operating"]
+    (operating,) = rows["operating"]
     at = dict(zip(operating["threshold"], zip(operating["findings"], operating["hits"], strict=True), strict=True))
     assert at[4.0] == (2, 1)
     assert at[8.0] == (1, 1)
     assert at[16.0] == (0, 0)
-    of_pixels = {row["hole"]: row for row in rows.of_study["pixels"]}
+    of_pixels = {row["hole"]: row for row in rows["pixels"]}
     assert of_pixels["1"]["pixels"] == len(known.outlines[1])
     assert of_pixels["1"]["above"][of_pixels["1"]["threshold"].index(4.0)] == 1
     assert of_pixels[""]["above"][of_pixels[""]["threshold"].index(4.0)] == 1
-    assert rows.of_study["sites"] == []
+    assert rows["sites"] == []
 
 
 def test_a_hole_free_board_gives_the_same_places_as_sites():
     known, judgement = sight_and_judgement()
     rows = study_rows(known, judgement, 0.01, hole_free=True)
-    assert rows.holes == []
-    assert [(row["hole"], row["detected"], row["signal"]) for row in rows.of_study["sites"]] == [
+    assert rows["holes"] == []
+    assert [(row["hole"], row["detected"], row["signal"]) for row in rows["sites"]] == [
         ("1", True, 9.0),
         ("2", False, 0.0),
     ]
-    assert {one["hole"] for one in rows.of_study["findings"]} == {""}
-    assert rows.of_study["operating"][0]["hits"] == [0] * len(grid(4.0, FINDING_OCTAVES))
-    assert rows.of_study["pixels"] == []
+    assert {one["hole"] for one in rows["findings"]} == {""}
+    assert rows["operating"][0]["hits"] == [0] * len(grid(4.0, FINDING_OCTAVES))
+    assert rows["pixels"] == []
 
 
 def test_a_place_where_nothing_was_judged_has_no_signal():
     known, judgement = sight_and_judgement()
     judgement.evidence.score[:] = np.nan
-    assert np.isnan(study_rows(known, judgement, 0.01, hole_free=True).of_study["sites"][0]["signal"])
+    assert np.isnan(study_rows(known, judgement, 0.01, hole_free=True)["sites"][0]["signal"])
 
 
 def test_the_grid_of_thresholds_holds_the_one_in_use():
@@ -177,7 +175,7 @@ def test_findings_at_other_thresholds_are_those_of_find(kind: type[ThesisDetecto
     score = np.random.default_rng(2).exponential(2.0, known.cloud.valid.shape)
     evidence = Evidence(score, score, score, 1.0)
     judgement = replace(judgement, detector=detector, evidence=evidence)
-    (operating,) = study_rows(known, judgement, 0.01, hole_free=False).of_study["operating"]
+    (operating,) = study_rows(known, judgement, 0.01, hole_free=False)["operating"]
     found = [detector.find(known.cloud, evidence, one) for one in operating["threshold"]]
     centres = [known.on_board(np.array([one.centre_m for one in each]).reshape(-1, 3)) for each in found]
     truth = np.array([damage.centre_board_m[:2] for damage in known.truth])

@@ -37,15 +37,14 @@ from cluster_processes import (
     until,
 )
 from serial_run import records_of, run_serially
-from test_engine import TINY
+from tiny_sweep import TINY
 
 from harness.engine.cluster import ClusterEngine
 from harness.engine.journal import Journal
-from harness.engine.options import code_of
 from harness.engine.plan import plan_of
 from harness.engine.processes import SerialEngine, render_into_cache
 from harness.engine.run import run_plan
-from harness.engine.work import Ended, Job, JobEngine, Limits
+from harness.engine.work import Ended, Job, JobEngine, Limits, code_of
 from harness.experiment.load import load_experiment
 from harness.vocabulary.errors import UserError
 from scenes.render.cache import read_view
@@ -111,14 +110,22 @@ def test_the_queue_stays_short_whatever_the_plan(cluster):
             ended += engine.ended()
 
 
-def test_a_job_that_kills_its_worker_costs_itself_only(cluster):
-    jobs = [*squares(60, "before"), Job("killer", "trials", kill_own_process, ()), *squares(60, "after")]
-    with engine_at(cluster) as engine:
+def test_every_fault_costs_its_own_job_only(cluster):
+    """One job kills its process, one hangs, one stops its whole process in C, one wants too much memory."""
+    faults = {"killer": kill_own_process, "endless": hang, "stuck": hold_the_interpreter}
+    jobs = [*squares(60, "before"), *(Job(name, "trials", fault, ()) for name, fault in faults.items())]
+    jobs += [Job("hungry", "trials", eat, (3000,)), *squares(60, "after")]
+    with engine_at(cluster, Limits(seconds=10.0, memory_mb=600)) as engine:
         ended = run(engine, jobs)
-    killer = ended.pop("killer")
-    assert killer.state == "crashed" and "SIGKILL" in killer.why
-    assert len(ended) == 120
+        again = run(engine, squares(30))
+    bad = {name: ended.pop(name) for name in (*faults, "hungry")}
+    assert [how.state for how in bad.values()] == ["crashed", "timed out", "timed out", "failed"]
+    assert "SIGKILL" in bad["killer"].why
+    assert "in hang" in bad["endless"].why and "--time-limit" in bad["endless"].why
+    assert "in hold_the_interpreter" in bad["stuck"].why
+    assert "out of memory" in bad["hungry"].why and "--memory-limit" in bad["hungry"].why
     assert all(how.state == "done" and how.value == int(name.split()[1]) ** 2 for name, how in ended.items())
+    assert {how.state for how in again.values()} == {"done"} and len(ended) == 120
 
 
 def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
@@ -139,39 +146,10 @@ def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
     assert {how.state for how in ended.values()} == {"done"} and len(ended) == 12 and killed
 
 
-def test_a_job_that_hangs_is_ended_by_its_limit(cluster):
-    jobs = [*squares(20, "before"), Job("endless", "trials", hang, ()), *squares(200, "after")]
-    with engine_at(cluster, Limits(seconds=20.0)) as engine:
-        ended = run(engine, jobs)
-        again = run(engine, squares(30))
-    endless = ended.pop("endless")
-    assert endless.state == "timed out" and "in hang" in endless.why and "--time-limit" in endless.why
-    assert {how.state for how in ended.values()} == {"done"}
-    assert {how.state for how in again.values()} == {"done"}
-
-
-def test_a_job_that_stops_its_whole_process_is_ended_by_its_limit(cluster):
-    with engine_at(cluster, Limits(seconds=20.0)) as engine:
-        ended = run(engine, [Job("endless", "trials", hold_the_interpreter, ()), *squares(100)])
-    endless = ended.pop("endless")
-    assert endless.state == "timed out" and "in hold_the_interpreter" in endless.why
-    assert {how.state for how in ended.values()} == {"done"}
-
-
-def test_a_job_that_eats_memory_meets_its_limit(cluster):
-    jobs = [*squares(20, "before"), Job("hungry", "trials", eat, (3000,)), *squares(20, "after")]
-    with engine_at(cluster, Limits(memory_mb=600)) as engine:
-        ended = run(engine, jobs)
-    hungry = ended.pop("hungry")
-    assert hungry.state == "failed" and "out of memory" in hungry.why and "--memory-limit" in hungry.why
-    assert {how.state for how in ended.values()} == {"done"}
-
-
 def test_a_node_of_several_processes_uses_them_all(tmp_path):
     with processes(tmp_path / "cluster") as one:
         one.worker("--nthreads", "3", "--no-nanny")
         with engine_at(one) as engine:
-            assert engine.worker_count == 3
             ended = run(engine, [Job(f"pid {n}", "trials", pid_after, (0.3,)) for n in range(12)])
     assert len({how.value for how in ended.values()}) == 3
     assert len({how.worker for how in ended.values()}) == 1

@@ -13,11 +13,11 @@ from pathlib import Path
 import faulty_jobs
 import pytest
 from serial_run import run_serially
-from tiny_sweep import ROOT, TINY, content, results, sweep, sweep_command
+from tiny_sweep import ROOT, TINY, content, results, sweep_command
 
 from harness.engine.journal import JOURNAL_VERSION, Journal
 from harness.engine.plan import plan_of
-from harness.engine.shard import locked
+from harness.engine.work import locked
 from harness.experiment.load import load_experiment
 from harness.vocabulary.errors import UserError
 
@@ -75,7 +75,8 @@ def run(home: Path, out: str, *arguments: str, faults: tuple[str, ...] = ()) -> 
     for fault in faults:
         (folder / fault).touch()
     given = environment(home) | {faulty_jobs.FOLDER: str(folder)}
-    return sweep(home / "tiny.yaml", home / out, "--set", REPEATS, *arguments, **given)
+    command = sweep_command(home / "tiny.yaml", home / out, "--set", REPEATS, *arguments)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800, env=os.environ | given)
 
 
 def judged_in(out: Path) -> list[str]:
@@ -203,7 +204,6 @@ def test_a_clock_that_jumps_changes_nothing(home, tmp_path, monkeypatch):
     assert outcome.failures == []
     entries = [Journal(tmp_path).read(key) for key in outcome.finished]
     assert all(entry is not None and 0 <= entry.seconds < 86400 for entry in entries)
-    assert 0 <= outcome.seconds < 86400
 
 
 def test_a_newer_journal_is_refused(home):

@@ -45,7 +45,7 @@ def test_every_fault_costs_its_own_job_only():
     ]
     innocent = doubles(30)
     jobs = [one for pair in zip(faults, innocent[: len(faults)], strict=True) for one in pair] + innocent[len(faults) :]
-    found = run(LocalEngine(2, Limits(seconds=20.0, memory_mb=1000)), jobs)
+    found = run(LocalEngine(2, Limits(seconds=10.0, memory_mb=1000)), jobs)
     assert {name: ended.state for name, ended in found.items() if ended.state != "done"} == {
         "raises": "failed",
         "refuses": "failed",
@@ -60,9 +60,9 @@ def test_every_fault_costs_its_own_job_only():
     assert not found["refuses"].is_bug and "to do: mend it" in found["refuses"].why
     assert "SIGKILL" in found["kills_its_process"].why
     assert "SIGABRT" in found["aborts"].why and "faulty_jobs.py" in found["aborts"].why
-    assert "not done after 20" in found["hangs"].why and "in hangs" in found["hangs"].why
+    assert "not done after 10" in found["hangs"].why and "in hangs" in found["hangs"].why
     assert "out of memory" in found["eats_memory"].why
-    assert found["hangs"].seconds >= 20.0
+    assert found["hangs"].seconds >= 10.0
     assert all(ended.state in STATES and ended.worker for ended in found.values())
 
 
@@ -71,13 +71,10 @@ def test_quick_jobs_are_ready_before_the_last_has_ended():
     rest = doubles(40)
     jobs = [*rest[:20], job(faulty_jobs.kills_its_process), *rest[20:30], job(faulty_jobs.hangs), *rest[30:]]
     with LocalEngine(1, Limits()) as engine:
-        assert engine.room("trials") == 1
-        engine.submit(jobs[0])
-        assert engine.room("trials") == 0
-        engine.ended()
+        assert engine.room("trials") == 2
         engine.submit(jobs[0])
         assert engine.room("trials") == 1
-    found = run(LocalEngine(1, Limits(seconds=15.0)), jobs)
+    found = run(LocalEngine(1, Limits(seconds=8.0)), jobs)
     states = {name: ended.state for name, ended in found.items() if ended.state != "done"}
     assert states == {"kills_its_process": "crashed", "hangs": "timed out"}
     assert [found[one.name].value for one in rest] == [2 * n for n in range(40)]

@@ -7,48 +7,43 @@ from pathlib import Path
 
 import pytest
 from serial_run import run_serially
-from test_engine_study import written
 from tiny_sweep import TINY, content, results, sweep
 
 from harness import merge
 from harness.engine.journal import Journal, record_text
 from harness.engine.plan import SweepPlan, parts_of, plan_of
-from harness.engine.shard import Shard, locked
+from harness.engine.work import Shard, locked
 from harness.experiment.load import load_experiment
 from harness.vocabulary.errors import UserError
 
 
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def home(study_out: Path) -> Path:
     """With a study of random boards and its run in one go."""
-    home = tmp_path_factory.mktemp("shards")
-    written(home)
-    done = sweep(home / "tiny.yaml", home / "whole")
-    assert done.returncode == 0, done.stderr
-    return home
+    return study_out.parent
 
 
 def plan(home: Path) -> SweepPlan:
-    return plan_of(load_experiment(home / "tiny.yaml"), home / "whole" / ".cache" / "renders")
+    return plan_of(load_experiment(home / "tiny.yaml"), home / "out" / ".cache" / "renders")
 
 
 @pytest.mark.slow
-def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, capsys):
+def test_shards_on_machines_of_their_own_merge_to_the_same_bytes(home, tmp_path, capsys):
     """Two folders without a common file; merged, and the report written where no render is."""
-    name = results(home / "whole").name
+    name = results(home / "out").name
     for number in (1, 2):
-        shutil.copytree(home / "whole" / ".cache", home / f"part{number}" / ".cache")
-        done = sweep(home / "tiny.yaml", home / f"part{number}", "--shard", f"{number}/2")
+        shutil.copytree(home / "out" / ".cache", tmp_path / f"part{number}" / ".cache")
+        done = sweep(home / "tiny.yaml", tmp_path / f"part{number}", "--shard", f"{number}/2")
         assert done.returncode == 0, done.stderr
         assert f"shard {number}/2: " in done.stdout
-        assert not list((home / f"part{number}").glob("tiny/[0-9a-f]*/report.html"))
-    parts = [str(home / f"part{number}" / "tiny" / name) for number in (1, 2)]
-    into = home / "joined" / "tiny" / name
+        assert not list((tmp_path / f"part{number}").glob("tiny/[0-9a-f]*/report.html"))
+    parts = [str(tmp_path / f"part{number}" / "tiny" / name) for number in (1, 2)]
+    into = tmp_path / "joined" / "tiny" / name
     assert merge.main([*parts, "--into", str(into)]) == 0
-    assert f"--out {home / 'joined'}" in capsys.readouterr().out
-    done = sweep(home / "tiny.yaml", home / "joined")
+    assert f"--out {tmp_path / 'joined'}" in capsys.readouterr().out
+    done = sweep(home / "tiny.yaml", tmp_path / "joined")
     assert done.returncode == 0, done.stderr
-    assert content(into) == content(results(home / "whole"))
+    assert content(into) == content(results(home / "out"))
 
 
 def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
@@ -78,8 +73,8 @@ def test_every_judged_trial_belongs_to_one_shard(home, count):
 def test_a_shard_renders_only_what_it_needs(home):
     study = plan(home)
     (first, then), (_, all_then) = parts_of(study, Shard(1, 4)), parts_of(study, Shard(1, 1))
-    mine = {path for parts in (*first, *then) for part in parts for path in part.paths}
-    judged = {path for parts in all_then for part in parts for path in part.paths}
+    mine = {path for parts in (*first, *then) for part in parts for path in part.batch.paths}
+    judged = {path for parts in all_then for part in parts for path in part.batch.paths}
     assert judged - mine
 
 
@@ -106,7 +101,7 @@ def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
 @pytest.fixture
 def two(home, tmp_path) -> tuple[Path, Path]:
     """A finished folder, and where to merge into."""
-    whole = results(home / "whole")
+    whole = results(home / "out")
     shutil.copytree(whole, tmp_path / "a" / "tiny" / whole.name)
     return tmp_path / "a" / "tiny" / whole.name, tmp_path / "b" / "tiny" / whole.name
 
@@ -122,11 +117,11 @@ def test_merging_twice_copies_once(two, capsys):
 
 
 def test_what_is_done_takes_the_place_of_what_is_not(two):
-    from harness.engine.journal import Entry
+    from harness.engine.work import Ended
 
     other, into = two
     keys = Journal(other / "journal").trials()
-    Journal(into / "journal").write(keys[0], Entry("crashed", why="its process was ended by SIGKILL"))
+    Journal(into / "journal").write(keys[0], Ended("crashed", why="its process was ended by SIGKILL"))
     assert merge.main([str(other), "--into", str(into)]) == 0
     entry = Journal(into / "journal").read(keys[0])
     assert entry is not None and entry.state == "done"
@@ -142,10 +137,10 @@ def test_different_results_for_one_trial_are_told(two, capsys):
     assert entry is not None and entry.record is not None
     assert merge.main([str(other), "--into", str(into)]) == 0
     slower = {**entry.record, "runs": [{**run, "seconds_detect": 9.0} for run in entry.record["runs"]]}
-    journal.write(key, replace(entry, text=record_text(slower)))
+    journal.write(key, replace(entry, value=record_text(slower)))
     assert merge.main([str(other), "--into", str(into)]) == 0
     changed = {**entry.record, "runs": [{**run, "detections": 99} for run in entry.record["runs"]]}
-    journal.write(key, replace(entry, text=record_text(changed)))
+    journal.write(key, replace(entry, value=record_text(changed)))
     assert merge.main([str(other), "--into", str(into)]) == 1
     assert "1 trials have different results" in capsys.readouterr().err
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,41 +14,24 @@ import pytest
 from declared_results import assert_declared
 from scipy import stats
 from serial_run import records_of, run_serially
+from tiny_sweep import STUDY, results
 
 from harness.engine import run
 from harness.engine.plan import plan_of
-from harness.engine.study_record import record_of
+from harness.engine.run import threshold_of
+from harness.engine.study import record_of
 from harness.engine.tables import tables_of
-from harness.engine.thresholds import threshold_of
-from harness.engine.trial import TrialTask, board_labels, run_trial
+from harness.engine.trial import TrialTask, run_trial
 from harness.evaluation.study.record import StudyRecord, read_record
 from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import load_experiment
-from harness.experiment.points import Point
+from harness.experiment.schema import Point
 from harness.tables.trials import ResultTables
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
 
-ROOT = Path(__file__).resolve().parents[1]
 
-TINY = """\
-name: tiny
-seed: 3
-source:
-  kind: simulated
-  target: {name: drawn, damage: {kind: through, per_board: 5, diameter_mm: [2.0, 12.0]}}
-  camera: {name: azure_kinect_nfov}
-  render: {bounces: 0}
-capture: {frames: 2}
-detector: {name: thesis, settings: {crop: {kind: auto, inset_px: 4}}}
-threshold: {calibrate: {boards: 5, false_calls_per_m2: 4.0}}
-study: {boards: 4, hole_free_boards: 3}
-sweep:
-  capture.frames: [1, 2]
-"""
-
-
-def written(folder: Path, text: str = TINY) -> Path:
+def written(folder: Path, text: str = STUDY) -> Path:
     (folder / "tiny.yaml").write_text(text)
     return folder / "tiny.yaml"
 
@@ -129,11 +110,7 @@ def test_a_study_s_threshold_is_set_by_the_wanted_rate():
 
 def test_each_board_has_its_own_noise_and_its_own_errors_of_nominal_poses(tmp_path):
     (group,) = plan_of(load_experiment(written(tmp_path)), tmp_path).groups
-    labels = [
-        (task.role, task.repeat, *board_labels(task))
-        for batch in group.batches
-        for _, task in group.trials(batch, AT_5)
-    ]
+    labels = [task.labels for batch in group.batches for _, task in group.trials(batch, AT_5)]
     assert len(set(labels)) == len(labels) == 12
     assert labels[0] == ("calibration", 0, "board", 0)
 
@@ -164,27 +141,13 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
 # ---- the whole study -------------------------------------------------------------------------------------------------
 
 
-def sweep(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "harness.sweep", str(folder.parent / "tiny.yaml"), "--out", str(folder)]
-    return subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=1800)
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    home = tmp_path_factory.mktemp("study")
-    written(home)
-    done = sweep(home / "out")
-    assert done.returncode == 0, done.stderr
-    assert "a90/95" in done.stdout
-    return home / "out"
-
-
-def results(folder: Path) -> Path:
-    (found,) = (folder / "tiny").glob("[0-9a-f]*")
-    return found
+@pytest.fixture
+def finished(study_out: Path) -> Path:
+    return study_out
 
 
 def test_a_study_leaves_its_record_tables_and_report(finished):
+    assert "a90/95" in (finished.parent / "told.txt").read_text()
     folder = results(finished)
     names = {path.name for path in folder.iterdir()}
     tables = {f"{name}.parquet" for name in ("trials", "runs", "sites", "findings", "operating", "pixels")}

@@ -9,13 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import spearmanr
-from synthetic_tables import World, example, joined, tables
+from synthetic_tables import World, example, tables
 
 from harness.evaluation.profile import HoleInView, bowl, hole_shape, hole_shapes
 from harness.evaluation.summary import hole_list
-from harness.report.examples import ExampleCloud
-from harness.thesis.claims import RULES, falling_rank, scatter_ratio, score_claims, verdicts_by_variant
-from harness.thesis.verdicts import Verdict, claims_table, decide
+from harness.report.clouds import ExampleCloud
+from harness.thesis.claims import RULES, Verdict, claims_table, decide, falling_rank, scatter_ratio, score_claims
 
 
 def verdict(claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)) -> Verdict:
@@ -118,15 +117,6 @@ def test_evidence_carries_the_numbers() -> None:
     assert "42 of 50 (3)" in more.evidence
     assert "hole 4 +2.0 (1.5 to 2.5)" in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
     assert "ratio position to size 4.00" in verdict("C5").evidence
-
-
-def test_sensitivity_table() -> None:
-    near = tables(World(rate=lambda hole, frames: float(hole >= 3)), frames=(1, 50), variant="distance 700 mm")
-    table = verdicts_by_variant(joined(near, tables(frames=(1, 50))), examples=[example(50)])
-    assert list(table["variant"]) == ["distance 700 mm", "main"]
-    assert list(table["C1"]) == ["not borne out", "borne out"]
-    assert list(table["C6"]) == ["undecided", "borne out"]
-    assert list(table.columns[-len(RULES) :]) == list(RULES)
 
 
 def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:

@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from synthetic_perspectives import MERGE, REGISTRATION, VIEWS, MapWorld, name_of, perspectives, with_variation
 
 from harness.evaluation.maps import (
     against_one,
+    by_views,
     change_of,
     compare_maps,
-    crossing_of,
     map_cases,
     maps_of,
+    of_map,
+    paired_ratio,
     run_ratio,
     size_errors,
+    summarise_registrations,
 )
-from harness.evaluation.registration import by_views, of_map, paired_ratio, summarise_registrations
 from harness.evaluation.summary import summarise_holes
 
 
@@ -109,34 +109,6 @@ def test_the_registrations_of_a_map_are_found_under_whichever_number_of_views_th
     assert set(of_map(table, "joint", 2)[VIEWS]) == {2.0}
     counts = by_views(table, (1, 2, 3)).set_index(["method", "views"])["n"]
     assert counts.to_dict() == {("marks", 2): 2, ("marks", 3): 4, ("joint", 2): 2, ("joint", 3): 4}
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ([1.0, 0.5, -0.5, -1.0], 5.0),
-        ([0.3, -0.1, -0.2, -0.3], 3.5),
-        ([0.4, -0.2, 0.2, -0.4], 6.0),  # the middle two are pooled to zero, and from 6 mm on the fit falls
-        ([-0.4, -0.2, 0.2, 0.4], np.nan),  # better with small holes, worse with large: no turn of that kind
-        ([0.1, 0.1, 0.2, 0.3], np.nan),
-        ([1.0, np.nan, -0.5, -1.0], np.nan),
-    ],
-)
-def test_where_the_change_turns(changes, expected):
-    found = crossing_of(np.array([2.0, 4.0, 6.0, 8.0]), np.array([changes]))
-    assert found == pytest.approx([expected], nan_ok=True)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.floats(-2, 2), min_size=2, max_size=8))
-def test_a_turn_lies_between_holes_that_grew_worse_and_holes_that_grew_better(changes):
-    sizes = np.arange(1.0, len(changes) + 1)
-    (found,) = crossing_of(sizes, np.array([changes]))
-    if np.isfinite(found):
-        values = np.array(changes)
-        assert 1.0 <= found <= len(changes)
-        assert values[sizes <= found].mean() >= 0
-        assert values[sizes > found].mean() < 0
 
 
 def holes(diameters, repeats=4, true=(10.0, 5.0)):

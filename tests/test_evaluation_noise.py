@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from synthetic_tables import FRAMES, World, tables
 
-from harness.evaluation.noise import fit_floor, noise_against_frames, noise_law
+from harness.evaluation.summary import fit_floor, noise_against_frames, noise_law
 
 
 def test_parts_are_recovered() -> None:

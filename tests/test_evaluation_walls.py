@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.evaluation.walls import shadowed_shares
+from harness.evaluation.profile import shadowed_shares
 
 RADIUS_M, DEPTH_M = 5e-3, 20e-3
 FAR_M = 1e5

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from harness.experiment.load import load_experiment
-from harness.experiment.points import Experiment
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.experiment.schema import Experiment
+from harness.vocabulary.declaration.yaml_source import DeclarationError
 
 
 @pytest.fixture

@@ -14,11 +14,10 @@ from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import read_as, settings_of, validated
-from harness.vocabulary.declaration.problems import DeclarationError
-from harness.vocabulary.declaration.yaml_source import parse_yaml, read_yaml
+from harness.vocabulary.declaration.yaml_source import DeclarationError, parse_yaml, read_yaml
 from harness.vocabulary.errors import UserError
 from scenes.sensor.camera import read_camera
-from scenes.target.declaration import TARGETS
+from scenes.target.thesis import TARGETS
 
 
 class Hole(Config):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
-from harness.experiment.dotted import PathError, get_path, key_path, overridden, set_path
+from harness.experiment.unfold import PathError, get_path, key_path, overridden, set_path
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source, parse_yaml
@@ -60,7 +60,7 @@ def paths_in(data: Any, above: KeyPath = ()) -> list[KeyPath]:
     return [path for key, value in inner for path in [(*above, key), *paths_in(value, (*above, key))]]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.dictionaries(keys, trees, min_size=1, max_size=4), value=trees, draw=st.data())
 def test_set_then_get_and_nothing_else_changes(data: dict[str, Any], value: Any, draw: st.DataObject) -> None:
     path = draw.draw(st.sampled_from(paths_in(data)))
@@ -74,7 +74,7 @@ def test_set_then_get_and_nothing_else_changes(data: dict[str, Any], value: Any,
     assert key_path(".".join(map(str, path))) == path
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.dictionaries(keys, trees, max_size=3), key=keys, value=trees)
 def test_a_new_key_is_added(data: dict[str, Any], key: str, value: Any) -> None:
     assert set_path(data, (key,), value) == {**data, key: value}

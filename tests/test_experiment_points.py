@@ -11,9 +11,9 @@ from pydantic import Field
 
 import detectors
 from harness.experiment.load import load_experiment, resolved_yaml
-from harness.experiment.points import MAIN, Experiment, Point
+from harness.experiment.schema import MAIN, Experiment, Point
 from harness.vocabulary.config import Config
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import DeclarationError
 from tests.plug_in_packages import offer
 
 
@@ -270,8 +270,11 @@ def test_mistakes_of_the_experiment_have_their_place(folder: Path, old: str, new
         ("capture.frames: [1, ten]", ['13:23: `capture.frames` is "ten"', "from 1 to 10000"]),
         ("capture.frames: []", ["13:19: `sweep.capture.frames` is an empty list", "(1 to 1000 items)"]),
         ("capture.frames: 3", ["13:19: `sweep.capture.frames` is 3"]),
-        ("capture.frames: [1, 5, 1]", ["13:26: 1 is in this list twice", "first at x.yaml:13:20"]),
-        ("source.target.distance_m: [1, 1.0]", ["13:33: 1.0 is in this list twice"]),
+        (
+            "capture.frames: [1, 5, 1]",
+            ["13:26: the points capture.frames=1 and capture.frames=1 are the same experiment"],
+        ),
+        ("source.target.distance_m: [1, 1.0]", ["13:33: the points", "are the same experiment"]),
         ("capture.frmes: [1]", ["13:3: unknown path `capture.frmes`", "did you mean: capture.frames"]),
         ("source.target.distnce_m: [1]", ["13:3: unknown path", "did you mean: source.target.distance_m"]),
         ("detector.settings.degre: [1]", ["13:3: unknown path", "did you mean: detector.settings.degree"]),
@@ -330,9 +333,9 @@ def test_a_combination_that_cannot_be_is_named(folder: Path) -> None:
             "frames: [1, 7]\n  vary",
             ["16:15: 7 frames are not run in the main experiment", "of 1, 5"],
         ),
-        ("frames: [1, 5]\n  vary", "frames: [1, 1]\n  vary", ["16:15: 1 is in this list twice"]),
+        ("frames: [1, 5]\n  vary", "frames: [1, 1]\n  vary", ["are the same experiment"]),
         ("[0.5, 0.9]", "[0.5, 90]", ["19:21: `source.target.distance_m` is 90"]),
-        ("[0.5, 0.9]", "[0.5, 0.5]", ["19:21: two variations are called `source.target.distance_m=0.5`"]),
+        ("[0.5, 0.9]", "[0.5, 0.5]", ["19:21: the points", "are the same experiment"]),
         (
             "path: source.target.distance_m",
             "path: source.target.distance",

@@ -11,8 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.vocabulary.declaration.problems import DeclarationError
-from harness.vocabulary.declaration.yaml_source import MAX_BYTES, MAX_DEPTH, parse_yaml, read_yaml, to_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    MAX_BYTES,
+    MAX_DEPTH,
+    DeclarationError,
+    parse_yaml,
+    read_yaml,
+    to_yaml,
+)
 
 
 def refused(text: str) -> str:
@@ -217,7 +223,7 @@ plain = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.dictionaries(st.from_regex(r"\A[a-z_]{1,6}\Z"), plain, min_size=1, max_size=4))
 def test_what_is_written_is_read_back(data: dict[str, object]) -> None:
     read = parse_yaml(to_yaml(data), "x").data

@@ -18,20 +18,18 @@ from detectors.average import AverageConfig, average
 from detectors.interface import Detection, Measurement
 from detectors.recordings import open_capture
 from harness import detect, export
-from harness.exchange import tum
-from harness.exchange.views import START_NS, in_turn, quaternion_of
-from harness.inspection.poses import read_poses
-from harness.vocabulary.capture import Cloud, FrameSource
+from harness import exchange as tum
+from harness.exchange import START_NS, in_turn, quaternion_of
+from harness.inspection.arguments import read_poses
 from harness.vocabulary.files import atomic_folder
-from harness.vocabulary.geometry import Region, invert, rotation_xyz_deg, transform_points
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.geometry import Cloud, FrameSource, Lens, Region, invert, rotation_xyz_deg, transform_points
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view
+from scenes.optics import NoiseFreeView
 from scenes.perspectives import ArcViews, guessed_T_reference_view, poses_of
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.thesis import ThesisTargetConfig
-from scenes.view import NoiseFreeView
 
 CAMERA = CameraConfig(name="azure_kinect_nfov", unit_seed=1)
 FRONT, BACK = Plane(0.7, 0.1), Plane(0.715, 0.1)
@@ -353,7 +351,7 @@ def test_half_an_export_is_never_seen(
         raise fault
         yield
 
-    monkeypatch.setattr("harness.exchange.views.ExportedView.exposures", broken)
+    monkeypatch.setattr("harness.exchange.ExportedView.exposures", broken)
     arguments = [str(experiment), "--format", "mcap", "--out", str(tmp_path / "out")]
     if isinstance(fault, RuntimeError):
         with pytest.raises(RuntimeError):

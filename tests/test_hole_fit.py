@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from detectors.hole import (
+from detectors.measure import (
     IMAGES,
     TOLERANCE,
     WALL_PRIOR,
     HolePatch,
-    Sight,
-    blurred_hole,
     correlated_products,
-    crossed,
     derivatives,
     fit_hole,
+    local_plane,
+    pictures,
+    sight,
 )
-from detectors.measure import local_plane
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
@@ -32,11 +31,11 @@ def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> HolePatch:
     random = np.random.default_rng(seed)
     shape = (34, 37)
     used = random.random(shape) > 0.02
-    sight = Sight.of(CENTRE_M, PER_PX_M, np.array([-14e-3, 0.0, 1e-3]))
-    blank = HolePatch(np.zeros(shape), used, PER_PX_M @ PER_PX_M.T, (5.0, 5.0), noise_m, sight)
+    sights = sight(CENTRE_M, PER_PX_M, np.array([-14e-3, 0.0, 1e-3]))[None]
+    blank = HolePatch(np.zeros(shape), used, PER_PX_M @ PER_PX_M.T, (5.0, 5.0), noise_m, sights)
     noise = cv2.blur(random.standard_normal(shape), (5, 5)) * 5.0 * noise_m
-    residual = np.where(used, blurred_hole(blank, hole) + noise + 1e-4, np.nan)
-    return HolePatch(residual, used, blank.metric_m2, blank.blur_px, noise_m, sight)
+    residual = np.where(used, pictures(blank, hole[None])[0] + noise + 1e-4, np.nan)
+    return HolePatch(residual, used, blank.metric_m2, blank.blur_px, noise_m, sights)
 
 
 def by_minpack(patch: HolePatch, start: tuple[float, float, float, float, float]) -> tuple[np.ndarray, float, bool]:
@@ -51,12 +50,12 @@ def by_minpack(patch: HolePatch, start: tuple[float, float, float, float, float]
 
     def misfit(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
-        image = blurred_hole(patch, hole)[patch.used]
+        image = pictures(patch, hole[None])[0][patch.used]
         return np.append(image + q[4] - data, weight * (hole[4] - WALL_PRIOR[0]))
 
     def jacobian(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
-        by = derivatives(patch, hole, blurred_hole(patch, hole))[:, patch.used]
+        by = derivatives(patch, hole)[1][:, patch.used]
         slope = 0.5 * math.pi * math.sin(math.pi * q[5])
         columns = [by[0], by[1], hole[2] * by[2] - 2.0 * hole[3] * by[3], by[3] / hole[2] ** 2, np.ones(len(data))]
         rows = np.column_stack([*columns, by[4] * slope])
@@ -90,7 +89,7 @@ def test_the_fit_is_that_of_the_plainly_written_least_squares(radius_mm: float, 
 
 def test_a_hopeless_start_is_told_and_not_looped_over() -> None:
     patch = patch_of(np.array([18.3, 16.4, 3e-3, 0.01, 0.6]), 1.5e-4, 0)
-    flat = HolePatch(np.where(patch.used, 1e-4, np.nan), patch.used, patch.metric_m2, (5.0, 5.0), 1.5e-4, patch.sight)
+    flat = HolePatch(np.where(patch.used, 1e-4, np.nan), patch.used, patch.metric_m2, (5.0, 5.0), 1.5e-4, patch.sights)
     fit = fit_hole(flat, 1000.0, -1000.0, 50.0, 0.1, 0.0)
     assert np.isfinite([fit.u_px, fit.v_px, fit.radius_m]).all()
 
@@ -131,12 +130,11 @@ def test_a_local_plane_is_that_of_exact_points(projection: str) -> None:
 
 def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
     emitter = np.array([-14e-3, 0.0, 1e-3])
-    found = Sight.of(CENTRE_M, PER_PX_M, emitter)
+    found = sight(CENTRE_M, PER_PX_M, emitter)
     normal = np.cross(*PER_PX_M)
-    np.testing.assert_array_equal(crossed(*PER_PX_M), normal)
     normal /= np.copysign(np.linalg.norm(normal), normal @ CENTRE_M)
     ray, z = CENTRE_M / CENTRE_M[2], CENTRE_M[2]
     slopes = ((PER_PX_M - np.outer(PER_PX_M[:, 2], ray)) / z)[:, :2].T
-    np.testing.assert_allclose(found.drift_px, np.linalg.pinv(slopes) @ (normal - normal[2] * ray)[:2] / z, rtol=1e-10)
+    np.testing.assert_allclose(found[1:3], np.linalg.pinv(slopes) @ (normal - normal[2] * ray)[:2] / z, rtol=1e-10)
     on_axis = emitter - CENTRE_M * float(normal @ emitter) / float(normal @ CENTRE_M)
-    np.testing.assert_allclose(found.beam_px, np.linalg.pinv(PER_PX_M.T) @ on_axis, rtol=1e-10)
+    np.testing.assert_allclose(found[4:6], np.linalg.pinv(PER_PX_M.T) @ on_axis, rtol=1e-10)

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from harness.engine.journal import JOURNAL_VERSION, Entry, Journal
+from harness.engine.journal import JOURNAL_VERSION, Journal
+from harness.engine.work import Ended
 from harness.vocabulary.errors import UserError
 
 
-def done(number: int) -> Entry:
-    return Entry("done", f'{{"runs":[{number}]}}')
+def done(number: int) -> Ended:
+    return Ended("done", f'{{"runs":[{number}]}}')
 
 
 def filled(folder: Path, count: int, first: int = 0) -> Journal:
@@ -64,7 +65,7 @@ def test_a_later_entry_counts_unless_only_the_earlier_trial_is_done(tmp_path):
     ):
         folder = tmp_path / "-".join(states)
         for state in states:
-            Journal(folder).write("a", done(1) if state == "done" else Entry(state))  # type: ignore[arg-type]
+            Journal(folder).write("a", done(1) if state == "done" else Ended(state))  # type: ignore[arg-type]
         assert Journal(folder).state("a") == expected
 
 

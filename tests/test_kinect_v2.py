@@ -7,14 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from harness.vocabulary.capture import Reason
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
+from scenes.sensor.amcw.facts import unwrap_table
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
@@ -39,7 +37,7 @@ def test_gain_meets_the_calibration_point():
 
 def test_the_window_is_the_published_one():
     imager = AmcwImager(V2, QUIET, NEAR_AXIS, V2.nominal_lens.region_slopes(NEAR_AXIS))
-    space, _ = imager.filter_settings
+    space = imager.filter_settings.space
     assert space / space.sum() == pytest.approx(
         np.array([[0.1069973, 0.1131098, 0.1069973], [0.1131098, 0.1195716, 0.1131098]])[[0, 1, 0]], abs=1e-6
     )
@@ -85,8 +83,8 @@ def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, fl
     strength[:, 0] = amplitude
     unit = np.stack([np.cos(phases), np.sin(phases)]).astype(f4)
     filtered, edge = np.empty((3, 3, 3), f4), np.empty((3, 3), f4)
-    settings = kernels.FilterSettings(f4(3.6067), f4(3), True, True)
-    kernels.filter_image(unit, strength, WINDOW.astype(f4), settings, filtered, edge)
+    settings = kernels.FilterSettings(WINDOW.astype(f4), f4(3.6067), f4(3), True, True)
+    kernels.filter_image(unit, strength, settings, filtered, edge)
     return complex(filtered[0, 1, 1], filtered[1, 1, 1]), float(edge[1, 1])
 
 
@@ -205,7 +203,7 @@ def test_unwrapping_is_right_over_the_whole_range_and_equals_the_published_one()
         turn = ((true + sigma * np.random.default_rng(4).standard_normal(true.shape)) % 1).astype(f4)
         published = published_range_m(turn.astype(float))
         half, residual2 = np.empty(range_m.size, f4), np.empty(range_m.size, f4)
-        ranging.half_path(turn, range_m.size, table.for_kernel, half, residual2)
+        ranging.half_path(turn, range_m.size, table, half, residual2)
         if sigma == 0:
             assert np.abs(half - range_m).max() < 5e-6
             assert residual2.max() < 1e-9

@@ -8,14 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, UNIFORM, changed, comb_phasors, true_z_m, z_of
 
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.calibration import ONLY_NOISE, calibrated_numbers, temporal_sigma_m, unit_before_plane
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig
-from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import ScannedLidar
-from scenes.sensor.lidar.scanner import LidarScanner
+from scenes.sensor.lidar.kernels import strongest_peaks
 from scenes.sensor.source import SimulatedUnit
 
 # ---------------------------------------------------------------- range without noise
@@ -93,8 +91,8 @@ def test_noise_of_a_peak_meets_the_bound_in_brute_force():
     phasor = comb_phasors(CAMERA, np.full((1, n), 1.5), np.ones((1, n)))
     peaks = strongest_peaks(phasor + (noise[0] + 1j * noise[1]) * (w.sum() / w)[:, None], w)
     places_m = peaks.delay[0] * CAMERA.unambiguous_m
-    scanner = LidarScanner(CAMERA, QUIET, PATCH, CAMERA.nominal_lens.region_slopes(PATCH))
-    assert places_m.std() == pytest.approx(scanner.metres_at_unit_ratio / ratio, rel=0.045)
+    bound_m = CAMERA.unambiguous_m / (CAMERA.period_s * CAMERA.bandwidth_rad_s)
+    assert places_m.std() == pytest.approx(bound_m / ratio, rel=0.045)
     assert peaks.height[0].std() == pytest.approx(1 / ratio, rel=0.045)
     assert abs(np.corrcoef(places_m, peaks.height[0])[0, 1]) < 4 / np.sqrt(n)
 

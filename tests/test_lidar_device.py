@@ -12,15 +12,14 @@ from lidar_footprint import hole_depth_seen_m, share_in_disc
 from lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, changed, mixed, z_of
 from scipy import stats
 
-from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
+from scenes.optics import NoiseFreeView
 from scenes.sensor.calibration import ONLY_NOISE
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.lidar.scanner import LidarScanner, overlap_taps, smear_weights
 from scenes.sensor.source import SimulatedUnit
-from scenes.view import NoiseFreeView
 
 # ---------------------------------------------------------------- several returns in one beam
 

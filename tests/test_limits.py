@@ -10,10 +10,9 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import isotonic_regression
 from synthetic_tables import World, joined, tables
 
-from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, isotonic, ladder_of
+from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, ladder_of
 from harness.evaluation.summary import summarise_holes
 
 
@@ -50,9 +49,6 @@ def test_half_size_lies_on_the_ladder_and_falls_when_more_is_found(rates):
     found = half_size(sizes, np.array([rates]))[0]
     assert found == np.inf or sizes[0] <= found <= sizes[-1]
     assert half_size(sizes, np.minimum(1, np.array([rates]) + 0.1))[0] <= found + 1e-9
-    assert isotonic(np.array([rates, rates[::-1]])) == pytest.approx(
-        np.stack([isotonic_regression(r).x for r in (rates, rates[::-1])])
-    )
 
 
 def test_interval_is_a_point_without_chance_and_covers_with_it():

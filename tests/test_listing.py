@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 
 from harness import clean, ls
-from harness.engine.journal import Entry, Journal
-from harness.engine.shard import locked
-from harness.listing.latest import latest_run, point_to
-from harness.listing.text import age_text, bytes_of, seconds_of, size_text
+from harness.engine.journal import Journal
+from harness.engine.work import Ended, locked
+from harness.listing import age_text, bytes_of, latest_run, point_to, seconds_of, size_text
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
 from scenes.render.cache import in_use, write_view
 from scenes.sensor.camera import load_camera
@@ -34,7 +33,7 @@ def results(out: Path, digest: str, name: str = "study", records: int = 0, **sai
     (folder / "experiment.yaml").write_text("# tofpod experiment 1\nname: study\n")
     journal = Journal(folder / "journal")
     for number in range(records):
-        journal.write(f"damaged-{number:05d}-{number:016x}", Entry("done", text='{"runs":[]}'))
+        journal.write(f"damaged-{number:05d}-{number:016x}", Ended("done", value='{"runs":[]}'))
     if said:
         whole = {"results_version": RESULTS_VERSION, "started": "2026-11-21T10:00:00+00:00", "commit": "abcdef0123"}
         (folder / "provenance.json").write_text(json.dumps({**whole, "dirty": True, **said}))
@@ -212,17 +211,14 @@ def read_text(path: Path) -> str:
     return path.read_text()
 
 
-def test_latest_is_a_text_file_where_links_cannot_be_made(tmp_path, monkeypatch):
+def test_a_link_that_cannot_be_made_is_told(tmp_path, monkeypatch, capsys):
     def refused(*_: object) -> None:
         raise OSError("no links here")
 
     monkeypatch.setattr("os.symlink", refused)
     run = results(tmp_path, "0" * 16, trials={"done": 1})
     point_to(run)
-    assert (run.parent / "latest").read_text() == f"{run.name}\n"
-    assert latest_run(run.parent) == run.name
-    point_to(results(tmp_path, "1" * 16, trials={"done": 1}))
-    assert latest_run(run.parent) == "1" * 16
+    assert f"the newest run is {run}" in capsys.readouterr().err and latest_run(run.parent) is None
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link"])

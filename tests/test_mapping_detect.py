@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.hole import Sight
 from detectors.interface import Detection
 from detectors.mapping.merge import merge
 from detectors.mapping.settings import FusedMerge, GridMerge
-from detectors.measure import HoleModelConfig, blur_in_cells
+from detectors.measure import HoleModelConfig, blur_in_cells, straight_sight
 from detectors.thesis import ThesisConfig, ThesisDetector
-from harness.vocabulary.capture import Cloud, MapViews
-from harness.vocabulary.geometry import Region, invert, transform_points
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud, MapViews, Region, invert, transform_points
 from tests.mapped_views import Hole, Plane, arc, reference, registered, seen
 
 DETECTOR = ThesisDetector(ThesisConfig.from_data({"crop": {"kind": "none"}, "min_points": 3}))
@@ -86,8 +83,8 @@ def test_blur_in_cells() -> None:
 
 
 def test_straight_sight_sees_no_parallax_on_a_facing_surface() -> None:
-    sight = Sight.straight(np.array([[1.4e-3, 0, 0], [0, 1.4e-3, 0]]))
-    np.testing.assert_allclose(sight.numbers, [[1.0, 0, 0, 0, 0, 0, 1.0, 1.0]], atol=1e-12)
+    sight = straight_sight(np.array([[1.4e-3, 0, 0], [0, 1.4e-3, 0]]))
+    np.testing.assert_allclose(sight, [1.0, 0, 0, 0, 0, 0, 1.0, 1.0], atol=1e-12)
 
 
 # ---------------------------------------------------------------- a hole seen from several places
@@ -112,8 +109,7 @@ def strongest(cloud: Cloud, detector: ThesisDetector) -> tuple[Detection, object
     return detection, detector.measure(cloud, evidence, detection)
 
 
-@pytest.mark.parametrize(("count", "half_deg"), [(1, 0.0), (3, 25.0), (7, 25.0)])
-@pytest.mark.parametrize("cell_mm", [None, 1.0])
+@pytest.mark.parametrize(("count", "half_deg", "cell_mm"), [(1, 0.0, None), (3, 25.0, 1.0), (5, 25.0, None)])
 def test_hole_on_a_map_has_its_size_and_place(count: int, half_deg: float, cell_mm: float | None) -> None:
     cloud, T_plane_cloud, _ = hole_map(count, half_deg, FusedMerge(cell_mm=cell_mm))
     detector = ThesisDetector(
@@ -131,7 +127,7 @@ def test_hole_on_a_map_has_its_size_and_place(count: int, half_deg: float, cell_
 
 def test_places_of_the_cameras_matter_to_the_size() -> None:
     """Without them the model takes the mean of shifted floors for a smaller and shallower hole."""
-    cloud, _, _ = hole_map(7, 25.0, FusedMerge())
+    cloud, _, _ = hole_map(5, 25.0, FusedMerge())
     detector = ThesisDetector(
         ThesisConfig.from_data({"crop": {"kind": "none"}, "min_points": 3, "hole_model": LIT_FROM_THE_LENS})
     )

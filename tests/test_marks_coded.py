@@ -44,10 +44,10 @@ def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = 
 def test_tags_are_read_and_placed_as_well_as_stated():
     rng = random_stream(1, "tags")
     errors, squares = [], []
-    for _ in range(8):
+    for _ in range(5):
         T = board_pose(*rng.uniform(-20, 20, 2), rng.uniform(-15, 15))
         T[:3, 3] += rng.uniform(-2e-3, 2e-3, 3)
-        cloud = marked_cloud(T, tags(PLACES), rng=rng, samples=4, lens=WIDE, sigma_m=2e-4)
+        cloud = marked_cloud(T, tags(PLACES), rng=rng, samples=3, lens=WIDE, sigma_m=2e-4)
         cloud = replace(cloud, rgb=cv2.GaussianBlur(cloud.rgb, (0, 0), rng.uniform(0.3, 1.0)))  # type: ignore[arg-type]
         for mark in find_marks(cloud, cloud.valid, CodedMarks()).trusted:
             assert mark.code is not None
@@ -58,7 +58,7 @@ def test_tags_are_read_and_placed_as_well_as_stated():
             squares.append(in_camera @ np.linalg.solve(mark.covariance_m2, in_camera) / 3)
             # a blurred corner is rounded off: its place is found up to half a pixel further in, on all four sides alike
             assert mark.area_m2 == pytest.approx(TAG_M**2, rel=0.06)
-    assert len(squares) >= 24
+    assert len(squares) >= 15
     # a tenth of a pixel is 0.14 mm
     assert np.sqrt(np.mean(np.square(errors))) < 0.2e-3
     assert 1 / 2.0**2 < np.mean(squares) < 1.5**2

@@ -1,4 +1,4 @@
-"""Links, components, normals and turns of the automatic crop against plain ones; the detectors' medians."""
+"""Links, components, normals and turns of the automatic crop against plain ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from detectors.masks import components
-from detectors.noise import median_of, median_size_of, quantile_of
 from detectors.smooth_surfaces import links, turns, unit_normals
 
 
@@ -105,12 +104,3 @@ def test_normals_and_their_turns_equal_plain_ones(half: int) -> None:
 
 def test_a_line_of_points_has_no_normal() -> None:
     assert not unit_normals(rough_points(0, h=1)).any()
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 60), part=st.sampled_from([0.0, 0.25, 0.5, 0.9, 1.0]))
-def test_medians_and_quantiles_are_numpys_bit_by_bit(seed: int, n: int, part: float) -> None:
-    values = np.random.default_rng(seed).standard_normal(n).round(2)
-    assert median_of(values) == np.median(values)
-    assert median_size_of(values) == np.median(np.abs(values))
-    assert quantile_of(values, part) == np.quantile(values, part)

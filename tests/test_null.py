@@ -11,13 +11,12 @@ from scipy import ndimage, stats
 from detectors import load_detector
 from detectors.interface import Evidence
 from detectors.null import FEWEST_PEAKS, Tail, each_object_once, own_threshold, skew_of
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Cloud, Region
 
 PITCH_M, DISTANCE_M, SIGMA_M = 2e-3, 0.7, 1e-3
 DETECTOR = load_detector("thesis", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
 ALPHA = 1e-3
-BOARDS = 16
+BOARDS = 8
 Noise = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 NOISES: dict[str, Noise] = {
     "normal": lambda random, shape: random.normal(size=shape),
@@ -62,7 +61,7 @@ def test_as_many_false_calls_as_expected(kind: str) -> None:
 
 def test_the_interval_holds_the_truth() -> None:
     """Peaks whose tail is known: exponential in the square of the score."""
-    held, expected, captures = 0, [], 300
+    held, expected, captures = 0, [], 150
     for seed in range(captures):
         random = np.random.default_rng([5, seed])
         peaks = np.sqrt(9.0 + 2.0 * random.exponential(size=random.poisson(50)))

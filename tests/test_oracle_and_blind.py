@@ -11,10 +11,10 @@ from scipy import stats
 from detectors import load_detector
 from detectors.controls import BlindDetector, Oracle, OracleConfig, judged_area_m2
 from detectors.interface import ToldTheTruth, TrueDamage
-from harness.testing import CHECKS, checks, motion
-from harness.testing.clouds import DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
-from harness.vocabulary.capture import Cloud
+from harness import testing as checks
+from harness.testing import CHECKS, DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Cloud
 
 ALPHA = 0.001
 """Of every statistical test here, with fixed seeds."""
@@ -86,7 +86,7 @@ def test_the_oracle_keeps_the_contract_of_its_own_cloud() -> None:
     """Told of one cloud, it finds the same damage in any other."""
     cloud = plane(seed=1)
     for check in CHECKS:
-        if check not in (motion.turns_with_the_cloud, motion.moves_with_the_cloud, checks.survives_missing_pixels):
+        if check not in (checks.turns_with_the_cloud, checks.moves_with_the_cloud, checks.survives_missing_pixels):
             check(lambda: oracle(*TRUTH), cloud)
 
 
@@ -107,10 +107,10 @@ def blind(**settings: object) -> BlindDetector:
 def test_the_blind_detector_keeps_the_contract_but_does_not_move_with_the_cloud() -> None:
     cloud = with_gaps(plane(seed=1), seed=2)
     for check in CHECKS:
-        if check not in (motion.turns_with_the_cloud, motion.moves_with_the_cloud):
+        if check not in (checks.turns_with_the_cloud, checks.moves_with_the_cloud):
             check(blind, cloud)
     with pytest.raises(AssertionError, match="moved by 37 mm"):
-        motion.moves_with_the_cloud(blind, cloud)
+        checks.moves_with_the_cloud(blind, cloud)
 
 
 def test_guesses_are_those_of_the_seed_and_the_cloud() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from harness.experiment.load import load_experiment
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.geometry import invert, transform_points
 from scenes.perspectives import (
     ArcViews,

@@ -18,7 +18,7 @@ from scenes.sensor import camera as cameras
 from scenes.sensor.camera import CAMERA_FOLDER, camera_file, camera_names, load_camera
 from tests.plug_in_packages import offer
 
-OWN_DETECTORS = ("blind", "local", "oracle", "thesis")
+OWN_DETECTORS = ("blind", "local", "matched", "oracle", "thesis")
 
 
 MINE = f"{__name__}:Mine"
@@ -63,7 +63,7 @@ def listed(capsys: pytest.CaptureFixture[str], kind: str) -> dict[str, list[dict
 def test_a_plug_in_is_found_without_importing_it_and_gone_when_uninstalled(monkeypatch, tmp_path):
     with monkeypatch.context() as patched:
         offer(patched, tmp_path, "acme", detectors.GROUP, {"mine": MINE, "off": "nope:X"})
-        assert detector_names() == ("blind", "local", "mine", "off", "oracle", "thesis")
+        assert detector_names() == ("blind", "local", "matched", "mine", "off", "oracle", "thesis")
         assert isinstance(load_detector("mine", {}), Mine)
     assert detector_names() == OWN_DETECTORS
 
@@ -144,7 +144,7 @@ def test_the_nearest_name_is_told_and_it_may_be_a_plug_in(monkeypatch, tmp_path)
     offer(monkeypatch, tmp_path, "acme", detectors.GROUP, {"wavelet": "acme:D"})
     error = mistake(detector_type, "wavlet")
     assert error.message == "there is no detector 'wavlet'; did you mean 'wavelet'?"
-    assert error.legal == "blind, local, oracle, thesis, wavelet" and "tofpod.detectors" in (error.fix or "")
+    assert error.legal == "blind, local, matched, oracle, thesis, wavelet" and "tofpod.detectors" in (error.fix or "")
 
 
 def test_a_part_of_a_name_finds_it():
@@ -186,7 +186,7 @@ def test_a_number_that_a_packages_camera_has_not_is_told_with_its_file(acme_came
 @pytest.mark.parametrize(
     ("name", "target", "why"),
     [
-        ("other", "acme_cameras:TEXT", "must be called other.yaml, not acme_tof.yaml"),
+        ("other", "acme_cameras:TEXT", "needs a file called other.yaml"),
         ("acme", "acme_cameras:NUMBER", "the path of a YAML file is wanted, not int"),
         ("nope", "acme_cameras:NOPE", "AttributeError"),
     ],
@@ -199,7 +199,7 @@ def test_a_packages_camera_that_is_no_file_is_told_with_its_package(acme_camera,
 
 def test_a_packages_camera_whose_file_is_gone_is_told(acme_camera):
     acme_camera.unlink()
-    assert "there is no file" in str(mistake(load_camera, "acme_tof"))
+    assert "there is no such file" in str(mistake(load_camera, "acme_tof"))
 
 
 # ---------------------------------------------------------------- what is listed

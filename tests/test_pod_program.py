@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.evaluation.pod.inspection_file import read_inspections
-from harness.evaluation.pod.statement import drawn_sizes, state_hits, state_signals
+from harness.evaluation.pod.statement import drawn_sizes, read_inspections, state_hits, state_signals
 from harness.pod import FILES, main
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.provenance import RESULTS_VERSION
 
 SIZES = np.linspace(0.5, 12.0, 60)
 

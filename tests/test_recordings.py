@@ -20,9 +20,8 @@ from detectors.recordings import Recording, open_capture
 from detectors.recordings.distances import frame_of, metres_per_unit, rounding_step_m
 from detectors.recordings.intrinsics import read_lens
 from harness import detect
-from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Frame, Lens, Reason
 
 STORED = plane.depth_mm()
 TRUE_M = plane.points_m(STORED)
@@ -195,7 +194,7 @@ def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None
     for number, path in enumerate(pictures):
         path.rename(path.with_stem(str(100 + number)))
     recording = open_capture([folder])
-    told = f"none of {len(pictures)} colour pictures has the number of a depth picture"
+    told = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
     assert any(told in note for note in recording.notes) and recording.first_frame().rgb is None
 
 

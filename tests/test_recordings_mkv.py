@@ -10,11 +10,10 @@ import pytest
 import recorded_plane as plane
 
 from detectors.recordings import open_capture
-from detectors.recordings.azure_calibration import ColourCamera, colour_camera, depth_lens, parse_calibration
-from detectors.recordings.azure_mkv import colour_on_depth
-from harness.vocabulary.capture import Reason
+from detectors.recordings.devices import colour_on_depth
+from detectors.recordings.intrinsics import ColourCamera, colour_camera, depth_lens, parse_calibration
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens, Reason
 
 CAMERAS = parse_calibration("test", plane.calibration())
 DEPTH = np.full((576, 640), 1000, np.uint16)

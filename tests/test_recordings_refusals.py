@@ -107,7 +107,7 @@ def test_sizes_that_differ_name_both_pictures(tmp_path: Path) -> None:
     png(tmp_path / "1.png")
     png(tmp_path / "2.png", STORED[:-2])
     message = refusal(tmp_path, lens=plane.LENS)
-    assert "2.png: 96 x 70" in message and "1.png has 96 x 72" in message
+    assert "2.png: 96 x 70" in message and "first frame has 96 x 72" in message
 
 
 def test_clouds_of_different_sizes_are_named(tmp_path: Path) -> None:
@@ -301,7 +301,7 @@ def test_a_faulty_capture_of_a_phone_is_explained(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "liblzfse", None)
     assert "pip install pyliblzfse" in refusal(tmp_path / "c.r3d")
     monkeypatch.setitem(sys.modules, "liblzfse", object())
-    assert "is damaged: -1 bytes" in refusal(tmp_path / "c.r3d")
+    assert "is damaged" in refusal(tmp_path / "c.r3d")
 
 
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"

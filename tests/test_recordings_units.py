@@ -14,9 +14,8 @@ import pytest
 from detectors.noise import noise_reach_px
 from detectors.recordings import Recording, open_capture
 from detectors.recordings.distances import decided_unit, no_return_codes
-from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Frame, Lens, Reason
 from scenes.sensor.camera import lens_named, lens_names
 from tests import recorded_plane as plane
 

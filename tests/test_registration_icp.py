@@ -8,12 +8,11 @@ from board_views import board_view, pose, target_error_m, usual_error, views
 from scipy.spatial.transform import Rotation
 
 from detectors.marks.mark import MarkSet
-from detectors.registration.icp import register_by_icp, stages_m
+from detectors.registration.by_points import register_by_icp, stages_m
 from detectors.registration.registered import Registration, predicted_error_m
 from detectors.registration.settings import IcpRegistration
 from detectors.views import PreparedView, View
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import Region, transform_points
+from harness.vocabulary.geometry import Cloud, Region, transform_points
 
 POSES = [pose(3, 4), pose(-6, 15, 2, (0.01, 0.0, 0.01))]
 PITCH_M = 0.5 / 300
@@ -54,6 +53,7 @@ def test_a_shaped_target_is_found_from_a_usual_guess(estimation, within_m):
     assert not found.failure and found.converged and found.pairs > 2400
 
 
+@pytest.mark.slow
 def test_the_covariance_of_point_to_plane_is_that_of_repeats():
     """10 repeats: the mean of d'C^-1 d is 6 for a true covariance, known to 6 sqrt(2/60) = 1.1; a factor of two holds
     it by three of those on both sides."""
@@ -102,7 +102,9 @@ def test_too_few_fiducial_points_are_a_failure_in_words():
     reference = board_view(POSES[0], np.eye(4)).prepared
     bare = board_view(POSES[1], np.eye(4), tapes_m=()).prepared
     found = register_by_icp(reference, bare, IcpRegistration())
-    assert found.failure == "too few points of the fiducial colour: 0 in the view, 3 needed"
+    assert found.failure == (
+        "too few points of the fiducial colour: 730 in the reference and 0 in the view, 3 needed in each"
+    )
     assert np.isnan(found.covariance).all()
 
 

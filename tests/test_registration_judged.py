@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from board_views import TAPES_M, board_view, pose, target_error_m, usual_error, views
 
-from detectors.registration.judged import still_moving
-from detectors.registration.register import loop_errors, register
-from detectors.registration.registered import Registration, displacement_jacobian, predicted_error_m
-from detectors.registration.sampling import sampling_of
+from detectors.registration.register import judge, loop_errors, register
+from detectors.registration.registered import (
+    Registration,
+    displacement_jacobian,
+    predicted_error_m,
+    sampling_of,
+    still_moving,
+)
 from detectors.registration.settings import (
     AnyRegistration,
     CpdRegistration,
@@ -23,7 +28,7 @@ from detectors.registration.settings import (
 )
 from detectors.views import PreparedView, View
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens
 
 POSES = [pose(3, 4), pose(-6, 15, 2, (0.01, 0.0, 0.01)), pose(8, -12, -1, (-0.01, 0.01, 0.0))]
 NOISE_M = 3e-4
@@ -101,12 +106,13 @@ def test_a_target_of_another_shape_lies_apart():
     assert "apart" in found.failure and "different targets" in found.failure
 
 
-FINE = Lens(660, 480, 900.0, 900.0, 329.5, 239.5)
-"""Pixels of 0.56 mm on the board: finer than what a real camera's views disagree by."""
+FINE = Lens(440, 320, 600.0, 600.0, 219.5, 159.5)
+"""Pixels of 0.83 mm on the board: finer than what a real camera's views disagree by."""
 
 
+@cache
 def fine_pair(bend_mm: float, seed: int = 0):
-    """Two views through fine pixels; the second errs as a whole by a bend."""
+    """Make two views through fine pixels; the second errs as a whole by a bend."""
     smooth = np.zeros((4, 4))
     smooth[2, 0], smooth[0, 2] = 1e-3 * bend_mm, -0.7e-3 * bend_mm
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M, lens=FINE, seed=2 * seed)
@@ -132,9 +138,10 @@ def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(con
 
 def test_views_whose_errors_would_blur_the_map_are_refused():
     found = register(prepared(fine_pair(9.0)), MarksRegistration())[1]
-    assert "would blur the map (up to 2.0 mm are merged)" in found.failure
+    assert "which would blur the map (up to" in found.failure
 
 
+@pytest.mark.slow
 def test_the_widened_covariance_holds_the_true_errors():
     """Random bends: true errors across over predicted ones, of 12 pairs, as chi square with 12 degrees."""
     random = np.random.default_rng(5)
@@ -158,9 +165,7 @@ def test_a_wrong_guess_turns_the_board_about():
     turned = register([reference.prepared, replace_guess(other.prepared, half_turn)], CpdRegistration())[1]
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is believed
     assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
-    from detectors.registration.judged import ReferenceTarget, judge
-
-    judged = judge(turned, ReferenceTarget(reference.prepared), other.prepared)
+    judged = judge(turned, reference.prepared, other.prepared)
     assert judged.failure.startswith("stands 180 degrees and ")
 
 
@@ -169,25 +174,21 @@ def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:
 
 
 def test_points_on_a_line_leave_a_turn_open():
-    from detectors.registration.judged import ReferenceTarget, judge
-
     made = views(POSES[:2], noise_m=NOISE_M)
     found = register(prepared(made), MarksRegistration())[1]
     open_turn = np.diag([0.2**2, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
-    judged = judge(replace(found, covariance=open_turn), ReferenceTarget(made[0].prepared), made[1].prepared)
+    judged = judge(replace(found, covariance=open_turn), made[0].prepared, made[1].prepared)
     assert "lie on a line" in judged.failure and "which would blur" in judged.failure
     slides = np.diag([1e-8, 1e-8, 1e-8, 0.01**2, 1e-8, 1e-8])
-    judged = judge(replace(found, covariance=slides), ReferenceTarget(made[0].prepared), made[1].prepared)
-    assert "slide along the surface" in judged.failure
+    judged = judge(replace(found, covariance=slides), made[0].prepared, made[1].prepared)
+    assert "not determined: the points let the target slide" in judged.failure
 
 
 @pytest.mark.parametrize("broken", [np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)])
 def test_a_mirror_image_or_nothing_is_no_registration(broken):
-    from detectors.registration.judged import ReferenceTarget, judge
-
     made = views(POSES[:2])
     found = register(prepared(made), MarksRegistration())[1]
-    judged = judge(replace(found, T_reference_view=broken), ReferenceTarget(made[0].prepared), made[1].prepared)
+    judged = judge(replace(found, T_reference_view=broken), made[0].prepared, made[1].prepared)
     assert judged.failure in ("mirrored: the transform is a reflection, not a rotation", "no transform was found")
 
 
@@ -232,15 +233,14 @@ def test_odometry_needs_a_lens_and_nominal_a_guess():
 # ------------------------------------------------------------ loops
 
 
-@pytest.mark.parametrize("config", [MarksRegistration(), CpdRegistration()], ids=lambda config: config.method)
-def test_loops_close_to_what_a_registration_is_wrong_by(config):
-    made = views([*POSES, pose(-2, -5, 4)], guess_error=usual_error(), noise_m=NOISE_M)
-    loops = loop_errors(prepared(made), config)
+def test_loops_close_to_what_a_registration_is_wrong_by():
+    made = prepared(views([*POSES, pose(-2, -5, 4)], guess_error=usual_error(), noise_m=NOISE_M))
+    loops = loop_errors(made, MarksRegistration())
     assert [loop.views for loop in loops[:2]] == [("view 0", "view 1", "view 2"), ("view 0", "view 1", "view 3")]
     assert len(loops) == 4 and not any(loop.failure for loop in loops)
     assert max(loop.translation_m for loop in loops) < PITCH_M
-    assert len(loop_errors(prepared(made), config, most=2)) == 2
-    assert loop_errors(prepared(made)[:2], config) == ()
+    assert len(loop_errors(made, MarksRegistration(), most=2)) == 2
+    assert loop_errors(made[:2], MarksRegistration()) == ()
 
 
 def test_a_loop_says_which_step_failed():

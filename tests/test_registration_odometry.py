@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from board_views import LENS, pose, target_error_m, views
 
-from detectors.registration.odometry import register_by_odometry
+from detectors.registration.by_points import register_by_odometry
 from detectors.registration.register import register
 from detectors.registration.settings import OdometryRegistration
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens
 
 PITCH_M = 0.5 / 300
 WALK = [pose(2 * np.sin(t), 3 * t, 1.5 * t, (0.004 * t, 0.003 * np.sin(2 * t), 0.004 * t)) for t in np.arange(5.0)]

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from scenes.render.cache import stored_view
-from scenes.render.variant import _has_nvidia_driver
+from scenes.render.scene import _has_nvidia_driver
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = """
 import sys
 from pathlib import Path
-from scenes.render.variant import _point_to_llvm
+from scenes.render.scene import _point_to_llvm
 _point_to_llvm()
 import mitsuba
 mitsuba.set_variant(sys.argv[1])

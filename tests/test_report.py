@@ -16,9 +16,9 @@ import pytest
 from synthetic_tables import Tables, World, example, joined, provenance, tables
 
 from harness.evaluation.summary import summarise_holes
-from harness.report.clouds import cloud_figure
+from harness.report.clouds import residual_figure
 from harness.report.page import answer_sentence, report_html, write_report
-from harness.report.terminal import holes_grid
+from harness.report.sections import holes_grid
 from harness.tables.text import inches
 from harness.thesis.claims import score_claims
 from harness.vocabulary.errors import UserError
@@ -80,11 +80,8 @@ def outline(page: str) -> Outline:
 def test_sections_come_in_order(outline: Outline) -> None:
     assert outline.headings == [
         "Holes against frames",
-        "Sizes",
-        "Positions",
-        "Averaged cloud",
+        "Sizes and positions",
         "Range residual",
-        "Depth through holes",
         "Noise against frames",
         "The thesis' claims",
         "If facts were otherwise",
@@ -113,7 +110,7 @@ def test_ids_are_unique_and_references_resolve(page: str, outline: Outline) -> N
 
 def test_every_figure_is_well_formed_and_has_words_for_those_who_cannot_see(page: str, outline: Outline) -> None:
     figures = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-    assert len(figures) == outline.labels == 6
+    assert len(figures) == outline.labels == 3
     for figure in figures:
         ET.fromstring(figure)
 
@@ -160,8 +157,7 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
 def test_little_data_still_make_a_page() -> None:
     few = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
     page = report_html(few, [], {}, "", "Averaging", True)
-    assert "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of the 7 claims" in page
-    assert "7 are undecided" in page
+    assert "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of 7 claims, 7 are undecided" in page
     assert "The one repeat is" in page
     assert "No data for this figure were kept." in page
     assert "not recorded" in page
@@ -173,13 +169,12 @@ def test_an_all_invalid_cloud_is_drawn() -> None:
     cloud = example(50)
     blank = dataclasses.replace(
         cloud,
-        points_m=np.full_like(cloud.points_m, np.nan),
         residual_mm=np.full_like(cloud.residual_mm, np.nan),
         detected=np.zeros_like(cloud.detected),
     )
     page = report_html(tables(frames=(50,)), [blank], provenance(), YAML, "Averaging")
-    assert "50 frames averaged" in page
-    ET.fromstring(cloud_figure([blank]))
+    assert "0 of 11 holes marked" in page
+    ET.fromstring(residual_figure([blank]))
 
 
 def test_the_file_is_written_whole_or_refused(tmp_path: Path) -> None:
@@ -198,19 +193,19 @@ def test_answer_tells_what_is_undecided() -> None:
     main = summarise_holes(results.holes)
     sentence = answer_sentence(main, score_claims(results, summary=main))
     assert "6 of 11 holes (6–11; the smallest is 9.52 mm, 3/8 in), with 5 undecided" in sentence
-    assert sentence.endswith("1 is not borne out (C1) and 2 are undecided (C2, C6).")
+    assert sentence.endswith("1 is not borne out (C1), 2 are undecided (C2, C6).")
 
 
 def test_terminal_table_and_its_plain_twin_say_the_same() -> None:
     from rich.console import Console
 
     summary = summarise_holes(tables().holes)
-    plain = holes_grid(summary).lines()
+    plain = holes_grid(summary, terminal=True).lines()
     assert plain[0].split()[:9] == ["hole", "drill", "mm", "N=1", "N=2", "N=5", "N=10", "N=20", "N=50"]
     assert plain[4].split()[:9] == ["4", '1/4"', "6.35", "0/50", "0/50", "0/50", "50/50", "50/50", "50/50"]
     assert len(plain) == 12
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(holes_grid(summary).rich())
+    console.print(holes_grid(summary, terminal=True).rich())
     drawn = [line.split() for line in console.export_text().splitlines() if line.strip()]
     assert [line for line in drawn if line and line[0].isdecimal()] == [line.split() for line in plain[1:]]
 
@@ -222,5 +217,5 @@ def test_inches() -> None:
 
 
 def test_importing_the_report_does_not_import_matplotlib() -> None:
-    code = "import sys, harness.report.page, harness.report.terminal; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, harness.report.page, harness.report.sections; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.evaluation.intervals import UNKNOWN, Interval
-from harness.tables.grid import Cell, Grid, show, text_of
 from harness.tables.outputs import outputs
 from harness.tables.readme import results_readme
 from harness.tables.schema import Column, Estimate, Table, write_table
 from harness.tables.study import STUDY_TABLES
+from harness.tables.text import Cell, Grid, show, text_of
 from harness.tables.trials import STORED, SUMMARISED
 from harness.vocabulary.errors import UserError
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from detectors.clusters import cluster_centres, euclidean_clusters
-from detectors.measure import extents
+from detectors.clusters import euclidean_clusters
 from harness.vocabulary.errors import UserError
 
 
@@ -75,46 +74,3 @@ def test_a_dense_sheet_of_100_000_points_is_one_cluster() -> None:
 def test_a_wrong_unit_is_a_clear_mistake() -> None:
     with pytest.raises(UserError, match="cannot be clustered"):
         euclidean_clusters(np.array([[0.0, 0, 0], [1e5, 0, 0]]), 0.01)
-
-
-def one_threshold_after_another(
-    points: np.ndarray, scores: np.ndarray, thresholds: list[float], distance: float, min_points: int
-) -> list[np.ndarray]:
-    """The same centres, written plainly: clusters of the points above each threshold."""
-    each = []
-    for threshold in thresholds:
-        there = np.flatnonzero(scores > threshold)
-        labels = euclidean_clusters(points[there], distance, min_points)
-        clusters = [there[labels == label] for label in range(labels.max(initial=-1) + 1)]
-        clusters.sort(key=lambda cluster: (-scores[cluster].max(), cluster[0]))
-        each.append(np.array([extents(points[cluster])[1] for cluster in clusters]).reshape(-1, 3))
-    return each
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    seed=st.integers(0, 10_000),
-    n=st.integers(0, 200),
-    spread=st.sampled_from([0.02, 0.1, 0.4]),
-    min_points=st.sampled_from([1, 2, 5]),
-    ties=st.booleans(),
-)
-def test_centres_at_many_thresholds_are_those_of_each(
-    seed: int, n: int, spread: float, min_points: int, ties: bool
-) -> None:
-    random = np.random.default_rng(seed)
-    points, scores = random.uniform(-spread, spread, (n, 3)), random.exponential(2.0, n)
-    if ties:
-        points, scores = points.round(2), scores.round(0)
-    thresholds = [0.5, 4.0, 1.0, 2.0, 2.0, 0.0, 100.0]
-    found = cluster_centres(points, scores, np.array(thresholds), 0.0137, min_points)
-    expected = one_threshold_after_another(points, scores, thresholds, 0.0137, min_points)
-    for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-
-
-def test_points_without_a_place_or_a_score_take_no_part() -> None:
-    points = np.array([[0.0, 0, 0], [np.nan, 0, 0], [1, 0, 0], [2, 0, 0]])
-    (found,) = cluster_centres(points, np.array([3.0, 3.0, np.nan, 1.0]), np.array([2.0]), 0.01)
-    np.testing.assert_array_equal(found, [[0.0, 0, 0]])
-    assert cluster_centres(points, np.ones(4), np.array([]), 0.01) == ()

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
+from scenes.sensor.amcw.facts import unwrap_table
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.amcw.unwrap import unwrap_table
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m, with_number
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
 from scenes.sensor.normals import normals_from_bits
@@ -156,8 +154,8 @@ def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, b
     offset = np.arange(-half, half + 1)
     space = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma_px**2))
     filtered, edge = np.empty((3, h, w), f4), np.empty((h, w), f4)
-    settings = kernels.FilterSettings(f4(3.6067), f4(24), drop_dim, by_amplitude)
-    kernels.filter_image(unit, amplitude, space.astype(f4), settings, filtered, edge)
+    settings = kernels.FilterSettings(space.astype(f4), f4(3.6067), f4(24), drop_dim, by_amplitude)
+    kernels.filter_image(unit, amplitude, settings, filtered, edge)
     phasor = unit[0] + 1j * unit[1]
     for y in range(h):
         for x in range(w):
@@ -194,7 +192,7 @@ def unwrapped(table, half_path):
     """Half the path (n,) that the kernel finds from exact wrapped phases, and its squared residual."""
     turn = np.ascontiguousarray(((half_path[:, None] / table.unambiguous_m * table.lattice) % 1).T, f4)
     half, residual2 = np.empty(half_path.size, f4), np.empty(half_path.size, f4)
-    ranging.half_path(turn, half_path.size, table.for_kernel, half, residual2)
+    ranging.half_path(turn, half_path.size, table, half, residual2)
     return half, residual2
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from harness.experiment.load import load_experiment
-from harness.experiment.points import MAIN, Experiment
-from harness.vocabulary.declaration.problems import DeclarationError
+from harness.experiment.schema import MAIN, Experiment
+from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.path_names import names_of, unit_of, value_text
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.vocabulary import sources
-from harness.vocabulary.sources import reached_sources, source_digest
+from harness.vocabulary import provenance
+from harness.vocabulary.provenance import reached_sources, source_digest
 
 FILES = {
     "harness/__init__.py": "",
@@ -30,7 +30,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
     return tmp_path
 
 
@@ -74,7 +74,7 @@ def test_every_source_of_a_plug_ins_package_counts(tmp_path: Path, monkeypatch: 
 def test_a_trial_reaches_what_it_runs_and_not_what_evaluates_or_draws() -> None:
     from harness.engine.plan import trial_code
 
-    names = {path.relative_to(sources.ROOT).as_posix() for path in reached_sources(trial_code("thesis"))}
+    names = {path.relative_to(provenance.ROOT).as_posix() for path in reached_sources(trial_code("thesis"))}
     assert {"detectors/thesis.py", "detectors/average.py", "scenes/sensor/amcw/imager.py"} <= names
-    assert {"harness/engine/trial.py", "harness/evaluation/match.py", "detectors/registration/icp.py"} <= names
+    assert {"harness/engine/trial.py", "harness/evaluation/match.py", "detectors/registration/by_points.py"} <= names
     assert not [name for name in names if name.startswith(("harness/report/", "harness/evaluation/pod/"))]

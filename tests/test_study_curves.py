@@ -11,13 +11,11 @@ import pytest
 from scipy import special, stats
 from synthetic_study import RADIUS_MM, THRESHOLD, SetUp, Study, Tables, study_record, study_tables
 
-from harness.evaluation.pod.false_calls import false_call_rate
-from harness.evaluation.study.axes import FRAMES, axis_lines, difference
-from harness.evaluation.study.chance import chance_hits
-from harness.evaluation.study.curves import free_response, pixel_curves, roc_curves
-from harness.evaluation.study.limit import SetUpLimit, limit_of, pod_at
+from harness.evaluation.intervals import false_call_rate
+from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curves
+from harness.evaluation.study.limit import SetUpLimit, limit_of, pod_at, surface_of
 from harness.evaluation.study.record import SetUpRecord
-from harness.evaluation.study.surface import surface_of
+from harness.evaluation.study.result import FRAMES, axis_lines, difference
 
 LOUD = 20.0
 """False calls per square metre of a study in which chance hits are frequent enough to be counted."""
@@ -53,7 +51,7 @@ class TestChance:
         tables = two_boards([("damaged", 1, 0.0, 0.0, "b")])
         rate = false_call_rate(0, 100.0)
         found = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0, rate)
-        assert found.probability == 0 and not found.sites_over_boards.known
+        assert found.probability == 0
         # none seen is no certainty: Poisson's upper bound of 0 calls, 2.9957 / 100 m2, on a circle of 5 mm
         assert found.interval.high == pytest.approx(2.9957 / 100 * np.pi * 0.005**2, rel=1e-4)
 
@@ -116,7 +114,7 @@ class TestRoc:
 
 class TestFreeResponse:
     def test_the_threshold_in_use_lies_on_the_curve(self, loud):
-        curve = free_response(loud.operating, loud.runs, loud.holes, 6.0)
+        curve = free_response(loud.operating, loud.runs, loud.holes)
         here = np.flatnonzero(curve.threshold == THRESHOLD)[0]
         assert curve.at == (curve.false_calls_per_m2[here], curve.found[here])
         assert curve.at[1] == loud.holes["detected"].mean()
@@ -125,12 +123,12 @@ class TestFreeResponse:
 
     def test_the_rate_is_that_of_hole_free_boards_alone(self, loud):
         """So it is the table's, though damaged boards have false calls of their own."""
-        curve = free_response(loud.operating, loud.runs, loud.holes, 6.0)
+        curve = free_response(loud.operating, loud.runs, loud.holes)
         runs = loud.runs[loud.runs["role"] == "hole_free"]
         assert curve.at[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
         more = loud.operating.copy()
         more.loc[more["role"] == "damaged", "findings"] += 7
-        again = free_response(more, loud.runs, loud.holes, 6.0)
+        again = free_response(more, loud.runs, loud.holes)
         assert np.array_equal(again.false_calls_per_m2, curve.false_calls_per_m2)
 
     def test_what_folds_back_is_left_out(self):
@@ -142,23 +140,22 @@ class TestFreeResponse:
         )
         runs = pd.DataFrame({"role": ["hole_free", "damaged"], "inspected_m2": 0.5, "false_calls": [2, 8]})
         holes = pd.DataFrame({"board": 0, "true_diameter_mm": 5.0, "signal": [7.0, 2.5], "detected": [True, False]})
-        curve = free_response(pd.concat([free, hits]), runs, holes, 6.0, draws=10)
+        curve = free_response(pd.concat([free, hits]), runs, holes, draws=10)
         assert curve.threshold.tolist() == [6.0, 5.0, 3.0, 2.0]
         assert curve.false_calls_per_m2.tolist() == [0.0, 4.0, 4.0, 6.0]
         assert curve.found.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.at == (4.0, 0.5)
 
     def test_none_without_hole_free_boards(self, loud):
         runs = loud.runs[loud.runs["role"] == "damaged"]
-        assert free_response(loud.operating, runs, loud.holes, 6.0) is None
+        assert free_response(loud.operating, runs, loud.holes) is None
 
     def test_false_calls_fall_as_their_scores_do(self, loud):
         """Scores are exponential, so the logarithm of the rate falls by 1 in a unit of threshold."""
-        curve = free_response(loud.operating, loud.runs, loud.holes, 6.0)
+        curve = free_response(loud.operating, loud.runs, loud.holes)
         expected = LOUD * np.exp(THRESHOLD - curve.threshold)
         scatter = np.sqrt(expected / curve.area_m2)
         assert np.all(np.abs(curve.false_calls_per_m2 - expected) < 4 * scatter)
         assert np.all(np.diff(curve.found) >= 0) and np.all(np.diff(curve.threshold) < 0)
-        assert np.all(curve.large_found >= curve.found - 1e-12)
 
 
 class TestPixels:
@@ -198,14 +195,15 @@ class TestSurface:
     def study(self, **changes: float) -> Study:
         return Study((SetUp(**changes),), depths_mm=(2.0, 10.0), hole_free_boards=0)
 
+    @pytest.mark.slow
     def test_a_known_plane_is_found(self):
-        """Hits drawn 30 times from logit = -18 + 9 ln a + 3 ln d on 30 boards: percentiles of so few boards hold the
-        truth in some 87 % of studies, so fewer than 24 of 30 in 9 % of such tests."""
+        """Hits drawn 15 times from logit = -18 + 9 ln a + 3 ln d on 30 boards: percentiles of so few boards hold the
+        truth in some 87 % of studies, so fewer than 11 of 15 in 4 % of such tests."""
         record = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[0]
         seen, true = record.inspected, np.array([-18.0, 9.0, 3.0])
         predictor = true[0] + true[1] * np.log(seen.diameter_mm) + true[2] * np.log(seen.depth_mm)
         slopes, sizes = [], []
-        for seed in range(30):
+        for seed in range(15):
             hit = np.random.default_rng(seed).random(len(predictor)) < special.expit(predictor)
             again = dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
             surface, why = surface_of(again, draws=100)
@@ -215,7 +213,7 @@ class TestSurface:
             slopes.append(surface.depth_slope_interval.low < 1 / 3 < surface.depth_slope_interval.high)
             sizes.append(surface.a90_low_mm[middle] < a90 < surface.a90_high_mm[middle])
             assert surface.pod(surface.a90_mm, surface.depth_mm) == pytest.approx(0.9, abs=1e-9)
-        assert sum(slopes) >= 24 and sum(sizes) >= 24
+        assert sum(slopes) >= 11 and sum(sizes) >= 11
 
     def test_agrees_with_statsmodels(self):
         sm = pytest.importorskip("statsmodels.api")
@@ -223,8 +221,7 @@ class TestSurface:
         surface, _ = surface_of(record)
         columns = [np.ones(len(seen.hit)), np.log(seen.diameter_mm), np.log(seen.depth_mm)]
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[surface.link]
-        design = np.column_stack(columns if len(surface.b) == 3 else [*columns, columns[1] * columns[2]])
-        fit = sm.GLM(seen.hit.astype(float), design, family=sm.families.Binomial(link)).fit()
+        fit = sm.GLM(seen.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)).fit()
         assert surface.b == pytest.approx(fit.params, rel=1e-5)
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
 
@@ -240,26 +237,10 @@ class TestSurface:
         hit = np.random.default_rng(5).random(len(chance)) < chance
         return dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
 
-    def test_an_interaction_that_grows_with_both_is_kept(self):
-        surface, why = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d))
-        assert why == "" and surface.note == "" and len(surface.b) == 4 and surface.interaction_p < 0.05
-
-    @pytest.mark.parametrize(
-        ("slopes", "falling"),
-        [((-4.0, 1.0, 4.0), "diameter"), ((1.0, -4.0, 3.0), "depth"), ((-4.0, -5.0, 5.0), "diameter and depth")],
-    )
-    def test_one_that_falls_inside_what_was_inspected_is_left_out(self, slopes, falling):
-        """At the least depth, ln 2, the slope along ln a is -4 + 4 * 0.69; so in the first case POD falls there."""
-        along, across, product = slopes
-        record = self.drawn(lambda a, d: -4.0 + along * a + across * d + product * a * d)
-        surface, why = surface_of(record, draws=50)
+    def test_an_interaction_is_told_and_left_out(self):
+        surface, why = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d), draws=50)
         assert why == "" and len(surface.b) == 3 and surface.interaction_p < 0.05
-        assert (
-            surface.note
-            == f"with an interaction POD would fall with {falling} inside what was inspected: fitted without"
-        )
-        pod = surface.pod(*np.meshgrid(np.geomspace(1, 14, 30), np.geomspace(2, 10, 30)))
-        assert np.all(np.diff(pod, axis=1) >= 0)
+        assert "diameter and depth interact" in surface.note
 
     def test_a_chance_that_falls_with_diameter_has_none(self):
         surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))
@@ -267,7 +248,7 @@ class TestSurface:
 
     def test_a_chance_that_falls_with_depth_is_said(self):
         surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)
-        assert surface.note == "POD falls with depth" and surface.depth_slope < 0
+        assert surface.note.startswith("POD falls with depth") and surface.depth_slope < 0
 
     def test_refused_where_depth_does_not_vary(self):
         surface, why = surface_of(study_record(Study(hole_free_boards=0)).set_ups[0])
@@ -330,10 +311,10 @@ class TestAxes:
 
     def test_what_differs_is_told_from_what_does_not(self, limits):
         distance, camera, _ = axis_lines(limits)
-        assert distance.whole.paired and distance.whole.beyond_chance and distance.whole.interval.low > 1
-        assert not camera.whole.beyond_chance and camera.whole.interval.low < 1 < camera.whole.interval.high
-        assert distance.whole.ratio == limits[0].a90_mm / limits[2].a90_mm
-        assert len(distance.steps) == 1 and distance.steps[0].interval == distance.whole.interval
+        assert distance.steps[0].paired and distance.steps[0].beyond_chance and distance.steps[0].interval.low > 1
+        assert not camera.steps[0].beyond_chance and camera.steps[0].interval.low < 1 < camera.steps[0].interval.high
+        assert distance.steps[0].ratio == limits[0].a90_mm / limits[2].a90_mm
+        assert len(distance.steps) == 1
 
     def test_pairing_cancels_what_boards_do_to_both(self):
         study = Study(

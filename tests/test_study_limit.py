@@ -12,12 +12,12 @@ from synthetic_study import SetUp, Study, study_record
 
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.curve import LINKS, PodCurve
-from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss
-from harness.evaluation.pod.likelihood_bounds import bound
-from harness.evaluation.study.limit import ALL_FOUND, limit_of
-from harness.evaluation.study.over_boards import (
+from harness.evaluation.pod.hit_miss import bound, choose_model, fit_hit_miss
+from harness.evaluation.study.limit import (
+    ALL_FOUND,
     board_weights,
     design_effect,
+    limit_of,
     refitted_sizes,
     row_weights,
     targets_of,
@@ -111,7 +111,7 @@ class TestWithoutACurve:
         limit = limit_of(with_hits(small, np.zeros(120, bool)))
         assert limit.statement is None and "missed" in limit.why and limit.why in limit.a90_95.why
         assert not limit.a90_95.demonstrated and np.isnan(limit.a90_mm) and np.isnan(limit.a50_mm)
-        assert np.all(np.isinf(limit.a90_draws_mm)) and np.isinf(limit.over_boards_mm)
+        assert np.all(np.isinf(limit.a90_draws_mm)) and np.isinf(limit.over_boards.value)
         assert limit.rate == 0 and not limit.boards_matter
 
     def test_a_chance_that_falls_with_size(self, small):
@@ -129,10 +129,10 @@ class TestWithoutACurve:
         limit = limit_of(with_hits(small, size > 6.0))
         gap = (size[size <= 6].max(), size[size > 6].min())
         assert limit.statement is not None and np.isfinite(limit.a90_draws_mm).all()
-        assert np.median(limit.a50_draws_mm) == pytest.approx(np.mean(gap), abs=0.6)
-        assert np.all(limit.a50_draws_mm < limit.a90_draws_mm)
+        assert gap[0] - 0.6 < limit.a50_interval_mm.low < limit.a50_interval_mm.high < gap[1] + 0.6
+        assert np.median(limit.a90_draws_mm) > limit.a50_mm
 
-    @pytest.mark.parametrize("seed", range(12))
+    @pytest.mark.parametrize("seed", range(4))
     def test_apart_too_estimates_lie_inside_their_intervals(self, seed):
         """Draws are fitted as the study is; with the middle of the gap for a90 its interval lies below it in every one
         of these."""
@@ -147,7 +147,7 @@ class TestWithoutACurve:
     def test_few_boards_that_were_all_found_are_no_boards_that_matter(self, small):
         """20 boards cannot demonstrate what takes 29; that says nothing of what damages of one board share."""
         limit = limit_of(with_hits(small, np.ones(120, bool)))
-        assert np.isinf(limit.over_boards_mm) and np.isnan(limit.design_effect) and not limit.boards_matter
+        assert np.isinf(limit.over_boards.value) and np.isnan(limit.design_effect) and not limit.boards_matter
 
 
 class TestWhatWasInspected:
@@ -259,6 +259,7 @@ class TestBoardsDrawnAgain:
         fit = fit_hit_miss(seen.diameter_mm[again], seen.hit[again])
         assert refitted_sizes(targets, curve, (0.9,), 1)[0, 0] == pytest.approx(fit.curve.size_at(0.9), rel=1e-5)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("boards_mm, low, high", [(0.0, 0.9, 1.1), (2.5, 1.7, 3.5)])
     def test_design_effect_is_one_of_independent_damage_and_more_where_boards_matter(self, boards_mm, low, high):
         """Means over 100 studies of 30 boards; of one study the ratio is known to about 25 %."""
@@ -269,6 +270,7 @@ class TestBoardsDrawnAgain:
             effects.append(design_effect(targets, fit_hit_miss(seen.diameter_mm, seen.hit).curve, 0.9))
         assert low < np.mean(effects) < high
 
+    @pytest.mark.slow
     def test_the_spread_of_draws_is_the_estimates_standard_error(self):
         """Over 100 studies of 30 boards that matter: the standard deviation of a90 against the mean of the draws'."""
         estimates, spreads = [], []
@@ -285,7 +287,7 @@ class TestBoardsDrawnAgain:
         curve, seen = limit.statement.curve, limit.record.inspected
         fit = fit_hit_miss(seen.diameter_mm, seen.hit, link=curve.link, log_size=curve.log_size)
         assert limit.design_effect > 1.3 and limit.over_boards == bound(fit, design_effect=limit.design_effect)
-        assert limit.over_boards_mm > limit.a90_95.value
+        assert limit.over_boards.value > limit.a90_95.value
         calm = limit_of(set_up(Study(boards=30, hole_free_boards=0, seed=3)))
         assert (calm.over_boards is calm.a90_95) == (calm.design_effect <= 1)
 
@@ -293,7 +295,7 @@ class TestBoardsDrawnAgain:
         record = set_up(Study(boards=30, hole_free_boards=0))
         limit = limit_of(with_hits(record, np.ones(240, bool)))
         smallest = [record.inspected.diameter_mm[record.inspected.board == board].min() for board in range(30)]
-        assert limit.over_boards_mm == np.sort(smallest)[28] > limit.a90_95.value
+        assert limit.over_boards.value == np.sort(smallest)[28] > limit.a90_95.value
 
     def test_design_effect_of_boards_with_one_damage_is_one(self, small):
         seen = small.inspected

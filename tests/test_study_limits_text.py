@@ -12,19 +12,14 @@ from hypothesis import strategies as st
 from synthetic_study import SetUp, Study, study_record
 
 from harness.evaluation.intervals import UNKNOWN, Interval
-from harness.evaluation.study.axes import FRAMES, axis_lines
 from harness.evaluation.study.limit import SetUpLimit, limit_of
-from harness.evaluation.study.result import SetUpResult, StudyResult
-from harness.report.examples import StudyExample
-from harness.report.study_axes_figure import axis_figure
-from harness.report.study_examples_figure import examples_figure, framed_pixels
-from harness.report.study_figures import MOST_PANELS, curves_figure, with_room
-from harness.report.study_page import study_parts
-from harness.tables.grid import Grid, text_of
+from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, axis_lines
+from harness.report.clouds import StudyExample, examples_figure
+from harness.report.study_page import MOST_PANELS, axis_figure, curves_figure, study_parts, with_room
 from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, notes_of, study_answer
 from harness.tables.schema import Estimate
 from harness.tables.study import axis_grid, axis_groups
-from harness.tables.text import interval, unbroken, unmeasured, with_interval
+from harness.tables.text import Grid, interval, text_of, unbroken, unmeasured, with_interval
 
 
 def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
@@ -35,7 +30,7 @@ def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
 def result_of(limits: list[SetUpLimit]) -> StudyResult:
     """A result of limits alone."""
     set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", (), np.nan) for one in limits)
-    return StudyResult(study_record(), set_ups, (), ())
+    return StudyResult(study_record(), set_ups, tuple(limits), (), ())
 
 
 def row_of(limit: SetUpLimit) -> dict[str, str]:
@@ -256,8 +251,7 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
     step = distance.lines["a, 1 frame"].steps[0]
     assert rows[1][-1].startswith(f"× {limits[2].a90_mm / limits[0].a90_mm:.2f} ({step.interval.low:.2f} to")
     assert rows[1][-1].endswith(" *") == step.beyond_chance
-    figure = axis_figure(distance, "axis-1")
-    assert f"a, 1 frame: 0.5 m: {limits[0].a90_mm:.2f} mm, 1 m: {limits[2].a90_mm:.2f} mm" in figure
+    assert "<svg" in axis_figure(distance, "axis-1")
 
 
 def test_an_axis_ends_at_a_little_more_than_the_largest_size(two: list[SetUpLimit]) -> None:
@@ -268,7 +262,6 @@ def test_an_axis_ends_at_a_little_more_than_the_largest_size(two: list[SetUpLimi
     texts = re.findall(r"<!-- (.*?) -->", figure)
     assert max(float(text) for text in texts if re.fullmatch(r"[\d.]+", text) and text not in ("1", "50")) <= 1.3 * 14
     assert {"no limit", "goes on beyond", "largest size inspected"} <= set(texts)
-    assert "1 frame: > 14 mm" in figure.replace("\u00a0", " ").replace("&gt;", ">")
     (group,) = axis_groups(axis_lines(two))
     assert not {"no limit", "goes on beyond"} & set(re.findall(r"<!-- (.*?) -->", axis_figure(group, "axis-1")))
 
@@ -304,22 +297,6 @@ def test_curves_without_a_curve_are_drawn(nothing_found: SetUpLimit, everything_
     assert "nan" not in re.sub(r"<!--.*?-->", "", figure, flags=re.DOTALL).lower()
 
 
-def test_pixels_are_framed_along_their_edges() -> None:
-    mask = np.zeros((4, 5), bool)
-    mask[1, 2:4] = True
-    border = {tuple(sorted(edge)) for edge in framed_pixels(mask)}
-    assert border == {
-        ((1.5, 0.5), (2.5, 0.5)),
-        ((2.5, 0.5), (3.5, 0.5)),
-        ((1.5, 1.5), (2.5, 1.5)),
-        ((2.5, 1.5), (3.5, 1.5)),
-        ((1.5, 0.5), (1.5, 1.5)),
-        ((3.5, 0.5), (3.5, 1.5)),
-    }
-    assert framed_pixels(np.zeros((3, 3), bool)) == []
-    assert len(framed_pixels(np.ones((3, 4), bool))) == 14
-
-
 def example(**changed: object) -> StudyExample:
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     rng = np.random.default_rng(3)
@@ -348,8 +325,6 @@ def test_examples_say_what_came_of_them() -> None:
     figure = examples_figure("examples-1", [missed, example()], "1 frame")
     assert "6.2 mm, below the limit, missed: no pixel was judged" in figure
     assert "6.2 mm, at the limit, hit: score 6.12, threshold 4.5" in figure
-    assert "stroke: #ff00ff" in figure
     without = examples_figure("examples-1", [missed, example()], "1 frame", by_limit=False)
     assert "6.2 mm, smaller, missed" in without
     assert "the limit" not in without
-    assert "stroke: #ff00ff" not in examples_figure("e", [example(detected=np.zeros((21, 21), bool))], "1 frame")

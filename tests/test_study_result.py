@@ -10,11 +10,9 @@ import pandas as pd
 import pytest
 from synthetic_study import THRESHOLD, SetUp, Study, Tables, study_record, study_tables
 
-from harness.evaluation.study.axes import difference
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record, record_text
-from harness.evaluation.study.result import StudyResult, evaluate_study
-from harness.evaluation.study.validity import held_sentences, number, swept_sentences, validity_of, varied_sentences
+from harness.evaluation.study.result import StudyResult, difference, evaluate_study, validity_of
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
 FACTS: dict[str, Any] = {
@@ -66,7 +64,7 @@ class TestStudy:
             assert [row.diameter_mm for row in one.sizes] == list(DIAMETERS_MM)
             assert one.limit.signals.signal.left == one.noise_floor < THRESHOLD
         assert [line.axis for line in result.axes] == ["capture.frames"]
-        assert result.axes[0].whole.beyond_chance and result.axes[0].whole.ratio < 1
+        assert result.axes[0].steps[0].beyond_chance and result.axes[0].steps[0].ratio < 1
 
     def test_record_and_tables_tell_the_same(self, study, result):
         tables = study_tables(study)
@@ -92,13 +90,11 @@ class TestStudy:
         assert [one.limit.a90_95.demonstrated for one in bare.set_ups] == [True, True]
         first = bare.set_ups[0]
         assert (first.chance, first.free_response, first.pixels, first.roc) == (None, None, None, ())
-        assert "What was held" not in dict(bare.validity) and "Hits by chance" not in dict(bare.validity)
 
     def test_a_detector_that_finds_nothing_is_judged_too(self, study):
         blind = dataclasses.replace(study, set_ups=(SetUp(a50_mm=200.0),))
         result = evaluate_study(study_record(blind), study_tables(blind), FACTS, draws=50)
         assert not result.limits[0].a90_95.demonstrated and result.set_ups[0].surface is None
-        assert "not demonstrated" in section(result, "The model and what it stands on")
 
     def test_signals_that_are_all_alike_are_judged_by_hits(self, study):
         """As of the oracle, which gives every damage the same score."""
@@ -115,29 +111,11 @@ class TestStudy:
 
 
 class TestValidity:
-    def test_varied_and_held(self, result):
-        varied = section(result, "What was varied")
-        assert "128 damages on 16 boards, 1 to 14 mm in diameter" in varied
-        assert "each inspected 2 times with new noise" in varied
-        assert "diameter from 1 to 14 mm and depth from 2 to 9 mm" in varied
-        assert "distance by ±10 mm" in varied and "tilt by ±8°" in varied and "roll" not in varied
-        assert "capture.frames: 1, 10." in varied
-        held = section(result, "What was held")
-        assert "board.width_mm 304.8" in held and "edge_gate on" in held and "name plane" in held
-        assert "distance_m" not in held and "diameter_mm" not in held and "frames" not in held and "tapes" not in held
-        assert "Averaging: frames 1," in " ".join(held_sentences({**FACTS, "sweep": {}}))
-
-    def test_hit_rule_and_false_calls(self, result):
+    def test_what_was_inspected_and_counts_as_a_hit(self, result):
+        seen = section(result, "What was inspected")
+        assert "128 damages on 16 boards, 1 to 14 mm in diameter" in seen
+        assert "each inspected 2 times with new noise" in seen and "capture.frames: 1, 10." in seen
         assert "within 15 mm" in section(result, "What counts as a hit")
-        calls = section(result, "Threshold and false calls")
-        rate = result.limits[0].false_calls
-        assert f"{rate.calls} calls on 8 m²" in calls and "set for a rate of 1 per m² on 60 hole-free runs" in calls
-        assert "the rate wanted lies inside" in calls
-
-    def test_a_rate_that_was_missed_is_said(self, study):
-        loud = dataclasses.replace(study, set_ups=(SetUp(false_calls_per_m2=6.0),))
-        result = evaluate_study(study_record(loud), study_tables(loud), FACTS, draws=50)
-        assert "the rate wanted lies outside" in section(result, "Threshold and false calls")
 
     def test_departures_are_those_of_this_study(self, result):
         said = section(result, "Departures from MIL-HDBK-1823A")
@@ -156,12 +134,12 @@ class TestValidity:
         record = study_record(study)
         failed = dataclasses.replace(record, set_ups=(dataclasses.replace(record.set_ups[0], failed=3),))
         said = section(evaluate_study(failed, study_tables(study), {}, draws=50), "Departures from MIL-HDBK-1823A")
-        assert "fewer than 60 targets (40)" in said and "3 trials failed" in said and "largest size" in said
+        assert "fewer than 60 targets (40)" in said and "Failed trials (3)" in said and "largest size" in said
         assert "share boards" not in said and "simulated" not in said and "more than once" not in said
 
     def test_depths_under_one_curve_depart(self, result):
         depths = np.concatenate([one.record.inspected.depth_mm for one in result.limits])
-        span = f"Depths from {number(depths.min())} to {number(depths.max())} mm share one curve"
+        span = f"Depths of {depths.min():.3g} to {depths.max():.3g} mm share one curve"
         assert span in section(result, "Departures from MIL-HDBK-1823A")
         flat = evaluate_study(study_record(), Tables(*[pd.DataFrame()] * 6), {}, draws=50)
         assert "share one curve" not in section(flat, "Departures from MIL-HDBK-1823A")
@@ -171,7 +149,7 @@ class TestValidity:
         result = evaluate_study(study_record(study), Tables(*[pd.DataFrame()] * 6), {}, draws=50)
         limit = result.limits[0]
         assert limit.beyond(limit.a90_95.value) and limit.a90_95.demonstrated
-        assert "a90/95: more than 14 mm" in section(result, "The model and what it stands on")
+        assert "a90/95 lies beyond the largest size" in section(result, "Departures from MIL-HDBK-1823A")
 
     def test_all_found_names_its_rule(self, study):
         sighted = dataclasses.replace(study, set_ups=(SetUp(a50_mm=-9.0),))
@@ -185,31 +163,6 @@ class TestValidity:
         swept = {**FACTS, "sweep": {"source.target.damage.kind": ["blind", "dent"], "source.camera.unit_seed": [1, 2]}}
         other = dict(validity_of(result.record, result.limits, [one.chance for one in result.set_ups], swept))[missing]
         assert not any("all are" in sentence or "one unit" in sentence for sentence in other)
-
-    def test_what_was_swept_is_not_called_drawn_or_held(self):
-        facts = {
-            **FACTS,
-            "sweep": {"source.target.damage.depth_mm": [[2, 3], [8, 9]], "source.target.tilt_deg": [0, 8]},
-        }
-        varied = " ".join(varied_sentences(facts))
-        assert "diameter from" in varied and "depth from" not in varied and "tilt" not in varied
-        assert swept_sentences(facts) == (
-            "source.target.damage.depth_mm: [2, 3], [8, 9].",
-            "source.target.tilt_deg: 0, 8.",
-        )
-        whole = {**FACTS, "sweep": {"source.camera": [{"name": "a"}, {"name": "b"}]}}
-        assert not any(sentence.startswith("Camera") for sentence in held_sentences(whole))
-
-    def test_no_sentence_without_its_fact(self):
-        assert varied_sentences({}) == swept_sentences({}) == held_sentences({}) == ()
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0"), (1.0, "1"), (7.5279, "7.53"), (1234.5, "1234"), (0.00021, "0.00021"), (12345.6, "1.23e+04")],
-)
-def test_number(value, text):
-    assert number(value) == text
 
 
 def test_set_ups_that_lack_a_board_are_not_paired(study):

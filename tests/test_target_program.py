@@ -14,11 +14,10 @@ import trimesh
 
 from harness.target import main
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.versions import RESULTS_VERSION
-from scenes.target.declaration import target_from_data
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.target.export import _srgb_bytes, write_mesh, write_truth
 from scenes.target.mesh import Target, build_target
-from scenes.target.thesis import ThesisTargetConfig
+from scenes.target.thesis import ThesisTargetConfig, target_from_data
 
 
 @pytest.fixture(scope="module")

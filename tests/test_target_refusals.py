@@ -8,8 +8,8 @@ import pytest
 
 from harness.vocabulary.errors import UserError
 from scenes.target.checks import check_target
-from scenes.target.declaration import target_from_data
 from scenes.target.mesh import build_target
+from scenes.target.thesis import target_from_data
 
 BOARD: dict[str, Any] = {"width_mm": 300, "height_mm": 100, "thickness_mm": 12}
 

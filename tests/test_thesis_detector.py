@@ -11,10 +11,8 @@ from detectors import detector_names, detector_type, load_detector
 from detectors.interface import Detector, Evidence
 from detectors.noise import rounding_floor
 from detectors.thesis import ThesisConfig, ThesisDetector
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Cloud, Lens, Region
 
 SHAPE = (120, 160)
 LENS = Lens(SHAPE[1], SHAPE[0], 240.0, 240.0, 79.5, 59.5)

@@ -73,7 +73,7 @@ def test_it_is_listed_with_its_package_and_what_is_broken_is_said_to_be(python: 
     assert done.returncode == 0, done.stderr
     listed = json.loads(done.stdout)
     detectors = {row["name"]: row for row in listed["detectors"]}
-    assert set(detectors) == {"acme_broken", "acme_median", "blind", "local", "oracle", "thesis"}
+    assert set(detectors) == {"acme_broken", "acme_median", "blind", "local", "matched", "oracle", "thesis"}
     assert detectors["acme_median"] == {
         "name": "acme_median",
         "package": "acme-inspection",

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from validation.transport import Scene, compared, face_parts, in_holes
 
-from scenes.render.scene import lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
+from scenes.optics import RenderConfig
+from scenes.render.scene import lit_scene, load_mitsuba
 from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import build_target
 from scenes.target.thesis import ThesisTargetConfig
+
+pytestmark = pytest.mark.slow
 
 
 def test_holes_before_a_backing_are_right_within_a_fifth_of_a_millimetre():

@@ -11,14 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
-from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
-from scenes.render.direct import Beams, comb_step, direct_light, footprint_of, phasor_sums
-from scenes.render.scene import lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Lens, Region
+from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Beams, Optics, RenderConfig, footprint_of
+from scenes.render.direct import comb_step, direct_light, phasor_sums
+from scenes.render.scene import lit_scene, load_mitsuba
 from scenes.render.view import render_view
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import TargetPart, build_target

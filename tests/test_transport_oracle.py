@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from harness.vocabulary.lens import Lens
-from scenes.optics import Optics
-from scenes.render.direct import direct_light, footprint_of
-from scenes.render.indirect import PathWork, gather_in_pixels
-from scenes.render.scene import lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
-from scenes.render.view import render_view
+from harness.vocabulary.geometry import Lens
+from scenes.optics import Optics, RenderConfig, footprint_of
+from scenes.render.direct import direct_light
+from scenes.render.scene import lit_scene, load_mitsuba
+from scenes.render.view import PathWork, gather_in_pixels, render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import TargetPart, build_target
@@ -26,7 +23,9 @@ CAMERA = load_camera("azure_kinect_nfov")
 FREQUENCIES = CAMERA.frequencies_hz
 BOUNCES = 6
 RUNS = 8
-BOTH = pytest.mark.parametrize("histogram", [False, True], ids=["phasors", "histogram"])
+BOTH = pytest.mark.parametrize(
+    "histogram", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["phasors", "histogram"]
+)
 
 
 def optics_of(width: int, height: int, focal_px: float) -> Optics:

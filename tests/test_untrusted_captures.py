@@ -6,10 +6,7 @@ Every file is opened in a process whose memory is limited to what its libraries 
 from __future__ import annotations
 
 import io
-import json
-import sqlite3
 import struct
-import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -24,9 +21,8 @@ import scipy.io
 from hostile_files import BOMB, capture_refusal, little_memory, refusal
 
 from detectors.recordings import open_capture
-from detectors.recordings.depth_images import read_depth_png
-from detectors.recordings.pictures import decoded, picture_size
-from harness.vocabulary import limits
+from detectors.recordings.depth_images import decoded, read_depth_png
+from harness.vocabulary import files
 
 STORED = plane.depth_mm()
 
@@ -86,7 +82,7 @@ def test_arrays_whose_header_lies(tmp_path, content, stated, told):
 
 def test_a_bomb_of_zeros(tmp_path, monkeypatch):
     """Truthful sizes, packed a thousand times: refused by what it unpacks to."""
-    monkeypatch.setattr(limits, "ARRAYS_BYTES", 64 << 20)
+    monkeypatch.setattr(files, "ARRAYS_BYTES", 64 << 20)
     path = npz(tmp_path / "a.npz", npy_header("(64, 1024, 1024)") + bytes(128 << 20))
     assert path.stat().st_size < 1 << 20
     assert "unpacks to 128 MiB\n  legal: at most 64 MiB" in capture_refusal(path)
@@ -95,19 +91,6 @@ def test_a_bomb_of_zeros(tmp_path, monkeypatch):
 def test_other_archives(tmp_path):
     good = io.BytesIO()
     np.save(good, STORED)
-    twice = tmp_path / "a.npz"
-    with pytest.warns(UserWarning), zipfile.ZipFile(twice, "w") as archive:
-        archive.writestr("depth.npy", good.getvalue())
-        archive.writestr("depth.npy", good.getvalue())
-    assert "stands there twice" in capture_refusal(twice)
-    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
-        for number in range(limits.ARRAYS_COUNT + 1):
-            archive.writestr(f"{number}.npy", b"")
-    assert "holds 1001 arrays" in capture_refusal(tmp_path / "b.npz")
-    with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
-        for number in range(30_000):
-            archive.writestr(f"{number}.npy", b"")
-    assert "holds 30000 arrays" in capture_refusal(tmp_path / "c.npz")
     (tmp_path / "d.npz").write_bytes(good.getvalue())
     assert "cannot be read" in capture_refusal(tmp_path / "d.npz")
     damaged = bytearray(npz(tmp_path / "e.npz", good.getvalue()).read_bytes())
@@ -137,7 +120,7 @@ def test_a_frame_of_too_many_pixels(tmp_path):
     with path.open("wb") as file:
         file.write(npy_header("(10000, 10000)"))
         file.truncate(file.tell() + 2 * 10**8)
-    assert "10000 x 10000 pixels\n  legal: at most 64 million" in capture_refusal(path)
+    assert "10000 x 10000 pixels\n  legal: 1 to 64 million" in capture_refusal(path)
 
 
 # ---- MATLAB ---------------------------------------------------------------------------------------------------------
@@ -158,9 +141,8 @@ def mat_variable(rows: int, columns: int, stated: int, numbers: bytes = b"") -> 
     ("content", "told"),
     [
         (mat_variable(30_000, 60_000, 0xFFFFFFF0), "not memory enough for what it states"),
-        (mat_variable(-3, 4, 96, bytes(96)), "negative dimension"),
         (mat_variable(3, 4, 0xFFFFFFF0, bytes(96)), "cannot be read"),
-        (struct.pack("<II", 14, 0xFFFFFFF0), "cut off"),
+        (struct.pack("<II", 14, 0xFFFFFFF0), "could not read bytes"),
         (element(15, b"no zlib")[:-1], "while decompressing"),
     ],
 )
@@ -170,7 +152,7 @@ def test_hostile_matlab_files(tmp_path, content, told):
 
 
 def test_a_compressed_matlab_bomb(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "READING_BYTES", 64 << 20)
+    monkeypatch.setattr(files, "READING_BYTES", 64 << 20)
     packed = zlib.compress(mat_variable(4096, 4096, 128 << 20, bytes(128 << 20)))
     (tmp_path / "a.mat").write_bytes(MAT_HEAD + struct.pack("<II", 15, len(packed)) + packed)
     assert "not memory enough for what it states" in capture_refusal(tmp_path / "a.mat")
@@ -180,6 +162,20 @@ def test_cells_beside_numbers_are_left_unread(tmp_path):
     cells = np.array([[1, 2], ["a", {"b": 1}]], object)
     scipy.io.savemat(tmp_path / "a.mat", {"depth": STORED, "notes": cells}, do_compression=True)
     assert open_capture([tmp_path / "a.mat"], lens=plane.LENS).region.shape == STORED.shape
+
+
+def test_cells_in_cells_in_a_mat_file_are_not_followed(tmp_path: Path) -> None:
+    """A hundred thousand deep, which ends a process that follows them."""
+    inner = struct.pack("<IIIIIIiiIIIId", 6, 8, 6, 0, 5, 8, 1, 1, 1, 0, 9, 8, 1.0)
+    level = struct.pack("<IIIIIIii", 6, 8, 1, 0, 5, 8, 1, 1)
+    heads, size = [struct.pack("<II", 14, len(inner))], len(inner) + 8
+    for depth in range(100_000):
+        name = struct.pack("<II5s3x", 1, 5, b"depth") if depth == 99_999 else struct.pack("<II", 1, 0)
+        size += len(level) + len(name)
+        heads.append(struct.pack("<II", 14, size) + level + name)
+        size += 8
+    (tmp_path / "a.mat").write_bytes(MAT_HEAD + b"".join(reversed(heads)) + inner)
+    assert "holds no numeric array" in capture_refusal(tmp_path / "a.mat")
 
 
 # ---- phones and lists of points --------------------------------------------------------------------------------------
@@ -196,25 +192,6 @@ def plane_archive(path: Path, metadata: bytes) -> Path:
         archive.writestr("metadata", metadata)
         archive.writestr("rgbd/0.depth", b"bvx$")
     return path
-
-
-@pytest.mark.parametrize(
-    "packed",
-    [
-        struct.pack("<4sI", b"bvxn", 96 * 72 * 4) + struct.pack("<I", 0xFFFFFFF0),
-        struct.pack("<4sI", b"bvx2", 0xFFFFFFF0) + bytes(24),
-        struct.pack("<4sI", b"bvx-", 0) * 100_000,
-        b"bvx1" + bytes(1000),
-        b"",
-    ],
-)
-def test_blocks_that_state_another_size_are_never_unpacked(tmp_path, packed, monkeypatch):
-    monkeypatch.setitem(sys.modules, "liblzfse", object())
-    told = {"K": [300, 0, 0, 0, 300, 0, 96, 72, 1], "w": 192, "h": 144, "dw": 96, "dh": 72}
-    with zipfile.ZipFile(tmp_path / "a.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("metadata", json.dumps(told))
-        archive.writestr("rgbd/0.depth", packed)
-    assert "is damaged" in capture_refusal(tmp_path / "a.r3d")
 
 
 def test_a_list_of_points_that_is_too_long(tmp_path):
@@ -239,7 +216,7 @@ def png_of(width: int, height: int) -> bytes:
 def test_a_png_of_60000_x_60000(tmp_path):
     path = tmp_path / "1.png"
     path.write_bytes(png_of(60_000, 60_000))
-    told = "60000 x 60000 pixels\n  legal: at most 64 million"
+    told = "60000 x 60000 pixels\n  legal: 1 to 64 million"
     assert told in refusal(lambda: read_depth_png(path)) and told in capture_refusal(path)
     assert told in refusal(lambda: decoded("a", path.read_bytes(), 1))
     path.write_bytes(png_of(0, 5))
@@ -267,7 +244,6 @@ def test_the_sizes_of_true_pictures():
 
     for suffix in (".png", ".jpg"):
         content = cv2.imencode(suffix, np.zeros((30, 50, 3), np.uint8))[1].tobytes()
-        assert picture_size("a", content) == (50, 30)
         assert decoded("a", content, cv2.IMREAD_COLOR).shape == (30, 50, 3)
 
 
@@ -348,6 +324,8 @@ def test_a_name_that_is_a_protocol_is_a_file(tmp_path, monkeypatch):
 
 
 def test_a_recording_of_too_large_pictures(tmp_path):
+    from detectors.recordings import devices
+
     path = tmp_path / "a.mkv"
     with av.open(str(path), "w", format="matroska") as container:
         stream = container.add_stream("ffv1", rate=5)
@@ -359,37 +337,14 @@ def test_a_recording_of_too_large_pictures(tmp_path):
     width = content.index(b"\xb0\x81\x60\xba\x81\x48")
     path.write_bytes(content[:width] + b"\xb0\x81\x60\xba\x81\x48".replace(b"\x60", b"\x7f") + content[width + 6 :])
     assert "127 x 72" in capture_refusal(path)
-    from detectors.recordings import azure_mkv
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(limits, "FRAME_PIXELS", 1000)
-        assert "127 x 72 pixels\n  legal: at most" in capture_refusal(path)
+        patched.setattr(files, "FRAME_PIXELS", 1000)
+        assert "127 x 72 pixels\n  legal: 1 to" in capture_refusal(path)
         path.write_bytes(content)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(azure_mkv, "FRAME_PIXELS", 1000)
+        patched.setattr(devices, "FRAME_PIXELS", 1000)
         assert "cannot be decoded" in capture_refusal(path)
-
-
-@pytest.mark.parametrize(
-    "program",
-    [
-        "create view messages as with recursive n(i) as (select 1 union all select i + 1 from n) select i id,"
-        " 1 topic_id, i timestamp, zeroblob(1000000) data from n",
-        "create table messages(id integer primary key, topic_id integer, timestamp integer,"
-        " data blob generated always as (zeroblob(1000000000)))",
-        "create table messages(id integer primary key, topic_id integer, timestamp integer, data as(zeroblob(9)))",
-        "create table other(a); create trigger messages after insert on other begin select 1; end",
-    ],
-)
-def test_a_database_with_programs(tmp_path, program):
-    folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
-    file = next(folder.glob("*.db3"))
-    with sqlite3.connect(file) as database:
-        if "table other" not in program:
-            database.execute("drop table messages")
-        database.executescript(program)
-    database.close()
-    assert "holds a program" in capture_refusal(folder)
 
 
 def test_a_bag_whose_description_is_hostile(tmp_path):

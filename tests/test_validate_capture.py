@@ -13,7 +13,7 @@ import pytest
 from harness.scorecard.bench import NOISE
 from harness.validate import main
 from harness.vocabulary.geometry import Region
-from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION
+from harness.vocabulary.provenance import GENERATOR, RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit

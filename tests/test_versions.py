@@ -14,13 +14,14 @@ from harness.compare import write_comparison
 from harness.evaluation.study.record import OLDEST_VERSION, RECORD_VERSION, read_record, record_text
 from harness.evaluation.study.verdict import compare_studies
 from harness.experiment.load import EXPERIMENT_VERSION, load_experiment, resolved_yaml
-from harness.inspection.poses import POSES_KEY, read_poses
+from harness.inspection.arguments import POSES_KEY, read_poses
 from harness.report.blocks import template
 from harness.report.compare import COMPARISON_VERSION
-from harness.report.findings import COLUMNS, FINDINGS_VERSION, VERSION_COLUMN, csv_text
+from harness.report.findings import csv_text
 from harness.scorecard.figures import BASELINE_FILE, SCORECARD_VERSION, read_baseline, write_baseline
+from harness.tables.trials import FINDINGS_OF_CAPTURE, FINDINGS_VERSION
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.versions import GENERATOR, RESULTS_VERSION, check_version, stamp_of, stamped
+from harness.vocabulary.provenance import GENERATOR, RESULTS_VERSION, check_version, stamp_of, stamped
 from tests.synthetic_study import SetUp, Study, study_record
 
 FILE = Path("x.json")
@@ -135,7 +136,7 @@ def test_every_page_names_its_version(path):
 
 def test_findings_carry_it_in_a_column():
     (head,) = csv.reader(io.StringIO(csv_text(())))
-    assert head == [*COLUMNS, VERSION_COLUMN] and FINDINGS_VERSION == 2
+    assert head == [column.name for column in FINDINGS_OF_CAPTURE.columns] and FINDINGS_VERSION == 2
 
 
 def test_a_scorecards_baseline(tmp_path):

@@ -10,8 +10,7 @@ from scipy import ndimage
 from validation.azure_walls import Wall, WallCheck, check_folder, walls_camera
 from validation.azure_walls_page import figure, page, table
 
-from harness.scorecard.noise import correlation, covariance, deviations, fixed_pattern
-from harness.scorecard.planes import robust_inverse_fit
+from harness.scorecard.bench import correlation, covariance, deviations, fixed_pattern, robust_inverse_fit
 from harness.vocabulary.geometry import Region
 from scenes.sensor.camera import load_camera
 
@@ -41,7 +40,10 @@ def patterned_stack(smooth: float, length: float, pixel: float, frames: int = 20
     return 1.3 / (1 - 0.4 * slopes[..., 0]) + field + white + noise, np.ones(shape, bool), slopes
 
 
-@pytest.mark.parametrize(("smooth_mm", "pixel_mm"), [(0.5, 0.0), (0.5, 0.2), (0.0, 0.2)])
+@pytest.mark.parametrize(
+    ("smooth_mm", "pixel_mm"),
+    [pytest.param(0.5, 0.0, marks=pytest.mark.slow), (0.5, 0.2), pytest.param(0.0, 0.2, marks=pytest.mark.slow)],
+)
 def test_a_planted_fixed_pattern_is_found_again(smooth_mm, pixel_mm):
     """Within 0.04 mm: three deviations of a field of some 400 patches of (2 l)^2 pixels. The surface takes the longest
     waves with it, which shortens the correlation by half a pixel."""

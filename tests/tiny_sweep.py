@@ -1,14 +1,17 @@
-"""A sweep of seconds, run as a user runs it, and its results as text that can be compared byte by byte."""
+"""Sweeps of seconds, run as a user runs them, and their results as text that can be compared byte by byte."""
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+
+from harness.sweep import main
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = """\
@@ -31,14 +34,51 @@ sweep:
 """
 
 
+STUDY = """\
+name: tiny
+seed: 3
+source:
+  kind: simulated
+  target: {name: drawn, damage: {kind: through, per_board: 5, diameter_mm: [2.0, 12.0]}}
+  camera: {name: azure_kinect_nfov}
+  render: {bounces: 0}
+capture: {frames: 2}
+detector: {name: thesis, settings: {crop: {kind: auto, inset_px: 4}}}
+threshold: {calibrate: {boards: 5, false_calls_per_m2: 4.0}}
+study: {boards: 4, hole_free_boards: 3}
+sweep:
+  capture.frames: [1, 2]
+"""
+
+
 def sweep_command(yaml: Path, out: Path, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "harness.sweep", str(yaml), "--out", str(out), *arguments]
 
 
-def sweep(yaml: Path, out: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run it to its end."""
-    command = sweep_command(yaml, out, *arguments)
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800, env=os.environ | environment)
+@dataclass
+class Done:
+    """How a program ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def sweep(yaml: Path, out: Path, *arguments: str) -> Done:
+    """Run the program to its end in this process, its workers in processes of their own."""
+    told, warned = io.StringIO(), io.StringIO()
+    with redirect_stdout(told), redirect_stderr(warned):
+        code = main([str(yaml), "--out", str(out), *arguments])
+    return Done(code, told.getvalue(), warned.getvalue())
+
+
+def finished(home: Path, text: str) -> Path:
+    """Run an experiment as ``home/tiny.yaml``; returns the folder of results, ``home/out``."""
+    (home / "tiny.yaml").write_text(text)
+    done = sweep(home / "tiny.yaml", home / "out")
+    assert done.returncode == 0, done.stderr
+    (home / "told.txt").write_text(done.stdout)
+    return home / "out"
 
 
 def results(out: Path) -> Path:

@@ -1,172 +1,297 @@
 """Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with its variance.
 
 Each pixel's depth counts as a height over the surface at the place where its *ray meets the surface*. On an intact
-surface that is the point itself; at a hole it is the mouth, which thereby lies in one place for all views, where the
-points behind it, shifted by depth times the tangent of the viewing angle, would smear it. What lies at the bottom of a
-wide hole, or stands out before the surface, is displaced by as much in a view that is slanted.
+surface that is the point itself; at a hole it is the mouth, which thereby lies in one place for all views. What lies at
+the bottom of a wide hole, or before the surface, is displaced in a view that is slanted.
 
-Blur is added by linear interpolation only: `detectors.mapping.raster`. Not modelled: correlation between the errors of
-registrations to one reference; changes of the blur between views (all count with the reference's).
-"""
+View i measures a cell's height as h + e_i + f(p_i) + g_i: e_i is the noise that the sensor's law and the registration's
+covariance explain; f the camera's fixed pattern, which belongs to the *pixel* p_i that looks at the cell; g_i what is
+fixed for a view and cell alone. Half the mean square difference of two views, as a function of how far apart p_i and
+p_j lie on the sensor, is noise + var g + var f (1 - exp(-(|p_i - p_j| / length)^exponent)), a variogram with nugget and
+sill (Matheron 1963; Cressie 1993), fitted here to medians, because at damage views see different parts of it. Views
+that look through the same pixels share f, and no number of them averages it out.
+
+Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that is not the
+same all over the sensor; changes of the blur. Where views are no farther apart than the pattern is long, its sill is an
+extrapolation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 
-import numba
 import numpy as np
 
-from detectors.mapping.between_views import BetweenViews, between_views
-from detectors.mapping.chosen_views import ChosenView
-from detectors.mapping.combine import Combined, combine
-from detectors.mapping.depth_noise import noise_of
-from detectors.mapping.placing import PlacedView, T_reference_map_of, common_surface, grid_over, place
-from detectors.mapping.raster import CellGrid
-from detectors.mapping.surface_map import SurfaceMap
-from detectors.surface import Surface, SurfaceConfig, fit_surface
-from harness.vocabulary.capture import MapViews
-from harness.vocabulary.geometry import invert, transform_points
+from detectors.mapping.placing import (
+    ChosenView,
+    PlacedView,
+    T_reference_map_of,
+    common_surface,
+    grid_over,
+    place,
+    raster_between,
+)
+from detectors.noise import rounding_left_m2
+from detectors.surface import SurfaceConfig, fit_surface
+from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points
+
+CELLS = 2000
+CLASSES, PER_CLASS = 12, 100
+"""Classes of distance on the sensor with equal numbers of pairs, and the least number worth a median."""
+LENGTHS = 24
+"""Trial lengths, geometric from a pixel to the largest distance between views."""
+EXPONENTS = (1.0, 1.5, 2.0)
+"""The law of a pattern that a filter smooths over a few pixels is flat at first (2), not pointed (1)."""
+MEDIAN_SQUARE = 0.45494
+"""Median of the square of a standard normal deviate."""
+MEDIAN_ERROR = 2.33
+"""Standard error of the median of n such squares, as a part of it, times the root of n."""
+GATE_SIGMAS = 5.0
+"""An observation so many deviations from the median of at least three views is an outlier."""
+
+
+@dataclass(frozen=True)
+class BetweenViews:
+    """``own_m2``: variance of what is fixed for a view and cell alone; ``pattern_m2``: of the fixed pattern, with
+    covariance exp(-(distance / ``length_px``)^``exponent``) between pixels. ``noise_share``: part of the variance that
+    the sensor's law states that is noise; below 1 only where the law was read off a single frame, whose surface shows
+    noise and pattern together."""
+
+    own_m2: float = 0.0
+    pattern_m2: float = 0.0
+    length_px: float = 1.0
+    exponent: float = 1.0
+    noise_share: float = 1.0
+
+
+def between_views(
+    heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
+) -> BetweenViews:
+    """Estimate it from heights (k, h, w), NaN where a view has none, with variances that the ``sensor`` and ``other``
+    (lens, registration) explain, and the direction ``looks_px`` (k, h, w, 2) in which each view sees each cell, in
+    pixels. ``repeated``: the sensor's variances come from repeated frames. All zero with one view or too little
+    overlap."""
+    several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
+    some = several[:: max(1, len(several) // CELLS)]
+    values = (heights, sensor, other, looks_px)
+    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, some] for v in values)
+    i, j = np.triu_indices(len(heights), 1)
+    both = np.isfinite(flat[i] - flat[j])
+    if both.sum() < PER_CLASS:
+        return BetweenViews()
+    apart = np.linalg.norm(looks[i] - looks[j], axis=-1)[both]
+    columns = (apart, (flat[i] - flat[j])[both] ** 2, *(0.5 * (v[i] + v[j])[both] for v in (sensor, other)))
+    parts = np.array_split(np.argsort(apart, kind="stable"), min(CLASSES, max(1, len(apart) // PER_CLASS)))
+    distance, square, of_sensor, of_other = (np.array([np.median(c[part]) for part in parts]) for c in columns)
+    half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
+    # the k (k - 1) / 2 differences of k views hold k - 1 independent ones
+    error = half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(apart) / len(parts))
+    known = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
+    first = (np.ones_like(distance) if repeated else of_sensor) / error
+    level, sill, length, exponent = _law(first, 1.0 / error, distance, known, repeated)
+    if repeated:
+        return BetweenViews(level, sill, length, exponent)
+    return BetweenViews(0.0, sill, length, exponent, min(max(level, 0.01), 1.0))
+
+
+def _law(
+    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
+) -> tuple[float, float, float, float]:
+    """(factor of ``first``, sill, length, exponent), all (c,) in standard errors: of nothing at all (where it
+    ``may_vanish``), ``first`` alone, and both terms that with the least chi square plus Schwarz's penalty, without
+    which a chance slope of the variogram would pass for a pattern."""
+    from scipy.optimize import nnls
+
+    penalty = float(np.log(max(len(distance), 2)))
+    (level,), misfit = nnls(first[:, None], known)
+    best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
+    if may_vanish and known @ known <= best[0]:
+        best = (float(known @ known), 0.0, 0.0, 1.0, 1.0)
+    for exponent, length in product(EXPONENTS, np.geomspace(1.0, max(1.0, float(distance.max())), LENGTHS)):
+        rise = 1.0 - np.exp(-((distance / length) ** exponent))
+        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), known)
+        if misfit**2 + 4.0 * penalty < best[0]:
+            best = (float(misfit) ** 2 + 4.0 * penalty, float(level), float(sill), float(length), exponent)
+    return best[1:]
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Values of each cell (h, w): ``height_m``: mean deviation from the fitted surface along z, positive behind, NaN
+    where no view counts; ``variance_m2``: of an intact surface's height, by sensor, lens and registration, and by what
+    views disagree about beyond (``between``); ``temporal_m2``: the part of it that more frames would lessen.
+    ``seen_by`` (k, h, w) bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``:
+    single observations that were outliers."""
+
+    cell_m: float
+    height_m: np.ndarray
+    variance_m2: np.ndarray
+    temporal_m2: np.ndarray
+    seen_by: np.ndarray
+    shares: np.ndarray
+    rejected: int
+    between: BetweenViews
+
+
+def combine(
+    heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool, cell_m: float
+) -> SurfaceMap:
+    """Combine the views' heights (k, h, w); arguments as of `between_views`. The weight of a view is the inverse of its
+    own variance, fixed errors included; the variance of the mean takes the covariance of views into account whose
+    pixels lie near one another. (The best weights under that covariance can be negative, which a hole seen by some
+    views only does not forgive.)"""
+    between = between_views(heights, sensor, other, looks_px, repeated)
+    temporal = between.noise_share * sensor
+    own = temporal + other + between.own_m2
+    rejected = _outliers(heights, own + between.pattern_m2)
+    used = np.isfinite(heights) & ~rejected
+    known = used.any(axis=0)
+    weights = np.where(used, 1.0 / (own + between.pattern_m2), 0.0)
+    with np.errstate(invalid="ignore"):
+        shares = np.nan_to_num(weights / weights.sum(axis=0))
+    squares = shares**2
+    shared = between.pattern_m2 * squares.sum(axis=0)
+    if between.pattern_m2 > 0:
+        for i, j in combinations(range(len(heights)), 2):
+            apart = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
+            shared += 2.0 * between.pattern_m2 * shares[i] * shares[j] * np.exp(-(apart**between.exponent))
+    height, alone, by_frames = (
+        np.where(known, np.where(used, each, 0.0).sum(axis=0), np.nan)
+        for each in (shares * heights, squares * own, squares * temporal)
+    )
+    return SurfaceMap(cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between)
+
+
+def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """(k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the views, if
+    that is larger) from the median of at least three views, where they cannot be damage. That is: as far before the
+    fitted surface, where damage would have been in the others' way; or behind, but alone among its own neighbours, as a
+    flying pixel is and nothing that has passed a camera's filter. A hole stays that few views see into, and its wall
+    that few views see."""
+    middle = _middle(heights)
+    deviation = heights - middle
+    limit = GATE_SIGMAS * np.maximum(1.4826 * _middle(np.abs(deviation)), np.sqrt(variances))
+    several = np.isfinite(heights).sum(axis=0) >= 3
+    rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
+    k, row, column = np.nonzero(several & (deviation > limit))
+    padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+    near = np.stack([padded[k, row + down, column + right] for down in range(3) for right in range(3)])
+    rejected[k, row, column] = near[4] - _middle(near) > limit[k, row, column]
+    return rejected
+
+
+def _middle(values: np.ndarray) -> np.ndarray:
+    """Return the median of the known values along the first axis; NaN where there is none."""
+    ordered = np.sort(values, axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    places = np.maximum(count - 1, 0) // 2, count // 2
+    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
+    return 0.5 * (low + high)
+
 
 LATERAL_PX = 0.1
 """Standard deviation of where a pixel looks: the reprojection error of a well calibrated lens."""
 SMOOTH_POINTS = 8192
-"""Points to which a single view's own smooth surface is fitted, and of which medians are taken."""
+BINS, PER_BIN = 16, 40
+SAMPLED = 16_384
+"""Pixels from which the law is read: a class' median is then known to 7 % from three frames."""
+LEAST_M2 = 1e-14
+"""Least variance: no point is known better than to 0.1 um, and no weight is infinite."""
 
 
-@dataclass(frozen=True)
-class _Sheet:
-    """The surface on the map's cells. ``points_m`` (h, w, 3) and ``gradient`` (h, w, 3): (-dz/dx, -dz/dy, 1), whose
-    product with a small displacement is the change of height along z."""
-
-    grid: CellGrid
-    points_m: np.ndarray
-    gradient: np.ndarray
-
-    @classmethod
-    def of(cls, grid: CellGrid, surface: Surface) -> _Sheet:
-        x, y = np.meshgrid(grid.x, grid.y)
-        z = surface.evaluate(x, y)
-        by_x = (surface.evaluate(x + grid.step, y) - z) / grid.step
-        by_y = (surface.evaluate(x, y + grid.step) - z) / grid.step
-        return cls(grid, np.stack([x, y, z], axis=-1), np.stack([-by_x, -by_y, np.ones_like(z)], axis=-1))
-
-
-@dataclass(frozen=True)
-class _Observed:
-    """One view on the map's cells, (h, w) each, NaN where it has nothing: height, its variance by the sensor's law and
-    by lens and registration, samples, the direction to the camera (h, w, 3) and that from it in pixels (h, w, 2).
-    ``repeated``: the sensor's law was read off repeated frames."""
-
-    height: np.ndarray
-    sensor: np.ndarray
-    other: np.ndarray
-    samples: np.ndarray
-    direction: np.ndarray
-    looks_px: np.ndarray
-    repeated: bool
-    rgb: np.ndarray | None
-    amplitude: np.ndarray | None
-
-
-def fuse(views: Sequence[ChosenView], cell_m: float | None) -> tuple[SurfaceMap, tuple[str, ...]]:
-    """The map, and what a user should know about it.
-
-    Raises UserError where the points do not determine a surface or the map would have too many cells.
-    """
+def fuse(views: Sequence[ChosenView], cell_m: float | None) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
+    """Return the map as an organised cloud, its frame in the first view's (4, 4), what else is known, and notes. The
+    cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` all of it, which
+    one view does not know of itself (then None). Rounding is in it, so there is no rounding step left. Raises UserError
+    where the points do not determine a surface or the map would have too many cells."""
     T_reference_map = T_reference_map_of(views[0])
     surface = common_surface(views, T_reference_map)
     placed = [place(view, T_reference_map, surface) for view in views]
-    sheet = _Sheet.of(grid_over(placed, cell_m), surface)
-    observed = [_observe(view, sheet, T_reference_map, views[0].slope_step) for view in placed]
-    heights, sensor, other, looks_px = (
-        np.stack([getattr(o, name) for o in observed]) for name in ("height", "sensor", "other", "looks_px")
+    grid = grid_over(placed, cell_m)
+    x, y = grid.places()
+    z = surface.evaluate(x, y)
+    # the product of the gradient with a small displacement is the change of height along z
+    by_x, by_y = surface.evaluate(x + grid.step, y) - z, surface.evaluate(x, y + grid.step) - z
+    gradient = np.stack([-by_x / grid.step, -by_y / grid.step, np.ones_like(z)], axis=-1)
+    points = np.stack([x, y, z], axis=-1)
+
+    observed, repeated = [], True
+    for view in placed:
+        cloud, inside = view.chosen.cloud, view.chosen.inside
+        raster = raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
+        variance, by_frames = depth_noise(cloud, inside, _roughness(view))
+        repeated &= by_frames
+        slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
+        unknown = np.full(inside.shape, np.nan)
+        colour = [unknown] * 3 if cloud.rgb is None else list(np.moveaxis(cloud.rgb, -1, 0))
+        amplitude = unknown if cloud.amplitude is None else cloud.amplitude
+        images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
+        values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
+        rays = points - view.T_map_view[:3, 3]
+        per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+        across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
+        correlation = _neighbour_correlation(view)
+        kept = correlation + (1.0 - correlation) * raster.concentration
+        in_view = rays @ view.T_map_view[:3, :3]
+        by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
+        observed.append(
+            (
+                values[..., 0],
+                values[..., 1] * kept * per_range**2,
+                (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration,
+                in_view[..., :2] / in_view[..., 2:] / views[0].slope_step,
+                values[..., 2:],
+            )
+        )
+    heights, sensor, other, looks_px, more = (np.stack(each) for each in zip(*observed, strict=True))
+    found = combine(heights, sensor, other, looks_px, repeated, grid.step)
+
+    clouds = [view.cloud for view in views]
+    samples = np.round(np.where(found.seen_by, more[..., 0], 0.0).sum(axis=0)).astype(np.int32)
+    means = (found.shares[..., None] * np.nan_to_num(more)).sum(axis=0)
+    known = np.isfinite(found.height_m)
+    shares = found.shares.sum(axis=(1, 2)) / found.shares.sum()
+    pixel_m = np.sqrt(shares @ np.stack([view.pixel_m for view in placed]) ** 2)
+    points[..., 2] += found.height_m
+    points[~known] = np.nan
+    merged = Cloud(
+        points_m=points,
+        reason=np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
+        count=samples,
+        variance_m2=found.temporal_m2 * samples,
+        region=Region(0, grid.shape[0], 0, grid.shape[1]),
+        z_step_m=0.0,
+        n_frames=sum(cloud.n_frames for cloud in clouds),
+        rgb=None if any(cloud.rgb is None for cloud in clouds) else np.round(means[..., 1:4]).astype(np.uint8),
+        amplitude=None if any(c.amplitude is None for c in clouds) else np.where(known, means[..., 4], np.nan),
+        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        projection="parallel",
+        mean_variance_m2=found.variance_m2 if len(views) > 1 else None,
+        map_views=MapViews(np.stack([view.T_map_view for view in placed]), shares, (pixel_m[0], pixel_m[1])),
     )
-    between = between_views(heights, sensor, other, looks_px, all(o.repeated for o in observed))
-    found = combine(heights, sensor, other, looks_px, between)
-    return _map(placed, sheet, T_reference_map, observed, found, between), _notes(views, found, between)
-
-
-def _observe(view: PlacedView, sheet: _Sheet, T_reference_map: np.ndarray, slope_step: float) -> _Observed:
-    """One view's heights on the cells with their variances."""
-    cloud = view.chosen.cloud
-    grid = sheet.grid
-    raster = view.raster(grid)
-    deviation = view.deviation_m.reshape(-1)
-    noise = noise_of(cloud, view.inside, _roughness(view))
-    direction, per_range, across, looks = _sight_lines(
-        sheet.points_m, sheet.gradient, view.camera_m, invert(view.T_map_view)[:3, :3], slope_step
-    )
-    slope = np.sqrt(np.einsum("...i,...i->...", cloud.points_m, cloud.points_m)) / cloud.points_m[..., 2]
-    range_variance = raster.at_cells((noise.mean_variance(cloud) * slope**2).reshape(-1))
-    correlation = _neighbour_correlation(view)
-    kept = correlation + (1.0 - correlation) * raster.concentration
-    sensor = range_variance * kept * per_range**2
-    lateral = (LATERAL_PX * view.pitch_m) ** 2 * across
-    rgb, amplitude = cloud.rgb, cloud.amplitude
-    return _Observed(
-        height=raster.at_cells(deviation),
-        sensor=sensor,
-        other=lateral + _registration_variance(view, sheet, T_reference_map),
-        samples=raster.at_cells(cloud.count.reshape(-1).astype(np.float64)),
-        direction=direction,
-        looks_px=looks,
-        repeated=noise.source == "frames",
-        rgb=None if rgb is None else raster.at_cells(rgb.reshape(-1, 3).astype(np.float64)),
-        amplitude=None if amplitude is None else raster.at_cells(amplitude.reshape(-1)),
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def _sight_lines(
-    points: np.ndarray, gradient: np.ndarray, camera: np.ndarray, R_view_map: np.ndarray, slope_step: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return for cells (h, w): unit direction to the camera (h, w, 3), change of height per metre along the ray, square
-    of the greatest change per metre across it, and x/z, y/z in the view's frame in the first view's pixels (h, w,
-    2)."""
-    h, w = points.shape[:2]
-    direction, looks = np.empty((h, w, 3)), np.empty((h, w, 2))
-    per_range, across = np.empty((h, w)), np.empty((h, w))
-    for row in range(h):
-        for column in range(w):
-            x, y, z = points[row, column] - camera
-            a, b, c = gradient[row, column]
-            distance = np.sqrt(x * x + y * y + z * z)
-            along = (x * a + y * b + z * c) / distance
-            direction[row, column] = (-x / distance, -y / distance, -z / distance)
-            per_range[row, column] = along
-            across[row, column] = max(a * a + b * b + c * c - along * along, 0.0)
-            depth = R_view_map[2, 0] * x + R_view_map[2, 1] * y + R_view_map[2, 2] * z
-            for k in range(2):
-                seen = R_view_map[k, 0] * x + R_view_map[k, 1] * y + R_view_map[k, 2] * z
-                looks[row, column, k] = seen / depth / slope_step
-    return direction, per_range, across, looks
+    return merged, T_reference_map, found, _notes(views, found)
 
 
 def _roughness(view: PlacedView) -> np.ndarray:
     """(h, w) z less the view's own smooth surface; only needed, and only worked out, where frames do not repeat."""
-    rough = np.full(view.inside.shape, np.nan)
-    inside = view.inside
-    if (view.chosen.cloud.count[inside] > 1).any():
-        return rough
-    x, y = view.places_m[inside].T
-    z = view.deviation_m[inside]
-    every = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
-    rough[inside] = z - fit_surface(x[every], y[every], z[every], SurfaceConfig()).evaluate(x, y)
+    inside = view.chosen.inside
+    rough = np.full(inside.shape, np.nan)
+    if not (view.chosen.cloud.count[inside] > 1).any():
+        x, y = view.places_m[inside].T
+        z = view.deviation_m[inside]
+        every = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
+        rough[inside] = z - fit_surface(x[every], y[every], z[every], SurfaceConfig()).evaluate(x, y)
     return rough
 
 
 def _neighbour_correlation(view: PlacedView) -> float:
-    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a pixel grid.
-
-    A smooth misfit of the surface counts as correlation, so that the variance is rather stated too large.
-    """
+    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a pixel grid."""
     if not view.chosen.cloud.organised:
         return 1.0
     d = view.deviation_m
-    middle = _median(d)
-    single = _median(np.abs(d - middle))
-    step = _median(np.concatenate([np.abs(np.diff(d, axis=0)).ravel(), np.abs(np.diff(d, axis=1)).ravel()]))
+    single = _median(np.abs(d - _median(d)))
+    step = _median(np.concatenate([np.abs(np.diff(d, axis=axis)).ravel() for axis in (0, 1)]))
     if not (single > 0 and np.isfinite(step)):
         return 1.0
     return float(np.clip(1.0 - 0.5 * (step / single) ** 2, 0.0, 1.0))
@@ -178,115 +303,85 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
 
 
-def _registration_variance(view: PlacedView, sheet: _Sheet, T_reference_map: np.ndarray) -> np.ndarray:
-    """(h, w) of the height, from the registration's covariance; 0 where the method has none."""
-    registration = view.chosen.registration
-    if not np.isfinite(registration.covariance).all():
-        return np.zeros(sheet.grid.shape)
+def _registration_variance(
+    view: ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
+) -> np.ndarray:
+    """(h, w) variance, by the registration, of the displacements w x (p - centre) + t of points (h, w, 3) along vectors
+    (h, w, 3): that of w . ((p - centre) x along) + t . along. 0 where the method has no covariance."""
+    if not view.known_covariance:
+        return np.zeros(points_m.shape[:2])
     turn = np.kron(np.eye(2), T_reference_map[:3, :3])
-    centre = transform_points(invert(T_reference_map), registration.centre_m)
-    variance: np.ndarray = _spread_along(
-        sheet.points_m, sheet.gradient, centre, np.ascontiguousarray(turn.T @ registration.covariance @ turn)
-    )
-    return variance
+    centre = transform_points(invert(T_reference_map), view.registration.centre_m)
+    lever = np.concatenate([np.cross(points_m - centre, along), along], axis=-1)
+    spread = ((lever @ (turn.T @ view.registration.covariance @ turn)) * lever).sum(axis=-1)
+    return np.asarray(np.maximum(spread, 0.0))
 
 
-@numba.njit(cache=True, nogil=True)
-def _spread_along(points: np.ndarray, along: np.ndarray, centre: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(h, w) variance of the displacements w x (p - centre) + t of points (h, w, 3) along vectors (h, w, 3): that of
-    w . ((p - centre) x along) + t . along."""
-    h, w = points.shape[:2]
-    spread = np.empty((h, w))
-    lever = np.empty(6)
-    for row in range(h):
-        for column in range(w):
-            a, b, c = along[row, column]
-            x, y, z = points[row, column] - centre
-            lever[:] = (y * c - z * b, z * a - x * c, x * b - y * a, a, b, c)
-            total = 0.0
-            for i in range(6):
-                for j in range(6):
-                    total += lever[i] * covariance[i, j] * lever[j]
-            spread[row, column] = max(total, 0.0)
-    return spread
-
-
-def _map(
-    placed: Sequence[PlacedView],
-    sheet: _Sheet,
-    T_reference_map: np.ndarray,
-    observed: Sequence[_Observed],
-    found: Combined,
-    between: BetweenViews,
-) -> SurfaceMap:
-    used = found.used
-    towards = sum(np.where(u[..., None], o.direction, 0.0) for u, o in zip(used, observed, strict=True))
-    number = used.sum(axis=0)
-    length = np.linalg.norm(towards, axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        direction = towards / length[..., None]
-        spread = np.rad2deg(np.sqrt(np.maximum(2.0 * (1.0 - length / number), 0.0)))
-    samples = sum(np.where(u, o.samples, 0.0) for u, o in zip(used, observed, strict=True))
-    return SurfaceMap(
-        T_reference_map=T_reference_map,
-        views=tuple(view.chosen.prepared.view.name for view in placed),
-        map_views=_map_views(placed, found),
-        x_m=sheet.grid.x,
-        y_m=sheet.grid.y,
-        cell_m=sheet.grid.step,
-        surface_z_m=sheet.points_m[..., 2],
-        height_m=found.height_m,
-        variance_m2=found.variance_m2,
-        temporal_m2=found.temporal_m2,
-        spread_m2=found.spread_m2,
-        samples=np.round(samples).astype(np.int32),
-        seen_by=used,
-        direction=direction,
-        direction_spread_deg=spread,
-        rejected=found.rejected,
-        between=between,
-        rgb=_mean_colour([o.rgb for o in observed], found),
-        amplitude=_mean_amplitude([o.amplitude for o in observed], found),
-    )
-
-
-def _map_views(placed: Sequence[PlacedView], found: Combined) -> MapViews:
-    shares = found.shares.sum(axis=(1, 2))
-    shares = shares / shares.sum()
-    x, y = np.sqrt(shares @ np.stack([view.pixel_m for view in placed]) ** 2)
-    return MapViews(np.stack([view.T_map_view for view in placed]), shares, (float(x), float(y)))
-
-
-def _mean_colour(colours: Sequence[np.ndarray | None], found: Combined) -> np.ndarray | None:
-    """(h, w, 3) uint8 by the heights' weights; None where a view has no colour."""
-    known = [colour for colour in colours if colour is not None]
-    if len(known) < len(colours):
-        return None
-    mean = sum(share[..., None] * np.nan_to_num(c) for share, c in zip(found.shares, known, strict=True))
-    return np.asarray(np.round(mean), dtype=np.uint8)
-
-
-def _mean_amplitude(amplitudes: Sequence[np.ndarray | None], found: Combined) -> np.ndarray | None:
-    """(h, w) as `_mean_colour`, NaN where no view counts."""
-    known = [amplitude for amplitude in amplitudes if amplitude is not None]
-    if len(known) < len(amplitudes):
-        return None
-    mean = sum(share * np.nan_to_num(a) for share, a in zip(found.shares, known, strict=True))
-    return np.where(np.isfinite(found.height_m), mean, np.nan)
-
-
-def _notes(views: Sequence[ChosenView], found: Combined, between: BetweenViews) -> tuple[str, ...]:
-    notes: list[str] = []
-    if len(views) == 1:
-        notes.append("one view: errors fixed for a view (pattern, wiggling) cannot be told, its variance has none")
-    else:
-        notes.append(
+def _notes(views: Sequence[ChosenView], found: SurfaceMap) -> tuple[str, ...]:
+    between = found.between
+    notes = ["one view: errors fixed for a view (pattern, wiggling) cannot be told, its variance has none"]
+    if len(views) > 1:
+        notes = [
             f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over {between.length_px:.1f} px of the sensor,"
             f" other differences between views {1e3 * np.sqrt(between.own_m2):.3f} mm"
-        )
-    without = [v.prepared.view.name for v in views if not np.isfinite(v.registration.covariance).all()]
+        ]
+    without = [view.name for view in views if not view.known_covariance]
     if without:
         notes.append(f"registered without a covariance, so counted among those differences: {', '.join(without)}")
     if found.rejected:
-        notes.append(f"{found.rejected} of {int(found.used.sum()) + found.rejected} observations were outliers")
+        notes.append(f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations were outliers")
     return tuple(notes)
+
+
+def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if it comes from the
+    sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise
+    of a correlation camera falls as 1 / amplitude: Lange and Seitz 2001), or without amplitude the range to the fourth.
+    A sample variance of ten frames is off by a factor of two; as a weight it would favour pixels quiet by chance.
+    ``deviation_m`` (h, w): z less the view's own smooth surface; where there is one frame only, its squares stand in
+    for the variances, so the fixed pattern counts as noise. Not modelled: noise that frames share (slow drift),
+    multipath, and the fixed pattern."""
+    from scipy.optimize import nnls
+    from scipy.stats import chi2
+
+    q = _regressor(cloud)
+    used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
+    repeated = bool(used.sum() >= PER_BIN)
+    if repeated:
+        samples, freedom = cloud.variance_m2[used], cloud.count[used] - 1.0
+    else:
+        used = inside & np.isfinite(deviation_m)
+        # one sample has the variance of a frame: it is divided by their number below
+        samples, freedom = deviation_m[used] ** 2 * cloud.count[used], np.ones(int(used.sum()))
+    slope, constant, typical = 0.0, LEAST_M2, 1.0
+    if used.any():
+        some = slice(None, None, max(1, len(samples) // SAMPLED))
+        numbers, where = np.unique(freedom[some], return_inverse=True)
+        samples = samples[some] / (chi2.median(numbers) / numbers)[where]
+        x = q[used][some]
+        # through the medians of classes of q: robust against damage in the view
+        parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
+        typical = float(np.median(x))
+        middle = np.array([np.median(x[part]) for part in parts]) / typical
+        height = np.maximum([np.median(samples[part]) for part in parts], LEAST_M2)
+        # each median is known to the same part of itself
+        slope, constant = nnls(np.column_stack([middle, np.ones(len(parts))]) / height[:, None], np.ones(len(parts)))[0]
+    frame = slope * q / typical + constant
+    left = 0.0
+    if cloud.z_step_m > 0 and repeated:
+        # rounding leaves in any average what no scatter shows: where frames repeat each other exactly it is all
+        left = rounding_left_m2(cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.maximum(frame / cloud.count + left, LEAST_M2), repeated
+
+
+def _regressor(cloud: Cloud) -> np.ndarray:
+    """(h, w) q: 1 / amplitude^2, or range^4 where a tenth of the points has no amplitude."""
+    valid = cloud.valid
+    if cloud.amplitude is not None:
+        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
+        if known.sum() >= 0.9 * valid.sum():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                q = 1.0 / cloud.amplitude**2
+            return np.where(known, q, np.where(valid, np.median(q[known]), np.nan))
+    return np.asarray((cloud.points_m**2).sum(axis=-1) ** 2)

@@ -20,10 +20,7 @@ class GridMerge(Config):
 
 
 class FusedMerge(Config):
-    """A map over the fitted surface: inverse-variance mean, its variance, count and viewing directions of each cell.
-
-    Frame: see `detectors.mapping.fusion`.
-    """
+    """A map over the fitted surface: inverse-variance mean of the views, its variance and count of each cell."""
 
     kind: Literal["fusion"] = "fusion"
     cell_mm: float | None = Field(default=None, gt=0, le=50, description="none: the first view's pixel pitch")
@@ -41,11 +38,8 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 
 
 class MappingConfig(Config):
-    """Settings from views to one cloud: the target is cut out of each view, its marks are found, views registered and
-    merged.
-
-    ``views``: use the first so many; none means all. ``crop``: of each view, in its own frame.
-    """
+    """Settings of crop, marks, registration and merge of views; ``views``: use the first so many; none means all. Each
+    view is cropped in its own frame."""
 
     views: int | None = Field(default=None, ge=1, le=1000)
     crop: CropConfig = Field(default_factory=AutoCrop)

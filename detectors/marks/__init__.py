@@ -1,3 +1,1 @@
 """Fiducial marks: found by colour or by code, with their place in space and how well it is known."""
-
-from __future__ import annotations

@@ -1,80 +1,175 @@
-"""Groups of coloured pixels: what may be a mark, with its rim."""
+"""Pixels that stand apart from the target's own colour, and their groups: what may be a mark, with its rim.
+
+Colour enters as chromaticity, which uneven light leaves alone and light of another colour shifts. A smooth polynomial
+over the target, fitted robustly, follows the shift; the scatter of what is left (minimum covariance determinant,
+Rousseeuw 1985, from one fixed start) says how far the target's own colour strays; the threshold is extrapolated from
+the scatter's tail to a rate of false pixels. Marks may cover a quarter of the target. Not modelled: shadows with hard
+edges."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from detectors.clusters import euclidean_clusters
-from detectors.marks.pixelation import region_covariance_px2
 from detectors.masks import grown, parts_with, shrunk
-from harness.vocabulary.capture import Cloud
+from harness.vocabulary.geometry import Cloud
 
-LEAST_PIXELS = 9
-"""Least pixels of a mark: three by three. Fewer have no inside, so nothing tells them from noise or from a rim."""
-MOST_BLOBS = 200
-"""The largest are looked at: more than this is speckle."""
-RIM_PX = 2
-"""Reach beyond the pixels found in which a mixed rim is looked for."""
-RING_PX = 8
-"""Reach of the surroundings whose colour is compared; they begin where a window of five pixels misses the rim."""
+FALSE_RATE = 1e-5
+"""Share of the target's own pixels that the extrapolated tail puts beyond the threshold. Real tails give ten (Gauss) to
+a hundred (Laplace) times as many: no mark, because a mark has nine that touch."""
+DEGREE = 2
+"""Degree of the polynomial: one lamp's fall-off, or two lamps of different colour, bend once over a board."""
+SAMPLE, STEPS, CORE = 4096, 6, 0.6
+"""Pixels of the fit, its steps of reweighting, and the share of the pixels that the scatter rests on."""
+CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
+"""Variance of the innermost `CORE` of a Gaussian in one and two dimensions."""
+GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
+"""Distances that `FALSE_RATE` of a Gaussian's exceed, in one and two dimensions."""
+NEARBY_PX = 16
+"""Reach to which a camera smears colour: JPEG keeps one for two by two pixels, in blocks of eight of these."""
+TAIL = (0.4, 0.7)
+"""Quantiles from which the tail is extrapolated; those above may be marks."""
+
+
+def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return shares (n, 2) of red and of blue in the sum of the channels, and the variance (n,) that rounding to whole
+    counts gives each of them, of colours (n, 3) uint8. Half a count is added, so that black has a share."""
+    counts = rgb.astype(np.float64) + 0.5
+    total = counts.sum(axis=1)
+    return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
+
+
+def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the logarithm (n, 1) of the mean of the channels and the variance (n,) that rounding gives it."""
+    mean = rgb.astype(np.float64).mean(axis=1) + 0.5
+    return np.log(mean)[:, None], 1.0 / 36.0 / mean**2
+
+
+def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance of pixels from the target's own colour (n,): in deviations of its scatter (the contrast), and
+    in units of the threshold, which is wider for dark pixels (the margin). ``features`` (n, p), p 1 or 2; ``rounding``
+    (n,) their variance from the whole counts, which dark pixels have more of: whatever noise the counts have is taken
+    to grow as it does. ``xy`` (n, 2): any smooth co-ordinates."""
+    stride = max(1, len(features) // SAMPLE)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    x, y = ((xy - (low + high) / 2) / np.maximum((high - low) / 2, 1e-12)).T
+    basis = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
+    backdrop = basis @ _smooth(basis[::stride], features[::stride])
+    offset = features - backdrop
+    darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
+    scatter = _scatter((offset / darkness[:, None])[::stride]) + np.median(rounding) * np.eye(features.shape[1])
+    contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
+    distance = contrast / darkness
+    return contrast, distance / _threshold(distance[::stride], features.shape[1])
+
+
+def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby, so
+    that a group ends where its edge is half way, and what a camera smears around it is not taken for more. The greatest
+    is that of a pixel with its eight neighbours, by their median."""
+    beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
+    side = 2 * NEARBY_PX + 1
+    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((side, side), np.uint8))
+    kept: np.ndarray = chosen & (beyond > 0.5 * greatest)
+    return kept
+
+
+def _smooth(basis: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """Coefficients (terms, p) by iterated bisquare weights from the median, one weight a pixel."""
+    coefficients = np.zeros((basis.shape[1], features.shape[1]))
+    coefficients[0] = np.median(features, axis=0)
+    for _ in range(STEPS):
+        residuals = features - basis @ coefficients
+        scale = np.maximum(np.median(np.abs(residuals), axis=0) / 0.6745, 1e-4)
+        square = ((residuals / (4.685 * scale)) ** 2).max(axis=1)
+        weight = np.where(square < 1.0, (1.0 - square) ** 2, 0.0)
+        gram = (basis * weight[:, None]).T @ basis
+        coefficients = np.linalg.lstsq(gram, (basis * weight[:, None]).T @ features, rcond=1e-9)[0]
+    return coefficients
+
+
+def _scatter(apart: np.ndarray) -> np.ndarray:
+    """Covariance (p, p) of the bulk about the backdrop, as of a Gaussian whose innermost part it is."""
+    p = apart.shape[1]
+    covariance = np.diag(np.maximum(np.median(np.abs(apart), axis=0) / 0.6745, 1e-6) ** 2)
+    for _ in range(STEPS):
+        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(covariance), apart)
+        core = apart[square <= np.quantile(square, CORE)]
+        covariance = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
+    return covariance
+
+
+def _threshold(distance: np.ndarray, p: int) -> float:
+    """The distance that `FALSE_RATE` of the target's own pixels exceed: a Weibull tail through the quantiles `TAIL`,
+    between a Gaussian's (shape 2 in two dimensions) and an exponential one (shape 1), and never below the
+    Gaussian's."""
+    middle, outer = np.quantile(distance, TAIL)
+    logs = [-np.log(1.0 - share) for share in TAIL]
+    shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
+    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / float(np.clip(shape, 1.0, 2.0)))
+    return float(max(tail, GAUSSIAN_LIMITS[p]))
+
+
+LEAST_PIXELS, MOST_BLOBS = 9, 200
+"""Least pixels of a mark, three by three (fewer have no inside), and the most groups that are looked at."""
+RIM_PX, RING_PX = 2, 8
+"""Reach beyond the pixels found in which a mixed rim is looked for, and of the surroundings that are compared."""
 MIXED_SHARE = 0.15
-"""Share of the rim two pixels wide: colours that are means over the pixel's area put 0.6 / 2 of it between 0.2 and 0.8
-of the way from one colour to the other, colours of the pixel's centre none."""
+"""Share of the rim, two pixels wide, between 0.2 and 0.8 of the way from one colour to the other: 0.6 / 2 where colours
+are means over the pixel's area, none where they are those of its centre."""
 SHARE_SIGMA = 0.1
-"""Deviation of a rim's colour as a share of area: a camera's transfer curve and its lens's blur are not known. A curve
-of 1 / 2.2 moves the shares between two colours of a contrast of five by as much."""
+"""Deviation of a rim's colour as a share of area: a camera's transfer curve and its lens's blur are not known."""
 ALIKE = 0.35
 """A pixel has a blob's colour where its distance to it is less than this part of that to the surroundings' colour."""
 CUT_SHARE = 0.05
 """Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
 GAP_SPACINGS = 2.2
 """Steps between points of one mark in a cloud without a grid: neighbours along a diagonal (1.4), and one missing."""
+HIGHEST = 6
+REST = np.pi**2 / 6 / (1.0 / np.arange(1, HIGHEST + 1) ** 2).sum()
+"""Highest frequency along each axis, and what makes up for the higher ones of an edge along the grid (1 / k^2 each)."""
+STEP = 1e-5
+"""Difference in frequency by which a transform is differentiated: good to 1e-6 for regions of 100 pixels across."""
+RECTANGULAR = 0.85
+"""Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
+SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
+"""Outlines between one whole pixel and the next, a rank-1 lattice over width and height; and turns of each, in pixels
+over its longer side: the thirds of a step."""
 
 
 @dataclass(frozen=True)
 class Blob:
     """``pixels`` (n,) flat indices and ``weights`` (n,) how much of the blob's colour they have, 0..1. ``grid`` (n, 2)
-    their places on a grid of unit step. ``share_covariance`` (2, 2) of the centroid there where weights are shares of
-    area, else None. ``surroundings`` (m,) flat indices of the target's points on and about it. ``contrast`` (3,):
-    logarithm of its colour over that of its surroundings, channel by channel, in which the light cancels. ``doubt``:
-    that it is cut, empty if not."""
+    their places on a grid of unit step, with ``grid_covariance`` (2, 2) of the centroid there. ``surroundings`` (m,)
+    flat indices of the target's points on and about it. ``contrast`` (3,): logarithm of its colour over that of its
+    surroundings, channel by channel, in which the light cancels. ``doubt``: that it is cut, empty if not."""
 
     pixels: np.ndarray
     weights: np.ndarray
     grid: np.ndarray
-    share_covariance: np.ndarray | None
+    grid_covariance: np.ndarray
     surroundings: np.ndarray
     contrast: np.ndarray
     doubt: str = ""
 
-    @property
-    def grid_covariance(self) -> np.ndarray:
-        """Covariance (2, 2) of the centroid on the grid."""
-        return region_covariance_px2(self.grid) if self.share_covariance is None else self.share_covariance
-
 
 def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
     """Find the connected groups of ``coloured`` (h, w) pixels, the largest first; single missing pixels do not part
-    them.
-
-    Whether a rim's colours are mixtures is a property of the camera, so it is decided for all groups together.
-    """
+    them. Whether a rim's colours are mixtures is a property of the camera, so it is decided for all groups together."""
     if not cloud.organised:
         return _in_space(cloud, inside, coloured)
     closed = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     order = 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]
-    windows = [
-        _window(cloud, inside, coloured, labels, int(label), boxes[label])
-        for label in order
-        if boxes[label, cv2.CC_STAT_AREA] >= LEAST_PIXELS
-    ]
-    rims = np.concatenate([window.share[window.rim] for window in windows]) if windows else np.zeros(0)
+    large = [label for label in order if boxes[label, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
+    windows = [_window(cloud, inside, coloured, labels, label, boxes[label]) for label in large]
+    rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
     mixed = len(rims) > 0 and bool(np.mean((rims > 0.2) & (rims < 0.8)) >= MIXED_SHARE)
-    blobs = [blob for window in windows if (blob := _blob(window, mixed, inside.shape)) is not None]
+    blobs = [blob for _, settled in windows if (blob := settled(mixed)) is not None]
     # those that share pixels with a larger one are parts of it
     taken = np.zeros(inside.size, dtype=bool)
     kept = []
@@ -86,79 +181,84 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
     return kept
 
 
-@dataclass(frozen=True)
-class _Window:
-    """A part of the grid about one group, from ``row`` and ``column`` on: the ``group``, the target and the other
-    groups there; and the ``share`` of the way from the surroundings' colour (0) to the group's (1) of each pixel's.
-
-    ``alike``: pixels of the group's colour. ``strays``: the deviation of independent pixels that would average over
-    5 x 5 as the surroundings' shares do: neighbours share their colour in a camera's mosaic and in JPEG.
-    """
-
-    row: int
-    column: int
-    group: np.ndarray
-    inside: np.ndarray
-    valid: np.ndarray
-    others: np.ndarray
-    share: np.ndarray
-    alike: np.ndarray
-    contrast: np.ndarray
-    strays: float
-    doubt: str
-
-    @property
-    def rim(self) -> np.ndarray:
-        """Pixels on either side of the group's border."""
-        return grown(self.group, 1) & ~_eroded(self.group) & self.inside
-
-
 def _window(
     cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, labels: np.ndarray, label: int, box: np.ndarray
-) -> _Window:
+) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
+    """The shares (n,) of the way from the surroundings' colour (0) to the group's (1) of the pixels on either side of
+    its border; and what makes a blob of the group once it is known whether rims are mixed."""
     left, top, width, height, area = (int(value) for value in box)
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row, column = max(top - margin, 0), max(left - margin, 0)
     cut = (slice(row, top + height + margin), slice(column, left + width + margin))
     assert cloud.rgb is not None
-    target = inside[cut]
-    group = (labels[cut] == label) & coloured[cut]
+    target, others = inside[cut], coloured[cut]
+    group = (labels[cut] == label) & others
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
-    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~coloured[cut]
+    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
     alone = ring.sum() < LEAST_PIXELS
-    rgb = cloud.rgb[cut].astype(float) if alone else _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
-    other = np.zeros(3) if alone else np.median(rgb[ring], axis=0)
+    rgb = cloud.rgb[cut].astype(float)
+    usual, other, strays = np.median(rgb[target], axis=0), np.zeros(3), 0.0
+    if not alone:
+        rgb = _evenly_lit(rgb, ring, group)
+        usual = other = np.median(rgb[ring], axis=0)
     span = np.median(rgb[core], axis=0) - other
     share = (rgb - other) @ span / max(float(span @ span), 1e-12)
-    away, averaged = np.linalg.norm(rgb - other - span, axis=-1), cv2.blur(share, (5, 5))
-    if not alone:
+    if alone:
+        share = group.astype(float)
+    else:
+        # neighbours share their colour in a camera's mosaic and in JPEG: independent pixels that would average alike
+        strays = float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2))))
         # the threshold that found the group knows the target's colour only, and leaves gaps where contrast is low: the
         # connected pixels more of the group's colour than not, as far as the surroundings reach
         group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
-    return _Window(
-        row=row,
-        column=column,
-        group=group,
-        inside=target,
-        valid=cloud.valid[cut],
-        others=coloured[cut] & ~group,
-        share=group.astype(float) if alone else share,
-        alike=away < ALIKE * np.linalg.norm(span),
-        contrast=_contrast(other + span, np.median(rgb[target], axis=0) if alone else other),
-        strays=0.0 if alone else float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(averaged[ring] ** 2)))),
-        doubt="nothing of the target's own colour is seen around it" if alone else "",
-    )
+    rim = grown(group, 1) & ~_eroded(group) & target
+
+    def settled(mixed: bool) -> Blob | None:
+        """Weigh each pixel by how far it has the group's colour if rims are mixed, else wholly; None for too few."""
+        weights = group.astype(float)
+        if mixed:
+            near = grown(group, RIM_PX) & target & ~(others & ~group)
+            weights = np.where(near, np.clip(share, 0.0, 1.0), 0.0)
+        v, u = np.nonzero((weights > 0.5) & target)
+        if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
+            return None
+        # why the group may go on where the target's points do not
+        around = grown(group, 1) & ~group
+        alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
+        on = around & alike & ~target
+        last_row, last_column = inside.shape[0] - 1 - row, inside.shape[1] - 1 - column
+        doubt = ""
+        if alone:
+            doubt = "nothing of the target's own colour is seen around it"
+        elif on.sum() > max(2.0, CUT_SHARE * around.sum()):
+            by_crop = (on & cloud.valid[cut]).sum() > on.sum() / 2
+            doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
+        elif u.min() == -column or v.min() == -row or u.max() == last_column or v.max() == last_row:
+            doubt = "cut by the picture's edge"
+        used_v, used_u = np.nonzero((weights > 0) & target)
+        grid = np.stack([used_u, used_v], axis=1).astype(float)
+        if mixed:
+            # the weights of the rim are wrong by `SHARE_SIGMA`, and by what the surroundings' colours stray
+            arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
+            covariance = (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / max(float(weights.sum()), 1.0) ** 2
+        else:
+            covariance = region_covariance_px2(grid)
+        own, around = ((v + row) * inside.shape[1] + u + column for v, u in ((used_v, used_u), np.nonzero(target)))
+        contrast = _contrast(other + span, usual)
+        return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
+
+    return share[rim], settled
 
 
 def _contrast(own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the logarithm (3,) of one colour over another; a count is added to each, so that black has one."""
+    """Logarithm (3,) of one colour over another; a count is added to each, so that black has one."""
     return np.asarray(np.log((own + 1.0) / (other + 1.0)))
 
 
 def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return colours (h, w, 3) as if the light were everywhere that at the group's middle: each channel over the ring's
-    plane through it. Light that falls off along a group would else weigh its two ends differently."""
+    """Colours (h, w, 3) as if the light were everywhere that at the group's middle: each channel over the ring's plane
+    through it. Light that falls off along a group would else weigh its two ends differently."""
     v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
     middle_v, middle_u = (float(axis[group].mean()) for axis in (v, u))
     basis = np.stack([np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]], axis=-1)
@@ -167,83 +267,99 @@ def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndar
     return np.asarray(rgb / np.clip(light, 0.5, 2.0))
 
 
-def _blob(window: _Window, mixed: bool, shape: tuple[int, int]) -> Blob | None:
-    """Return the group as a blob: with ``mixed`` rims each pixel counts as far as it has the group's colour, else
-    wholly."""
-    weights = window.group.astype(float)
-    if mixed:
-        near = grown(window.group, RIM_PX) & window.inside & ~window.others
-        weights = np.where(near, np.clip(window.share, 0.0, 1.0), 0.0)
-    v, u = np.nonzero((weights > 0.5) & window.inside)
-    if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
-        return None
-    used_v, used_u = np.nonzero((weights > 0) & window.inside)
-    near_v, near_u = np.nonzero(window.inside)
-    return Blob(
-        pixels=(used_v + window.row) * shape[1] + used_u + window.column,
-        weights=weights[used_v, used_u],
-        grid=np.stack([used_u, used_v], axis=1).astype(float),
-        share_covariance=_share_covariance(window, float(weights.sum())) if mixed else None,
-        surroundings=(near_v + window.row) * shape[1] + near_u + window.column,
-        contrast=window.contrast,
-        doubt=window.doubt or _cut(np.stack([u, v], axis=1), window, shape),
-    )
-
-
-def _cut(own: np.ndarray, window: _Window, shape: tuple[int, int]) -> str:
-    """Return why the group, with its ``own`` places (n, 2), goes on where the target's points do not."""
-    around = grown(window.group, 1) & ~window.group
-    on = around & window.alike & ~window.inside
-    if on.sum() > max(2.0, CUT_SHARE * around.sum()):
-        crop_cuts = (on & window.valid).sum() > on.sum() / 2
-        return "cut by the crop's edge" if crop_cuts else "without range in parts of it"
-    (left, top), (right, bottom) = own.min(axis=0), own.max(axis=0)
-    at_start = window.column + left == 0 or window.row + top == 0
-    at_end = window.column + right == shape[1] - 1 or window.row + bottom == shape[0] - 1
-    return "cut by the picture's edge" if at_start or at_end else ""
-
-
-def _share_covariance(window: _Window, total: float) -> np.ndarray:
-    """Return the covariance (2, 2) of a weighted centroid: the weights of its rim are wrong by `SHARE_SIGMA`, and by
-    what the surroundings' colours stray."""
-    variance = SHARE_SIGMA**2 + window.strays**2
-    v, u = np.nonzero(window.rim)
-    own_v, own_u = np.nonzero(window.group)
-    arm = np.stack([u - own_u.mean(), v - own_v.mean()], axis=1)
-    return np.asarray(variance * arm.T @ arm / max(total, 1.0) ** 2)
-
-
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """Take a pixel off the mask; beyond the window counts as outside."""
     return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
 
 
 def _in_space(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
-    """Find groups of points without a grid, by their distances; no rim, and no telling whether they are cut."""
+    """Groups of points without a grid, by their distances; no rim, and no telling whether they are cut."""
     from scipy.spatial import cKDTree
 
     found, target = np.flatnonzero(coloured), np.flatnonzero(inside)
-    points = cloud.points_m.reshape(-1, 3)
     if len(found) < LEAST_PIXELS:
         return []
     assert cloud.rgb is not None
-    rgb = cloud.rgb.reshape(-1, 3).astype(float)
-    usual = np.median(rgb[target], axis=0)
+    points, rgb = cloud.points_m.reshape(-1, 3), cloud.rgb.reshape(-1, 3).astype(float)
     spacing = float(np.median(cKDTree(points[found]).query(points[found], k=2)[0][:, 1]))
     labels = euclidean_clusters(points[found], GAP_SPACINGS * spacing, LEAST_PIXELS)
     sizes = np.bincount(labels[labels >= 0], minlength=1)
     blobs = []
     for label in np.argsort(-sizes, kind="stable")[:MOST_BLOBS]:
         pixels = found[labels == label]
-        if len(pixels) < LEAST_PIXELS:
-            continue
         away = points[pixels] - points[pixels].mean(axis=0)
-        reach = 1.5 * np.linalg.norm(away, axis=1).max()
-        _, sizes_, axes = np.linalg.svd(away, full_matrices=False)
-        if sizes_[1] < spacing:
+        if len(pixels) < LEAST_PIXELS or (svd := np.linalg.svd(away, full_matrices=False))[1][1] < spacing:
             continue
-        grid = away @ axes[:2].T / spacing
+        grid = away @ svd[2][:2].T / spacing
+        reach = 1.5 * np.linalg.norm(away, axis=1).max()
         near = np.linalg.norm(points[target] - points[pixels].mean(axis=0), axis=1) < reach
-        contrast = _contrast(np.median(rgb[pixels], axis=0), usual)
-        blobs.append(Blob(pixels, np.ones(len(pixels)), grid, None, target[near], contrast))
+        contrast = _contrast(np.median(rgb[pixels], axis=0), np.median(rgb[target], axis=0))
+        covariance = region_covariance_px2(grid)
+        blobs.append(Blob(pixels, np.ones(len(pixels)), grid, covariance, target[near], contrast))
     return blobs
+
+
+def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
+    """Return the covariance (..., 2, 2) of the centroid of the lattice points within polygons (..., n, 2), vertices in
+    order: the lattice's own error, with sharp edges and no noise, to first order. Over random shifts of the lattice the
+    error of the sum of f(x) = x - c over the points within has, by Poisson's summation formula, the sum of |F(k)|^2
+    over all integer frequencies k but 0 as its variance, F being the Fourier transform of f over the region (Kendall
+    1948)."""
+    x = polygon_px.astype(np.float64)
+    area, centre = _area_and_centre(x)
+    steps = np.arange(-HIGHEST, HIGHEST + 1)
+    k = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    # either of k and -k
+    k = k[len(k) // 2 + 1 :].astype(np.float64)
+    ahead, behind = (
+        np.stack([_transform(x - centre[..., None, :], k + side * shift) for shift in STEP * np.eye(2)], axis=-1)
+        for side in (1.0, -1.0)
+    )
+    # the integral of x exp(-2 pi i k.x) is i / (2 pi) times the gradient of the plain transform
+    moments = (ahead - behind) / (4.0 * np.pi * STEP)
+    square = np.einsum("...ki,...kj->...ij", moments, moments.conj()).real
+    return np.asarray(2.0 * REST * square / area[..., None, None] ** 2)
+
+
+def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
+    """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
+    no line. Their convex outline stands for the region; where they fill their smallest rectangle that rectangle, whose
+    long sides tell the slope of the short ones, where few steps are seen. How its size falls between whole pixels is
+    unknown, and decides whether the errors of opposite edges add or cancel, and its slope is known to part of a step;
+    so the covariance is the mean over outlines up to a pixel larger and turned by up to that."""
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    box_middle, size, angle = cv2.minAreaRect(hull)
+    # the outermost centres lie half a pixel within the region
+    if len(pixels) > RECTANGULAR * (size[0] + 1) * (size[1] + 1):
+        outline = cv2.boxPoints((box_middle, (size[0] + 1, size[1] + 1), angle)).astype(np.float64)
+    else:
+        outline = hull[:, 0].astype(np.float64)
+    area, centre = _area_and_centre(outline)
+    # with as large an area as the pixels have
+    outline = centre + (outline - centre) * np.sqrt(len(pixels) / abs(float(area)))
+    extent = np.ptp(outline, axis=0)
+    middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
+    steps = np.arange(SIZES)
+    sizes = 1.0 + np.stack([steps, 2 * steps % SIZES], axis=1) / SIZES / extent
+    cosine, sine = np.cos(TURNS / extent.max()), np.sin(TURNS / extent.max())
+    axes = np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), -1, 0)
+    outlines = ((outline - middle) * sizes[:, None, None, :]) @ axes
+    return np.asarray(centroid_covariance_px2(outlines).mean(axis=(0, 1)))
+
+
+def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
+    following = np.roll(x, -1, axis=-2)
+    cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
+    area = cross.sum(axis=-1) / 2
+    return area, ((x + following) * cross[..., None]).sum(axis=-2) / (6 * area[..., None])
+
+
+def _transform(x: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Integral (..., k) of exp(-2 pi i k.x) over polygons (..., n, 2), with the sign of their orientation, for
+    frequencies (k, 2) but 0: by the divergence theorem a sum over the edges."""
+    edge = np.roll(x, -1, axis=-2) - x
+    outward = np.stack([edge[..., 1], -edge[..., 0]], axis=-1)
+    phase, along = (k @ np.swapaxes(each, -1, -2) for each in (edge, x + edge / 2))
+    flow = (k @ np.swapaxes(outward, -1, -2)) * np.exp(-2j * np.pi * along) * np.sinc(phase)
+    return np.asarray(flow.sum(axis=-1) / (-2j * np.pi * (k**2).sum(axis=1)))

@@ -1,52 +1,234 @@
-"""The marks of one view: coloured spots or codes that are found, judged, and put in doubt where they may be wrong.
+"""The marks of one view: coloured spots or codes (OpenCV's) that are found, judged, and put in doubt.
 
-A mark lies on the target's surface: what lies behind it is a hole through which something of another colour is seen.
-Pieces of tape of one colour are alike: the median of its colour tells the odd one, if there are three.
+The slope of a mark's plane is fitted to the mark and its surroundings together, over which depth noise averages, the
+offset to the mark alone, so that a mark that is thick, or that the camera ranges differently, is placed where it is
+measured. The centroid is that of the pixels' rays cut by this plane, weighted by the surface that they cover and by
+their colour. Spots behind the surface are holes through which another colour is seen; marks of one colour are alike.
+Not modelled: a surface or tag that bends within the mark; a lens whose distortion is more than quadratic over one tag.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from detectors.marks.backdrop import above_half, chromaticity, lightness, stand_out
-from detectors.marks.blobs import Blob, find_blobs
-from detectors.marks.coded import coded_marks
+from detectors.average import CORRELATED_PIXELS
+from detectors.marks.blobs import Blob, above_half, chromaticity, find_blobs, lightness, stand_out
 from detectors.marks.mark import LEAST_MARKS, CodedMarks, ColourMarks, Mark, MarkSet, RedMarks, problem_of
-from detectors.marks.patch import Spot, fit_patch, place_spot
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud
 
-Feature = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+PATCH_POINTS = 512
+LAR_STEPS, BISQUARE_STEPS = 5, 3
+LEAST_SCALE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Patch:
+    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m``, and the deviation of one point's z about it."""
+
+    slope_x: float
+    slope_y: float
+    offset_m: float
+    sigma_m: float
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal (3,) towards the camera (z points away from it)."""
+        steep = np.array([self.slope_x, self.slope_y, -1.0])
+        return np.asarray(steep / np.linalg.norm(steep))
+
+    def above_m(self, points_m: np.ndarray) -> np.ndarray:
+        """Return z of points (n, 3) less the plane's: positive behind it."""
+        x, y, z = points_m.T
+        return np.asarray(z - self.slope_x * x - self.slope_y * y - self.offset_m)
+
+    def cut(self, points_m: np.ndarray, projection: str) -> np.ndarray:
+        """Return the places (n, 3) at which the rays of points (n, 3) meet the plane."""
+        x, y, z = points_m.T
+        if projection == "parallel":
+            return np.stack([x, y, z - self.above_m(points_m)], axis=1)
+        scale = self.offset_m / (z - self.slope_x * x - self.slope_y * y)
+        return np.asarray(points_m * scale[:, None])
+
+    def range_covariance_m2(self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+        """Return the covariance (3, 3) of a centre (3,) on the plane by the mean z of its pixels (n,). Its deviation is
+        what is left about the plane, or the averaged frames' noise if that is more, `CORRELATED_PIXELS` sharing one
+        value; and no less than the maker of a map states."""
+        frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
+        known = frames[np.isfinite(frames)]
+        variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
+        if cloud.mean_variance_m2 is not None:
+            stated = cloud.mean_variance_m2.ravel()[pixels]
+            variance = max(variance, float(np.nanmean(stated)) if np.isfinite(stated).any() else 0.0)
+        ray = centre_m / centre_m[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
+        # a plane shifted along z by d is met further along the ray by d n_z / n.ray of it
+        along = ray * self.normal[2] / (self.normal @ ray)
+        return np.asarray(variance * min(1.0, CORRELATED_PIXELS / len(pixels)) * np.outer(along, along))
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A mark's place: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``length_m`` and ``breadth_m`` of
+    the rectangle with its second moments, ``pitch_m`` between pixels there, and ``behind_m``: how far its mean lies
+    behind its surroundings, with the standard deviation ``behind_sigma_m``."""
+
+    centre_m: np.ndarray
+    covariance_m2: np.ndarray
+    normal: np.ndarray
+    area_m2: float
+    length_m: float
+    breadth_m: float
+    pitch_m: float
+    behind_m: float
+    behind_sigma_m: float
+
+
+def fit_patch(points_m: np.ndarray) -> Patch | None:
+    """Fit the plane of most of some points (n, 3): least absolute residuals, then bisquare. None where they are too few
+    or on a line. Up to a third of them may lie off it."""
+    points = points_m[:: max(1, len(points_m) // PATCH_POINTS)]
+    if len(points) < 6:
+        return None
+    middle = np.median(points, axis=0)
+    basis = np.column_stack([points[:, :2] - middle[:2], np.ones(len(points))])
+    z = points[:, 2] - middle[2]
+    if np.linalg.matrix_rank(basis[:, :2], tol=1e-9) < 2:
+        return None
+    weight = np.ones(len(points))
+    for step in range(LAR_STEPS + BISQUARE_STEPS + 1):
+        weighted = basis * weight[:, None]
+        solved = np.linalg.solve(weighted.T @ basis, weighted.T @ z)
+        size = np.abs(z - basis @ solved)
+        scale = max(float(np.median(size)) / 0.6745, LEAST_SCALE_M)
+        if step < LAR_STEPS:
+            weight = 1.0 / np.maximum(size, 0.1 * scale)
+        else:
+            weight = np.maximum(1.0 - (size / (4.685 * scale)) ** 2, 0.0) ** 2
+    a, b, c = solved.tolist()
+    # the median of all sizes counts the points off the plane too
+    sigma = float(np.sqrt(np.mean(size[size <= 3.0 * scale] ** 2)))
+    return Patch(a, b, middle[2] + c - a * middle[0] - b * middle[1], max(sigma, LEAST_SCALE_M))
+
+
+def place_spot(
+    cloud: Cloud, pixels: np.ndarray, weights: np.ndarray, grid: np.ndarray, grid_covariance: np.ndarray, patch: Patch
+) -> Spot:
+    """Return a mark's place from its pixels (n,) flat indices of points, ``weights`` (n,) 0..1 of its colour, their
+    positions ``grid`` (n, 2) on a grid of unit step, and the covariance (2, 2) of their centroid there."""
+    points = cloud.points_m.reshape(-1, 3)[pixels]
+    own = weights > 0.5
+    # the mean height of those points within four scales of the median
+    height = patch.above_m(points[own])
+    middle = float(np.median(height))
+    scale = max(float(np.median(np.abs(height - middle))) / 0.6745, LEAST_SCALE_M)
+    kept = height[np.abs(height - middle) <= 4.0 * scale]
+    behind, sigma = float(kept.mean()), float(max(kept.std(), scale))
+    settled = replace(patch, offset_m=patch.offset_m + behind, sigma_m=sigma)
+    on_plane = settled.cut(points, cloud.projection)
+    covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
+    centre = np.average(on_plane, axis=0, weights=covers)
+    jacobian = np.linalg.lstsq(grid - grid.mean(axis=0), on_plane - centre, rcond=None)[0].T
+    covariance = settled.range_covariance_m2(centre, cloud, pixels[own]) + jacobian @ grid_covariance @ jacobian.T
+    scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
+    _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
+    pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
+    # of a flat mark: a hole's own depths differ, which must not excuse it
+    behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
+    area, pitch = pixel_area * float(weights.sum()), float(np.sqrt(pixel_area))
+    covariance = (covariance + covariance.T) / 2
+    return Spot(centre, covariance, settled.normal, area, float(major), float(minor), pitch, behind, behind_sigma)
+
+
+CORNER_PX = 0.25
+"""Standard deviation per axis of a refined corner: 0.18 on drawn sharp tags of 40 pixels, 0.34 with a blur of 1.5."""
+LEAST_SEEN, WHOLE = 0.5, 0.95
+"""Share of a tag's pixels on the target, below which it is not the target's; and that of a tag in no doubt."""
+HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+
+
+def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
+    """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one code are in doubt."""
+    none = np.zeros(0, dtype=np.int64)
+    if not cloud.organised:
+        return MarkSet((), none, problem="codes are read from a picture, and this cloud has no pixel grid")
+    assert cloud.rgb is not None
+    grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    corners_px, found, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
+    codes = [] if found is None else [int(code) for code in found.ravel()]
+    # corners (4, 2) in pixels of the grid, the centre of the first being (0, 0)
+    tags = [(code, tag.reshape(4, 2).astype(float)) for code, tag in zip(codes, corners_px, strict=True)]
+    tags.sort(key=lambda tag: (tag[0], tag[1].tolist()))
+    each = [_coded_mark(cloud, inside, code, corners, codes.count(code) > 1) for code, corners in tags]
+    marks = tuple(mark for mark in each if mark is not None)
+    off = len(each) - len(marks)
+    pixels = np.unique(np.concatenate([none, *(mark.pixels for mark in marks)]))
+    notes = (f"{off} tags lie off the target, or have no range",) if off else ()
+    return MarkSet(marks, pixels, problem_of(marks, f"searched for tags of {dictionary}"), notes)
+
+
+def _coded_mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool) -> Mark | None:
+    """The tag as a mark; None where it is off the target or without range."""
+    area = np.zeros(inside.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(area, np.rint(corners).astype(np.int32), 1)
+    pixels = np.flatnonzero((area > 0) & inside)
+    points = cloud.points_m.reshape(-1, 3)[pixels]
+    patch = fit_patch(points) if len(pixels) >= LEAST_SEEN * area.sum() else None
+    if patch is None:
+        return None
+    grid = np.stack([pixels % inside.shape[1], pixels // inside.shape[1]], axis=1).astype(float)
+    middle, half = grid.mean(axis=0), max(float(np.ptp(grid, axis=0).max()) / 2, 1.0)
+    rays = points[:, :2] / points[:, 2:] if cloud.projection == "central" else points[:, :2]
+    coefficients = np.linalg.lstsq(_quadratic((grid - middle) / half), rays, rcond=1e-10)[0]
+    wanted = np.concatenate([corners, corners.mean(axis=0) + HALF_STEPS])
+    found = _quadratic((wanted - middle) / half) @ coefficients
+    on_plane = patch.cut(np.column_stack([found, np.ones(len(found))]), cloud.projection)
+    places, steps = on_plane[:4], np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1)
+    centre = places.mean(axis=0)
+    covariance = steps @ steps.T * CORNER_PX**2 / 4 + patch.range_covariance_m2(centre, cloud, pixels)
+    seen, without = len(pixels) / int(area.sum()), 1.0 - cloud.valid[area > 0].mean()
+    doubt = ""
+    if twice:
+        doubt = f"code {code} is seen more than once"
+    elif seen < WHOLE and without > 1.0 - WHOLE:
+        doubt = f"without range in {100 * without:.0f} % of it"
+    elif seen < WHOLE:
+        doubt = f"{100 * (1 - seen):.0f} % of it beyond the crop's edge"
+    area_m2 = float(np.linalg.norm(np.cross(places[2] - places[0], places[3] - places[1]))) / 2
+    return Mark(centre, (covariance + covariance.T) / 2, patch.normal, pixels, area_m2, code, doubt)
+
+
+def _quadratic(uv: np.ndarray) -> np.ndarray:
+    u, v = uv.T
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+
+
 CLEAR_MARGIN = 2.0
 """Marks whose pixels pass the threshold by this factor have whole outlines; else lightness is tried too."""
 LEAST_TARGET = 100
-"""Pixels of the target below which its own colour is not known."""
 BEHIND_M = 2.0 * MM
-"""A mark may seem to lie so far behind its surroundings: cameras range dark and bright surfaces differently, by a
-millimetre or two. A hole seen through is deeper, but for the smallest ones, which the camera's blur fills."""
+"""A mark may seem to lie so far behind its surroundings: cameras range dark and bright surfaces differently."""
 BEHIND_SIGMAS = 5.0
 RAISED_SHARE = 0.25
 """A mark may stand before its surroundings by this part of its breadth: a tag on board, but no object."""
 SAME_COLOUR = 0.35
 """Two spots have one colour where their contrasts to their surroundings differ by less than this part of them."""
 WEAK_SHARE = 1 / 3
-"""Share of the strongest colour's contrast to its surroundings: weaker spots beside such marks are stains, or what a
-camera's compression makes of the light."""
+"""Share of the strongest colour's contrast to its surroundings: weaker spots beside such marks are stains."""
 UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
-"""A mark's length, breadth or area is unlike the others' where it differs by more than this part of the median and so
-many pixels more: a pixel at either end may be missed."""
+"""A mark's length, breadth or area is unlike the others' from this part of the median and so many pixels on."""
 LARGEST_SHARE = 0.15
-"""Share of the target: a larger spot is no mark, but a part of the target of another colour."""
+"""Share of the target: a larger spot is a part of the target of another colour."""
 
 
 def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks) -> MarkSet:
-    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour.
-
-    Never raises for what the picture shows: a set on which no registration can rest says so in its ``problem``.
-    """
+    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. Never raises for what the picture
+    shows: a set on which no registration can rest says so in its ``problem``."""
     none = MarkSet((), np.zeros(0, dtype=np.int64))
     if cloud.rgb is None:
         return replace(none, problem="the capture has no colour, by which marks are found")
@@ -75,118 +257,98 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
     return replace(lighter, notes=(*lighter.notes, "the marks were found by their lightness"))
 
 
-def _standing_out(cloud: Cloud, inside: np.ndarray, feature: Feature) -> tuple[MarkSet, float]:
-    """Find the marks by one feature of the colours, and the median margin of the trusted ones' pixels."""
+def _standing_out(
+    cloud: Cloud, inside: np.ndarray, feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> tuple[MarkSet, float]:
+    """The marks by one feature of the colours, and the median margin of the trusted ones' pixels."""
     assert cloud.rgb is not None
-    apart = stand_out(*feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2])
     contrast, margin = np.zeros(inside.shape), np.zeros(inside.shape)
-    contrast[inside], margin[inside] = apart.contrast, apart.margin
+    contrast[inside], margin[inside] = stand_out(*feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2])
     coloured = above_half(margin > 1.0, contrast) if cloud.organised else margin > 1.0
     found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
     # a hole through which another colour shows is no fiducial
     own = np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in found.marks)]))
-    found = replace(found, points=own)
     pixels = [mark.pixels for mark in found.trusted]
-    return found, float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
-
-
-def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
-    """Find marks among coloured pixels; ``missing`` says why there are not more."""
-    candidates = []
-    for blob in find_blobs(cloud, inside, coloured):
-        patch = fit_patch(cloud.points_m.reshape(-1, 3)[blob.surroundings])
-        if patch is not None:
-            spot = place_spot(cloud, blob.pixels, blob.weights, blob.grid, patch)
-            candidates.append(_Candidate(blob, spot, float((blob.weights > 0.5).sum()) / int(inside.sum())))
-    marks, notes = _judged(candidates)
-    if not cloud.organised:
-        notes += ("a cloud without a pixel grid does not tell whether a mark is cut",)
-    return MarkSet(marks, np.flatnonzero(coloured), problem_of(marks, missing), notes)
-
-
-# ---------------------------------------------------------------- judging
+    median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
+    return replace(found, points=own), median
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A spot with its pixels, and its share of the target's."""
+    """A spot with its pixels. ``share``: of the target's. ``behind``: True where it lies behind the surface.
+    ``sizes_m`` (3,): length, breadth, and the mean breadth over the length, which gaps lessen."""
 
     blob: Blob
     spot: Spot
     share: float
-
-    @property
-    def behind(self) -> bool:
-        """True where it lies behind the surface."""
-        return self.spot.behind_m > max(BEHIND_M, BEHIND_SIGMAS * self.spot.behind_sigma_m)
-
-    @property
-    def sizes_m(self) -> np.ndarray:
-        """Length, breadth, and the mean breadth over the length, which gaps lessen (3,)."""
-        return np.array([self.spot.length_m, self.spot.breadth_m, self.spot.area_m2 / self.spot.length_m])
-
-    def mark(self, usual_m: np.ndarray | None) -> Mark:
-        """Return the mark, with its doubt; ``usual_m`` (3,): the sizes of its like."""
-        spot, blob = self.spot, self.blob
-        doubt = blob.doubt
-        if doubt:
-            pass
-        elif self.share > LARGEST_SHARE:
-            doubt = f"{100 * self.share:.0f} % of the target: a part of it rather than a mark"
-        elif -spot.behind_m > max(RAISED_SHARE * spot.breadth_m, BEHIND_SIGMAS * spot.behind_sigma_m):
-            doubt = f"it stands {-spot.behind_m / MM:.0f} mm before the surface"
-        elif usual_m is not None:
-            unlike = np.abs(self.sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
-            doubt = f"unlike the others: {_in_words(self.sizes_m)}, they {_in_words(usual_m)}" if unlike.any() else ""
-        pixels = blob.pixels[blob.weights > 0.5]
-        covariance = spot.covariance_m2(blob.grid_covariance)
-        return Mark(spot.centre_m, covariance, spot.normal, pixels, spot.area_m2, doubt=doubt)
+    behind: bool
+    sizes_m: np.ndarray
 
 
-def _in_words(sizes_m: np.ndarray) -> str:
-    length, breadth, mean_breadth = sizes_m
-    return f"{length / MM:.0f} x {breadth / MM:.0f} mm, {100 * min(mean_breadth / breadth, 1.0):.0f} % filled"
-
-
-def _judged(candidates: Sequence[_Candidate]) -> tuple[tuple[Mark, ...], tuple[str, ...]]:
-    """Return the marks, in the order of their pixels, and notes on what was taken for none."""
+def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
+    """The marks among coloured pixels, in the order of their pixels; ``missing`` says why there are not more."""
+    candidates = []
+    for blob in find_blobs(cloud, inside, coloured):
+        patch = fit_patch(cloud.points_m.reshape(-1, 3)[blob.surroundings])
+        if patch is not None:
+            spot = place_spot(cloud, blob.pixels, blob.weights, blob.grid, blob.grid_covariance, patch)
+            share = float((blob.weights > 0.5).sum()) / int(inside.sum())
+            behind = spot.behind_m > max(BEHIND_M, BEHIND_SIGMAS * spot.behind_sigma_m)
+            sizes_m = np.array([spot.length_m, spot.breadth_m, spot.area_m2 / spot.length_m])
+            candidates.append(_Candidate(blob, spot, share, behind, sizes_m))
     # groups of one colour, each candidate compared with the first of its group
     colours: list[list[_Candidate]] = []
     for candidate in sorted(candidates, key=lambda c: (-c.spot.area_m2, int(c.blob.pixels[0]))):
         for group in colours:
-            apart = np.linalg.norm(candidate.blob.contrast - group[0].blob.contrast)
-            if apart < SAME_COLOUR * np.linalg.norm(group[0].blob.contrast):
+            contrast = group[0].blob.contrast
+            if np.linalg.norm(candidate.blob.contrast - contrast) < SAME_COLOUR * np.linalg.norm(contrast):
                 group.append(candidate)
                 break
         else:
             colours.append([candidate])
-    groups, vivid = [], []
+    groups = []
     for colour in colours:
         # where most of a colour's area lies behind, holes too small to look deep share the colour of those that do
-        behind = sum(c.spot.area_m2 for c in colour if c.behind)
-        group = [] if behind > 0.5 * sum(c.spot.area_m2 for c in colour) else [c for c in colour if not c.behind]
-        if group:
-            whole = [c for c in group if not c.blob.doubt]
-            usual_m = _usual_m(whole) if len(whole) >= 3 else None
-            groups.append([c.mark(usual_m) for c in group])
-            vivid.append(float(np.linalg.norm(group[0].blob.contrast)))
-    enough = [sum(not mark.doubt for mark in group) >= LEAST_MARKS for group in groups]
-    least = WEAK_SHARE * max((v for v, many in zip(vivid, enough, strict=True) if many), default=0.0)
+        flat = [c for c in colour if not c.behind]
+        if flat and 2.0 * sum(c.spot.area_m2 for c in colour if c.behind) <= sum(c.spot.area_m2 for c in colour):
+            whole, usual_m = [c for c in flat if not c.blob.doubt], None
+            if len(whole) >= 3:
+                # half of the spots' area is in larger ones, so that chips do not count much
+                sizes, areas = np.array([c.sizes_m for c in whole]), [c.spot.area_m2 for c in whole]
+                usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
+            groups.append((float(np.linalg.norm(flat[0].blob.contrast)), [_mark(c, usual_m) for c in flat]))
+    enough = [vivid for vivid, found in groups if sum(not mark.doubt for mark in found) >= LEAST_MARKS]
     marks = []
-    for v, many, found in zip(vivid, enough, groups, strict=True):
-        doubt = f"no {LEAST_MARKS} marks have its colour, as they have another" if any(enough) and not many else ""
-        doubt = "its colour hardly stands apart beside the others'" if v < least else doubt
+    for vivid, found in groups:
+        doubt = ""
+        if vivid < WEAK_SHARE * max(enough, default=0.0):
+            doubt = "its colour hardly stands apart beside the others'"
+        elif enough and sum(not mark.doubt for mark in found) < LEAST_MARKS:
+            doubt = f"no {LEAST_MARKS} marks have its colour, as they have another"
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
-    holes = len(candidates) - len(marks)
-    note = f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks"
-    return tuple(marks), (note,) if holes else ()
+    notes = []
+    if holes := len(candidates) - len(marks):
+        notes.append(f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks")
+    if not cloud.organised:
+        notes.append("a cloud without a pixel grid does not tell whether a mark is cut")
+    return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), tuple(notes))
 
 
-def _usual_m(candidates: Sequence[_Candidate]) -> np.ndarray:
-    """Return sizes (3,) such that half of the spots' area is in larger ones: chips do not count much."""
-    areas = np.array([c.spot.area_m2 for c in candidates])
-    sizes = np.array([c.sizes_m for c in candidates])
-    order = np.argsort(sizes, axis=0, kind="stable")
-    middle = (np.cumsum(areas[order], axis=0) >= areas.sum() / 2).argmax(axis=0)
-    return np.array([sizes[order[row, axis], axis] for axis, row in enumerate(middle)])
+def _mark(candidate: _Candidate, usual_m: np.ndarray | None) -> Mark:
+    """The candidate as a mark, with its doubt; ``usual_m`` (3,): the sizes of its like."""
+    spot, blob, sizes_m = candidate.spot, candidate.blob, candidate.sizes_m
+    doubt = blob.doubt
+    if doubt:
+        pass
+    elif candidate.share > LARGEST_SHARE:
+        doubt = f"{100 * candidate.share:.0f} % of the target: a part of it rather than a mark"
+    elif -spot.behind_m > max(RAISED_SHARE * spot.breadth_m, BEHIND_SIGMAS * spot.behind_sigma_m):
+        doubt = f"it stands {-spot.behind_m / MM:.0f} mm before the surface"
+    elif usual_m is not None:
+        unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
+        (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
+        if unlike.any():
+            doubt = f"unlike the others: {length:.0f} x {breadth:.0f} mm, they {usual_length:.0f} x {usual_breadth:.0f}"
+    pixels = blob.pixels[blob.weights > 0.5]
+    return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)

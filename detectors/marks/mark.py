@@ -1,9 +1,7 @@
-"""A fiducial mark as a registration needs it: a place in the view's frame, with its covariance; the settings that say
-how marks are found; and what a registration needs of them: three or more, trusted, and not on a line."""
+"""Fiducial marks as a registration needs them, how they are found, and what they must fulfil together."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -12,15 +10,13 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM
 
 LEAST_MARKS = 3
-OFF_LINE_SIGMAS = 5.0
+OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
 """Marks lie on a line where their root mean square distance from it is less than so many standard deviations of one
-mark's place: the turn about the line would be wrong by a fifth of a radian."""
-OFF_LINE_SHARE = 0.02
-"""... or less than this part of their root mean square distance along it: each millimetre that a view is wrong at a
-mark would become 50 mm at the same distance across the line."""
+mark's place, or less than this part of that along it: the turn about the line would be wrong by a fifth of a radian, or
+each millimetre that a view is wrong at a mark would become 50 mm."""
 
 
 class RedMarks(Config):
@@ -38,10 +34,7 @@ class ColourMarks(Config):
 
 
 class CodedMarks(Config):
-    """Printed codes (ArUco, AprilTag), found in the cloud's colour by OpenCV.
-
-    ``dictionary``: OpenCV's name of the set of codes that the tags were printed from.
-    """
+    """Printed codes (ArUco, AprilTag) of OpenCV's ``dictionary`` of that name, found in the cloud's colour."""
 
     kind: Literal["coded"] = "coded"
     dictionary: str = "DICT_6X6_50"
@@ -62,14 +55,12 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark in one view, camera frame, metres.
-
-    ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3, 3): of that centroid; systematic errors that
-    all pixels of the mark share (a range offset, a distortion of the lens) are not in it. ``normal`` (3,): unit normal
-    of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on the
-    surface. ``code``: of a coded mark its identity, None of a piece of tape. ``doubt``: why it should not be relied on
-    (cut by the crop's edge, no range in parts of it, a shape unlike the others); empty for none.
-    """
+    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
+    3): of that centroid; systematic errors that all pixels of the mark share (a range offset, a distortion of the lens)
+    are not in it. ``normal`` (3,): unit normal of the surface there, towards the camera. ``pixels`` (n,): flat indices
+    into the cloud's grid. ``area_m2``: on the surface. ``code``: of a coded mark its identity, None of a piece of tape.
+    ``doubt``: why it should not be relied on (cut by the crop's edge, no range in parts of it, a shape unlike the
+    others); empty for none."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray
@@ -98,16 +89,14 @@ class MarkSet:
 
 
 def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
-    """Return why no registration can rest on these marks; empty where one can. ``missing`` says why there are not
-    more."""
+    """Return why no registration can rest on these marks; empty where one can. ``missing``: why there are not more."""
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)
     found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
-    times = sorted(Counter(mark.doubt for mark in marks if mark.doubt).items())
-    doubts = "; ".join(doubt if n == 1 else f"{doubt} ({n} times)" for doubt, n in times)
-    in_doubt = f"; {len(marks) - len(trusted)} more in doubt: {doubts}" if doubts else ""
-    return found + in_doubt + (f"; {missing}" if missing else "")
+    doubts = ", ".join(sorted({mark.doubt for mark in marks if mark.doubt}))
+    in_doubt = f"{len(marks) - len(trusted)} more in doubt: {doubts}" if doubts else ""
+    return "; ".join(text for text in (found, in_doubt, missing) if text)
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:

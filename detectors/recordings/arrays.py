@@ -1,29 +1,178 @@
-"""Captures in files of arrays: which array holds the distances, and the meaning of its axes. Height maps too.
+"""Captures in files of arrays: which array holds the distances, and the meaning of its axes. Height maps and bare
+numbers too.
 
-A height map of a profiler has no lens: its pixels lie a stated pitch apart, and it is a cloud in parallel projection.
-x and y count from its middle, and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a
-stated unit, micrometres, millimetres or metres are taken, whichever gives the relief a plausible part of the extent.
+The libraries that read them believe what a file states: they run within `files.limited_memory`. Arrays of objects are
+refused: they would need pickle. A height map's pixels lie a stated pitch apart, and it is a cloud in parallel
+projection: x and y count from its middle, and z, which points away from the viewer, is `DISTANCE_M` at the median
+height. Without a stated unit, micrometres, millimetres or metres are taken, whichever gives the relief a plausible part
+of the extent.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from detectors.recordings.array_files import ArraysLoader, RawLoader, load_mat, load_npy, load_npz
-from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow, rounding_step_m
+from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_beside, lens_for
-from detectors.recordings.recording import Asked, Recording
-from harness.vocabulary.capture import Frame, Reason
+from detectors.recordings.recording import Asked, Recording, damage_told
+from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.limits import refuse_pixels
+from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
+from harness.vocabulary.geometry import Frame, Lens, Reason
+
+LEGAL_ARRAYS = "numeric arrays as numpy.save or numpy.savez write them, no objects"
+LEGAL_MAT = "MATLAB 5 to 7 files (-v6, -v7) of numeric arrays: Location (h, w, 3), (n, 3) or (k, n, 3), and Color"
+LEGAL_RAW = (
+    "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
+    "BYTES before the first frame"
+)
+EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
+"""The line for MATLAB that turns a point cloud ``pc`` into arrays."""
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+ArraysLoader = Callable[[Path], Mapping[str, np.ndarray]]
+"""Loads a file's arrays by name; the only array of a file without names is called ""."""
+
+
+def load_npy(path: Path) -> dict[str, np.ndarray]:
+    """Map an ``.npy`` file. Raises UserError where it is broken or holds objects."""
+    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+        return {"": np.lib.format.open_memmap(path, mode="r")}
+
+
+def load_npz(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or of objects."""
+    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+        with zipfile.ZipFile(path) as archive:
+            stated = sum(entry.file_size for entry in archive.infolist())
+        fix = f"save its frames as .npy, which is not unpacked; {RAISE}"
+        refuse_bytes(str(path), stated, files.ARRAYS_BYTES, "unpacks to", fix)
+        with np.load(path, allow_pickle=False) as held:
+            return {name: np.asarray(held[name]) for name in held}
+
+
+def load_mat(path: Path) -> dict[str, np.ndarray]:
+    """Return the numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved first. Raises UserError
+    for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file."""
+    import scipy.io
+
+    with path.open("rb") as file:
+        head = file.read(520)
+    if HDF5_SIGNATURE in (head[:8], head[512:520]) or b"MATLAB 7.3" in head[:116]:
+        fix = "save it with '-v7' in place of '-v7.3', for a cloud: " + EXPORT
+        raise UserError(f"{path}: is a -v7.3 file (HDF5)", legal=LEGAL_MAT, fix=fix)
+    with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, "save it again with '-v7'"):
+        # cells and structs hold no frames, and nested deeply enough they end the process without a word
+        flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
+        loaded = scipy.io.loadmat(path, variable_names=flat)
+        loaded = {name: value for name, value in loaded.items() if isinstance(value, np.ndarray)}
+    arrays = {}
+    for name, value in loaded.items():
+        # MATLAB's scalars are 1 x 1 arrays; text, cells, structs and objects have other kinds.
+        if value.dtype.kind in "iuf" and value.size > 1:
+            stacked_last = value.ndim == 4 and value.shape[2] == 3 and value.shape[3] != 3
+            arrays[name] = np.moveaxis(value, -1, 0) if stacked_last else value
+    if arrays:
+        return arrays
+    for value in loaded.values():
+        if isinstance(value, scipy.io.matlab.MatlabOpaque):
+            what, kind = (bytes(value[key][0]).decode("latin1") for key in ("s0", "s2"))
+            raise UserError(
+                f"{path}: the variable {what} is a MATLAB object ({kind}), which cannot be read outside MATLAB",
+                legal=LEGAL_MAT,
+                fix=f"in MATLAB, with the cloud named pc: {EXPORT}",
+            )
+    raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=f"in MATLAB: {EXPORT}")
+
+
+SENSOR_SIZES = (
+    *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
+    *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
+)  # (width, height) of the depth images of usual cameras
+SAME_SCENE = 0.05  # part of its distance by which the median pixel of two frames of one scene differs at most
+NEIGHBOURS = 0.1
+"""The same of neighbouring pixels: rows of a floor seen flat differ by 1 %, noise by less; a wrong layout by 100 %."""
+
+
+@dataclass(frozen=True)
+class RawLoader:
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on. ``step``: bytes from pixel
+    to pixel, more than a number's where brightness and confidence stand between."""
+
+    width: int
+    height: int
+    kind: str
+    step: int
+    offset: int
+
+    @classmethod
+    def stated(cls, text: str) -> RawLoader:
+        """Parse WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]. Raises UserError for anything else."""
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text)
+        if match is None:
+            raise UserError(f"--raw {text}: no such layout", legal=LEGAL_RAW)
+        width, height, kind, step, offset = match.groups()
+        refuse_pixels(f"--raw {text}", int(width), int(height))
+        kind = kind or "u2"
+        own = np.dtype(kind).itemsize
+        if int(step or own) < own:
+            raise UserError(f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW)
+        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
+
+    def __call__(self, path: Path) -> dict[str, np.ndarray]:
+        """Map the frames (n, h, w). Raises UserError where there is none."""
+        kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
+        frame = self.width * self.height * self.step
+        if size < frame:
+            raise UserError(
+                f"{path}: has {size} bytes from byte {self.offset} on, but a frame of {self.width} x {self.height}"
+                f" numbers in steps of {self.step} bytes needs {frame}",
+                legal=LEGAL_RAW,
+            )
+        content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
+        strides = (frame, self.width * self.step, self.step)
+        return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
+
+    def refuse_doubtful(self, path: Path, frames: np.ndarray) -> None:
+        """Raise UserError where neighbours differ as no surface's do, or the planes are no frames of one scene."""
+
+        def apart(first: np.ndarray, second: np.ndarray) -> float:
+            """Return the median relative difference where both have a number; infinity where none has."""
+            both = (first > 0) & (second > 0)
+            return float(np.median(np.abs(first - second)[both] / first[both])) if both.any() else float("inf")
+
+        first, last = (frames[i].astype(np.float64) for i in (0, -1))
+        rough, changed = apart(first[:, 1:], first[:, :-1]), apart(first, last)
+        if not rough < NEIGHBOURS:
+            what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
+            raise UserError(f"{path}: {what}: the layout is another", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
+        left_over = (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
+        if len(frames) > 1 and (left_over or not changed < SAME_SCENE):
+            raise UserError(
+                f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
+                f" {100 * changed:.3g} % between the first and the last plane: depth beside brightness and confidence?",
+                legal="frames of one scene, or one plane",
+                fix="choose the plane with the depth: --array :0",
+            )
+
+
+def raw_layout_of(path: Path) -> UserError:
+    """Return the message for a file of bare numbers: the layouts of usual cameras that its size fits."""
+    size = path.stat().st_size
+    layouts = {f"{w}x{h}": size // (w * h) for w, h in SENSOR_SIZES if size % (w * h) == 0 and size >= 2 * w * h}
+    ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
+    fitting = " or ".join(f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked)
+    fix = "state the layout" + (f"; its size fits {fitting}" if fitting else "")
+    return UserError(f"{path}: nothing says how its {size} bytes are laid out", legal=LEGAL_RAW, fix=fix)
+
 
 LOADERS: dict[str, ArraysLoader] = {".npy": load_npy, ".npz": load_npz, ".mat": load_mat}
 DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
@@ -33,48 +182,36 @@ LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, with
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
-
-@dataclass(frozen=True)
-class Stack:
-    """One file's arrays with the frame axis first: ``distances`` (n, h, w) depth or (n, h, w, 3) points."""
-
-    distances: np.ndarray
-    rgb: np.ndarray | None
-    amplitude: np.ndarray | None
-    organised: bool
+Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool]
+"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid."""
 
 
 def open_arrays(path: Path, asked: Asked) -> Recording:
-    """Open a file of arrays: the frames of a capture, or with a pitch a height map.
-
-    Raises UserError where no array, or more than one, could be meant, and where its axes are no capture's.
-    """
+    """Open a file of arrays: frames, or with a pitch a height map. Raises UserError where none or several fit."""
     load = RawLoader.stated(asked.raw) if asked.raw is not None else LOADERS[path.suffix.lower()]
     if asked.pitch is not None:
         return _open_height_map(path, load, asked)
-    stack = _stack(path, load, asked)
+    distances, _, _, organised = _stack(path, load, asked)
     if isinstance(load, RawLoader):
-        load.refuse_doubtful(path, stack.distances)
-    height, width = stack.distances.shape[1:3]
+        load.refuse_doubtful(path, distances)
+    height, width = distances.shape[1:3]
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
-    if stack.distances.ndim == 3:
+    if distances.ndim == 3:
         own = partial(lens_beside, [path.parent], width, height)
         hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
         lens, files = lens_for(str(path), asked, width, height, own, hint)
-    scale_m = asked.scale_m or default_metres(stack.distances.dtype)
+    scale_m = asked.scale_m or default_metres(distances.dtype)
     read = partial(_frames, path, load, asked, scale_m)
-    is_whole = stack.distances.dtype.kind in "iu"
-    step_m = scale_m if is_whole else rounding_step_m(next(read()).z_m)
-    return Recording(path.name, read, (height, width), scale_m, step_m, (path, *files), lens, stack.organised)
+    is_whole = distances.dtype.kind in "iu"
+    return Recording.begun(path.name, read, scale_m, is_whole, files=(path, *files), lens=lens, organised=organised)
 
 
 def _frames(path: Path, load: ArraysLoader, asked: Asked, scale_m: float) -> Iterator[Frame]:
     """Yield the frames of one file. ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole."""
-    stack = _stack(path, load, asked)
-    for i, stored in enumerate(stack.distances):
-        rgb = stack.rgb[i] if stack.rgb is not None else None
-        amplitude = stack.amplitude[i] if stack.amplitude is not None else None
+    distances, *beside, _ = _stack(path, load, asked)
+    for i, stored in enumerate(distances):
+        rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
         yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
 
 
@@ -82,7 +219,6 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis first."""
     arrays = load(path)
     name, array = _named_array(str(path), arrays, DISTANCE_NAMES, asked.array)
-    refuse_narrow(name, array.dtype)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     has_points, shape, organised = _axes(name, array.shape, asked.lens)
@@ -98,46 +234,38 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     amplitude = next((beside[key] for key in AMPLITUDE_NAMES if key in beside), None)
     fits = amplitude is not None and amplitude.size == math.prod(shape)
     amplitude = amplitude.reshape(shape).astype(np.float32) if amplitude is not None and fits else None
-    return Stack(array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised)
+    return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised
 
 
 def _named_array(
     name: str, arrays: Mapping[str, np.ndarray], usual: Sequence[str], asked: str | None
 ) -> tuple[str, np.ndarray]:
-    """Return (what to call it, array): the one asked for as NAME[:NUMBER], else the only one with a usual name, else
-    the only one. Raises UserError where none or several could be meant."""
+    """Return (name, array): the one asked for as NAME[:NUMBER], else the one with a usual name, else the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (asked or "").partition(":")
     if not key:
-        found = [key for key in arrays if key.lower() in usual]
-        if not found and len(arrays) == 1:
-            found = list(arrays)
+        found = [key for key in arrays if key.lower() in usual] or list(arrays)
         if len(found) != 1:
-            what = "several arrays that could be the depth" if found else "no array that could be the depth"
+            choice = f"choose by --array NAME, for instance --array {found[0]} (of a height map with --pitch)"
             raise UserError(
-                f"{name}: {what} (it holds {held})",
+                f"{name}: no array, or several arrays, that could be the depth (it holds {held})",
                 legal="one array named " + ", ".join(usual) + "; " + LEGAL_AXES,
-                fix=f"choose by --array NAME, for instance --array {(found or list(arrays))[0]}"
-                " (of a height map with --pitch, the distance between its pixels)"
-                if arrays
-                else None,
+                fix=choice if found else None,
             )
         (key,) = found
     if key not in arrays:
         raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
-    array = arrays[key]
-    if not number:
-        return f"{name}: {key}" if key else name, array
-    if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-        raise UserError(f"--array {asked}: no such part of {key or name} {array.shape}", legal="NAME, or NAME:0 and up")
-    return f"{name}: {key}:{number}", array[int(number)]
+    array, name = arrays[key], f"{name}: {key}" if key else name
+    if number:
+        if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
+            raise UserError(f"--array {asked}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 and up")
+        array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
+    refuse_narrow(name, array.dtype)
+    return name, array
 
 
 def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, tuple[int, int, int], bool]:
-    """Return (holds points, (n, h, w), has a pixel grid) of an array's shape.
-
-    A list of points goes back on the lens' pixels where it has exactly as many.
-    """
+    """Return (holds points, (n, h, w), has a pixel grid) of an array's shape."""
     is_lists = shape[-1:] == (3,) and (len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0]))
     if is_lists:
         frames, points = (1, *shape[:-1])[-2:]
@@ -151,15 +279,11 @@ def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, t
     return has_points, (n, grid[0], grid[1]), True
 
 
-# ---- height maps -----------------------------------------------------------------------------------------------------
-
 HEIGHT_NAMES = ("height", "heights", "heightmap", "height_map", "elevation", "dem", "map", "h", "z")
-DOWN_NAMES = ("depth", "distance", "range", "z_depth")
-"""Names of arrays whose numbers grow away from the viewer."""
+DOWN_NAMES = ("depth", "distance", "range", "z_depth")  # names of arrays whose numbers grow away from the viewer
 DISTANCE_M = 1.0
 RELIEF = (5e-4, 0.5)
-"""Plausible relief (1st to 99th percentile) over the map's shorter side. Its ends are a factor of 1000 apart, as the
-units are, so that no two fit: 0.12 mm to 12 cm of a map 24 cm wide."""
+"""Plausible relief (1st to 99th percentile) over the map's shorter side: no two units, 1000 apart, fit."""
 
 
 def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
@@ -220,7 +344,6 @@ def _map_frames(
 def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.ndarray]:
     """Return the name and the map (h, w). Raises UserError for several maps, which are no frames of one capture."""
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
-    refuse_narrow(name, values.dtype)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:
         raise UserError(
@@ -229,8 +352,7 @@ def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.
             fix=f"choose one by its number: --array {(array or '').partition(':')[0]}:0",
         )
     if values.ndim != 2 or min(values.shape) < 2:
-        raise UserError(
-            f"{name}: axes {values.shape} are no height map's", legal="(h, w), or (n, h, w) with --array NAME:NUMBER"
-        )
+        legal = "(h, w), or (n, h, w) with --array NAME:NUMBER"
+        raise UserError(f"{name}: axes {values.shape} are no height map's", legal=legal)
     refuse_pixels(name, values.shape[1], values.shape[0])
     return name, values

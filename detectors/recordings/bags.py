@@ -1,29 +1,158 @@
 """ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
 
-A depth image needs the CameraInfo that its driver publishes beside it. Where a bag of clouds (the thesis recorded
-``points2``) holds a CameraInfo of the cloud's size whose rays pass through the cloud's points, z and that lens are
-used: then a pixel's ray is the same in all frames, as it was in the camera, and not rounded anew in each.
+``rosbags`` unpacks chunks whole: it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
+driver publishes beside it. Where a bag of clouds holds a CameraInfo whose rays pass through the cloud's points, z and
+that lens are used: a pixel's ray is then the same in all frames, not rounded anew in each.
 """
 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.bag_files import LEGAL_BAG, Bag, find_bag
-from detectors.recordings.distances import UNITS_M, default_metres, rounding_step_m
+from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Asked, Recording, slopes_of
-from harness.vocabulary.capture import Frame
+from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told, slopes_of
+from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Frame, Lens
+
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Ros1Reader
+    from rosbags.rosbag2 import Reader
+
+BAG_SUFFIXES = (".mcap", ".db3")
+ROS1_SUFFIX = ".bag"
+METADATA = "metadata.yaml"
+LEGAL_BAG = "a ROS 2 bag (its folder with metadata.yaml, one .db3 or one .mcap) or a .bag of ROS 1"
+MAX_MESSAGE_BYTES = 2**28  # 256 MiB: a cloud of four million points with 64 bytes each
+
+
+class Bag(NamedTuple):
+    """``files`` hold the messages, in order; ``packed``: each message is compressed by itself (zstd)."""
+
+    name: str
+    files: tuple[Path, ...]
+    metadata: Path | None = None
+    packed: bool = False
+
+    def topics(self) -> dict[str, str]:
+        """Return topic to message type, sorted; of a topic with several types the last."""
+        found: dict[str, str] = {}
+        for file in self.files:
+            with _opened(file) as reader:
+                found |= {connection.topic: connection.msgtype for connection in reader.connections}
+        return dict(sorted(found.items()))
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic, None where it has none."""
+        return next(self.messages(topic), ("", None))[1]
+
+    def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
+        """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
+        UserError where a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
+        from rosbags.typesys import Stores, get_typestore
+
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
+            from backports import zstd
+
+        number = 0
+        for file in self.files:
+            is_ros1 = file.suffix.lower() == ROS1_SUFFIX
+            types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+            decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+            with _opened(file) as reader:
+                wanted = [connection for connection in reader.connections if connection.topic == topic]
+                found = reader.messages(wanted) if wanted else iter(())
+                while True:
+                    name = f"{self.name} {topic} message {number}"
+                    with _readable(file):
+                        item = next(found, None)
+                        if item is None:
+                            break
+                        content = zstd.decompress(item[2]) if self.packed else item[2]
+                        if len(content) > MAX_MESSAGE_BYTES:
+                            most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
+                            raise UserError(f"{name}: has more than {most}", legal=f"messages up to {most}")
+                        message = decode(content, item[0].msgtype)
+                    yield name, message
+                    number += 1
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag's file, or a folder with a bag, whole or not."""
+    if path.is_file():
+        return path.suffix.lower() in (*BAG_SUFFIXES, ROS1_SUFFIX)
+    try:
+        if any(_holds_messages(inside) for inside in path.iterdir()):
+            return True
+        metadata = path / METADATA
+        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.open("rb").read(MAX_BYTES)
+    except OSError:
+        return False
+
+
+def find_bag(path: Path) -> Bag:
+    """Return a folder or file as a bag. Raises UserError where its description or one of its files is missing."""
+    if path.is_file():
+        return Bag(path.name, (path,))
+    metadata = path / METADATA
+    if not metadata.is_file():
+        held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
+        raise UserError(
+            f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}",
+            legal=LEGAL_BAG,
+            fix="name that file itself, or run: ros2 bag reindex",
+        )
+    fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
+    with damage_told(f"{metadata}: is no description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
+        told = read_yaml(metadata).data["rosbag2_bagfile_information"]
+        files = tuple(path / Path(name).name for name in told["relative_file_paths"])
+        mode = str(told.get("compression_mode") or "none").lower()
+    if mode == "file":
+        fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
+        raise UserError(f"{path}: its files are compressed whole", legal=LEGAL_BAG, fix=fix)
+    absent = [file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)]
+    if absent or not files:
+        what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is not there, or of no kind that is read"
+        raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
+    return Bag(path.name, files, metadata, packed=mode == "message")
+
+
+def _holds_messages(path: Path) -> bool:
+    return path.name.lower().removesuffix(".zstd").endswith(BAG_SUFFIXES)
+
+
+def _readable(file: Path) -> AbstractContextManager[None]:
+    mend = f"rosbag reindex {file}" if file.suffix.lower() == ROS1_SUFFIX else "ros2 bag reindex, or mcap recover"
+    what = f"{file}: is truncated or damaged, or is no bag"
+    return damage_told(what, LEGAL_BAG, f"copy it again; of a recording that was cut off: {mend}")
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
+    from rosbags.rosbag1 import Reader as Ros1Reader
+    from rosbags.rosbag2 import Reader
+
+    with _readable(file):
+        reader = Ros1Reader(file) if file.suffix.lower() == ROS1_SUFFIX else Reader(file)
+        reader.open()
+    try:
+        yield reader
+    finally:
+        reader.close()
+
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -32,27 +161,23 @@ UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 NOT_DEPTH = re.compile(r"(^|[/_])(ir|infra\w*|confidence|amplitude|intensity|reflectivity)([/_]|\d|$)", re.IGNORECASE)
 """Words in the topics of other pictures that a depth camera publishes in 16 bits or floating point."""
-TRANSPORTS = ("/compressedDepth", "/compressed")
 RAY_TOLERANCE_PX = 0.01
-"""A lens counts where each point lies within this of its pixel's ray: 14 um at 0.7 m with the Azure Kinect's focal
-length, three hundred times what float32 leaves of it."""
+"""A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
 
-Topics = dict[str, str]
-"""Topic to message type."""
+Topics = dict[str, str]  # topic to message type
 
 
 def open_bag(path: Path, asked: Asked) -> Recording:
-    """Open a bag's depth images or clouds. A lens that is given must fit clouds' points.
-
-    Raises UserError where the bag is broken or empty, has no such topic, or the topic holds something else.
-    """
+    """Open a bag's depth images or clouds. Raises UserError where it is broken or empty, or a lens does not fit."""
     bag = find_bag(path)
     topics = bag.topics()
-    chosen, notes = _chosen_topic(path, bag, topics, asked)
+    chosen, note = _chosen_topic(path, bag, topics, asked)
+    if bag.first(chosen) is None:
+        raise UserError(f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again")
     opened = _open_clouds if topics[chosen] == CLOUD_TYPE else _open_images
     recording = opened(path, bag, topics, chosen, asked)
     files = (*bag.files, *filter(None, (bag.metadata, asked.intrinsics)))
-    return replace(recording, files=files, notes=(*notes, *recording.notes))
+    return replace(recording, files=files, notes=(note, *recording.notes))
 
 
 def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Frame]:
@@ -64,12 +189,10 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
 
 def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
     scale_m = asked.scale_m or UNITS_M["m"]
-    first = next(_frames(bag, topic, scale_m, by_lens=False), None)
-    if first is None:
-        raise UserError(f"{path}: no message on {topic}", legal="at least one cloud", fix="record again")
+    first = next(_frames(bag, topic, scale_m, by_lens=False))
     height, width = first.z_m.shape
     lens = read_lens(asked.intrinsics, width, height) if asked.intrinsics else asked.lens
-    notes: tuple[str, ...] = ()
+    note = ""
     if lens is not None:
         if (lens.height, lens.width) != (height, width):
             what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
@@ -80,33 +203,21 @@ def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
                 fix="leave --intrinsics out: the points are used as they stand",
             )
     elif height == 1:
-        notes = (NO_GRID,)
+        note = NO_GRID
     else:
-        for info in (name for name, kind in topics.items() if kind == INFO_TYPE):
-            message = bag.first(info)
-            found = lens_of_info(message, (height, width)) if message is not None else ""
-            if isinstance(found, Lens) and _off_ray_px(found, first) <= RAY_TOLERANCE_PX:
-                lens = found
-                break
-        else:
-            notes = ("no CameraInfo in the bag fits the points; each frame's own x and y are averaged",)
-    return Recording(
-        name=bag.name,
-        read=partial(_frames, bag, topic, scale_m, lens is not None),
-        shape=(height, width),
-        scale_m=scale_m,
-        z_step_m=rounding_step_m(first.z_m),
-        lens=lens,
-        organised=height > 1,
-        unit_from="ROS, whose clouds are in metres",
-        notes=notes,
-    )
+        messages = (bag.first(name) for name, kind in topics.items() if kind == INFO_TYPE)
+        found = (lens_of_info(message, (height, width)) for message in messages if message is not None)
+        fitting = (each for each in found if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX)
+        lens = next(fitting, None)
+        if lens is None:
+            note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
+    read, unit_from = partial(_frames, bag, topic, scale_m, lens is not None), "ROS, whose clouds are in metres"
+    more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
+    return Recording.begun(bag.name, read, scale_m, **more)
 
 
 def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
-    name, message = next(bag.messages(topic), ("", None))
-    if message is None:
-        raise UserError(f"{path}: no message on {topic}", legal="at least one depth image", fix="record again")
+    name, message = next(bag.messages(topic))
     stored = stored_depth(name, message)
     height, width = stored.shape
     is_whole = stored.dtype.kind == "u"
@@ -115,10 +226,8 @@ def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
         return _lens_of_images(path, bag, topics, topic, (height, width)), None
 
     lens, _ = lens_for(str(path), asked, width, height, own)
-    scale_m, unit_from = (
-        asked.scale_m,
-        "ROS, which sets millimetres for integers and metres for floating point (REP 118)",
-    )
+    scale_m = asked.scale_m
+    unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     for name, kind in topics.items():
         # RealSense's viewer states the unit beside a sensor's streams
         sensor, _, option = name.partition("/option/")
@@ -130,38 +239,32 @@ def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
                 scale_m, unit_from = float(f"{message.data:.6g}"), name
     scale_m = scale_m or default_metres(stored.dtype)
     read = partial(_frames, bag, topic, scale_m, by_lens=False)
-    step_m = scale_m if is_whole else rounding_step_m(next(read()).z_m)
-    return Recording(bag.name, read, (height, width), scale_m, step_m, lens=lens, unit_from=unit_from)
+    return Recording.begun(bag.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
 
 
-# ---- which topic -----------------------------------------------------------------------------------------------------
-
-
-def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[str, tuple[str, ...]]:
-    """Return the topic to read, and what the user should know of the others: the depth image with its lens, else the
-    cloud."""
+def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[str, str]:
+    """Return the topic to read, and what the user should know of the others."""
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag, topics)
+    both = ", ".join([*clouds, *images])
     held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
     if asked.topic is not None:
         name = asked.topic if asked.topic in topics else f"/{asked.topic}"
         if name not in topics:
-            legal = ", ".join([*clouds, *images])
-            raise UserError(f"{path}: no topic {asked.topic}; its topics: {held}", legal=legal or LEGAL_BAG)
+            raise UserError(f"{path}: no topic {asked.topic}; its topics: {held}", legal=both or LEGAL_BAG)
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
-        return name, ()
+        return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
     has_lens = bool(asked.intrinsics or asked.lens)
     if len(images) == 1 and (not clouds or has_lens or _infos_of(topics, images[0])):
-        others = ", ".join(clouds)
-        note = f"the depth images on {images[0]} are read, with their lens, not the clouds on {others}; --topic chooses"
-        return images[0], (note,) if clouds else ()
+        others = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
+        return images[0], f"the depth images on {images[0]} are read{others}" if clouds else ""
     if len(usual) == 1:
-        note = f"the clouds on {usual[0]} are read; depth images: {', '.join(images)}; --topic chooses"
-        return usual[0], (note,) if images else ()
-    if not images and not clouds:
+        others = f"; depth images: {', '.join(images)}; --topic chooses"
+        return usual[0], f"the clouds on {usual[0]} are read{others}" if images else ""
+    if not both:
         raise UserError(
             f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
             legal=kinds,
@@ -169,20 +272,14 @@ def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[s
         )
     own = next((topic for topic in images if _infos_of(topics, topic)), "")
     found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
-    raise UserError(
-        f"{path}: {found}",
-        legal=", ".join([*clouds, *images]),
-        fix=f"choose one, for instance --topic {own or (images or clouds)[0]}",
-    )
+    fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
+    raise UserError(f"{path}: {found}", legal=both, fix=fix)
 
 
 def _depth_topics(bag: Bag, topics: Topics) -> list[str]:
-    """Return the topics whose first picture may be depth. 16-bit grey counts as depth only under a name that says so,
-    and a compressed copy only where the pictures themselves are not in the bag."""
+    """Return the topics whose first picture may be depth; 16-bit grey only under such a name, no copies."""
     found = []
-    for topic, kind in topics.items():
-        if kind not in IMAGE_TYPES or NOT_DEPTH.search(topic):
-            continue
+    for topic in (name for name, kind in topics.items() if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)):
         message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
@@ -191,17 +288,11 @@ def _depth_topics(bag: Bag, topics: Topics) -> list[str]:
 
 
 def _of_pictures(topic: str) -> str:
-    """Return a topic without the name of its transport."""
-    transport = next((end for end in TRANSPORTS if topic.endswith(end)), "")
-    return topic.removesuffix(transport)
-
-
-# ---- the lens and the unit -------------------------------------------------------------------------------------------
+    return topic.removesuffix("/compressedDepth").removesuffix("/compressed")
 
 
 def _infos_of(topics: Topics, topic: str) -> list[str]:
-    """Return the CameraInfo topics that belong to a picture by name: camera_info beside it; info/camera_info beside its
-    folder (RealSense)."""
+    """Return the CameraInfo topics that belong to a picture by name."""
     folder = _of_pictures(topic).rpartition("/")[0]
     names = (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info", f"{topic}/camera_info")
     return [name for name in names if topics.get(name) == INFO_TYPE]
@@ -211,11 +302,10 @@ def _lens_of_images(path: Path, bag: Bag, topics: Topics, topic: str, shape: tup
     """Return the lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
     every = [name for name, kind in topics.items() if kind == INFO_TYPE]
     why: list[str] = []
+    is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
     for info in _infos_of(topics, topic) or (every if len(every) == 1 else []):
         message = bag.first(info)
-        if message is None:
-            continue
-        lens = lens_of_info(message, shape, is_rectified="rect" in _of_pictures(topic).rpartition("/")[2])
+        lens = "is empty" if message is None else lens_of_info(message, shape, is_rectified)
         if isinstance(lens, Lens):
             return lens
         why.append(f"{info} {lens}")
@@ -228,11 +318,8 @@ def _lens_of_images(path: Path, bag: Bag, topics: Topics, topic: str, shape: tup
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs.
-
-    A rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and the region of
-    interest are taken off. ROS 1 writes the matrices in capitals.
-    """
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs. A rectified image has
+    the lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are taken off."""
     d, k, p = (
         np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in ("d", "k", "p")
     )
@@ -248,25 +335,17 @@ def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = Fals
     fx, fy, cx, cy = p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
     if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
         return f"states the focal length {fx:g}, {fy:g}, as of a camera that is not calibrated"
-    return Lens(
-        width=shape[1],
-        height=shape[0],
-        fx=float(fx / across),
-        fy=float(fy / down),
-        # pixel positions count from the first pixel's centre, which lies half a pixel inside
-        cx=float((cx - roi.x_offset + 0.5) / across - 0.5),
-        cy=float((cy - roi.y_offset + 0.5) / down - 0.5),
-        distortion=tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8)))),
-    )
+    # pixel positions count from the first pixel's centre, which lies half a pixel inside
+    cx, cy = (cx - roi.x_offset + 0.5) / across - 0.5, (cy - roi.y_offset + 0.5) / down - 0.5
+    distortion = tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8))))
+    return Lens(shape[1], shape[0], float(fx / across), float(fy / down), float(cx), float(cy), distortion)
 
 
 def _off_ray_px(lens: Lens, frame: Frame) -> float:
     """Return the distance of a frame's worst point from its pixel's ray."""
     assert frame.xy_m is not None
     valid = np.isfinite(frame.z_m)
-    if not valid.any():
-        return float("inf")
     slopes = slopes_of(lens, lens.whole)[valid]
     off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (lens.fx, lens.fy)
-    worst = float(off.max())
+    worst = float(off.max()) if valid.any() else float("inf")
     return worst if np.isfinite(worst) else float("inf")

@@ -1,13 +1,10 @@
 """Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv, .asc, .pts).
 
-Open3D reads the points but drops the grid, so the header is read here: a PCD is organised where HEIGHT > 1, a PLY
-where it states num_cols and num_rows (as range scanners write). Open3D returns a cut PLY filled up with zeros, so the
-header's promise is compared with the file first.
-
-A list has a point a line, its numbers apart by blanks, tabs, commas or semicolons. Columns are x y z, then an
-intensity, or red green blue, or both; a line of names before the numbers says otherwise. Lines that begin with # or //
-are comments. A comment with ``width`` and ``height``, a first line of two whole numbers, a lens with as many pixels,
-or a sensor's usual size on which x/z and y/z rise evenly put the points on a pixel grid.
+Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
+1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
+or both; a line of names before the numbers says otherwise. A comment with ``width`` and ``height``, a first line of two
+whole numbers, a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly put points on a
+grid.
 """
 
 from __future__ import annotations
@@ -16,20 +13,20 @@ import io
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from detectors.open3d_library import load_open3d
-from detectors.recordings.array_files import SENSOR_SIZES
-from detectors.recordings.distances import UNITS_M, frame_of, rounding_step_m
-from detectors.recordings.recording import NO_GRID, Asked, Recording
-from harness.vocabulary.capture import Frame
+from detectors.recordings.arrays import SENSOR_SIZES
+from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.limits import TABLE_BYTES, bounded_bytes, refuse_pixels
+from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
+from harness.vocabulary.geometry import Frame, Lens
 
 CLOUDS = (".ply", ".pcd")
 POINT_LISTS = (".xyz", ".asc", ".pts", ".txt", ".csv")
@@ -40,30 +37,24 @@ RASTER_CORRELATION = 0.999
 def open_clouds(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
     """Open clouds in the order given, each a frame. Raises UserError on a broken file."""
     scale_m = asked.scale_m or UNITS_M["m"]
-    read = partial(_frames, tuple(paths), asked.lens, scale_m)
-    first = next(read())
-    height, width = first.z_m.shape
     is_list = paths[0].suffix.lower() in POINT_LISTS
-    note = f"the points fill a grid of {width} x {height} pixels" if is_list else ""
-    return Recording(
-        name=name,
-        read=read,
-        shape=(height, width),
-        scale_m=scale_m,
-        z_step_m=rounding_step_m(first.z_m),
-        files=tuple(paths),
-        organised=height > 1,
-        notes=tuple(filter(None, [note if height > 1 else NO_GRID])),
-    )
+    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, asked.lens, scale_m)
+    recording = Recording.begun(name, read, scale_m, files=tuple(paths))
+    height, width = recording.shape
+    note = NO_GRID if height == 1 else f"the points fill a grid of {width} x {height} pixels" * is_list
+    return replace(recording, organised=height > 1, notes=(note,))
 
 
-def _frames(paths: tuple[Path, ...], lens: Lens | None, scale_m: float) -> Iterator[Frame]:
+def _frames(paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float) -> Iterator[Frame]:
     """Yield a cloud a file, (h, w), or (1, n) without a grid. ``lens`` only tells whether a list fills a pixel grid."""
     for path in paths:
-        yield (_read_list if path.suffix.lower() in POINT_LISTS else _read_cloud)(path, lens, scale_m)
+        points, grid, rgb, amplitude = reader(path, lens)
+        amplitude = None if amplitude is None else amplitude.astype(np.float32).reshape(grid)
+        rgb = None if rgb is None else rgb.reshape(*grid, 3)
+        yield frame_of(path.name, points.reshape(*grid, 3), scale_m, rgb, amplitude)
 
 
-def stated_size(lines: Sequence[str]) -> tuple[int, int]:
+def _stated_size(lines: Sequence[str]) -> tuple[int, int]:
     """Return width and height that lines of a header state, 0 where they do not."""
     text = "\n".join(lines).lower()
     names = (r"(?:num_)?(?:width|cols)", r"(?:num_)?(?:height|rows)")
@@ -72,9 +63,8 @@ def stated_size(lines: Sequence[str]) -> tuple[int, int]:
     return width, height
 
 
-def grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
-    """Return (h, w) of points (n, 3) whose grid nothing states: the lens', or a usual sensor's where they rise row by
-    row as a camera's pixels do; (1, n) else."""
+def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
+    """Return (h, w) of points (n, 3) whose grid nothing states."""
     count = len(points)
     if lens is not None and lens.width * lens.height == count:
         return lens.height, lens.width
@@ -89,8 +79,6 @@ def grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
     return 1, count
 
 
-# ---- PLY and PCD -----------------------------------------------------------------------------------------------------
-
 LEGAL_CLOUD = "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
 PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8} | {
     "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8,
@@ -98,76 +86,44 @@ PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
 """A count in a header: more digits are no file's, and Python refuses to read thousands of them."""
-PCD_SIZES = {1, 2, 4, 8}
-"""Bytes that a number of a PCD may have."""
-PCD_NUMBERS = 10_000
-"""Numbers in one point: descriptors of some hundred stand in published clouds."""
-LZF_STRONGEST = 100
-"""Factor by which LZF can shorten at most: three bytes stand for at most 264."""
+PCD_NUMBERS = 10_000  # numbers in one point: descriptors of some hundred stand in published clouds
+LZF_STRONGEST = 100  # factor by which LZF can shorten at most: three bytes stand for at most 264
 
 
-class CloudHeader(NamedTuple):
-    """The size that a file's header promises. ``height`` is 1 without a grid; ``data_bytes`` the least that follow."""
-
-    width: int
-    height: int
-    header_bytes: int
-    data_bytes: int
-
-
-def _read_cloud(path: Path, _: Lens | None, scale_m: float) -> Frame:
+def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
     """Read one PLY or PCD. Raises UserError where it has no header, holds no points, or is cut off."""
     o3d = load_open3d()
-    try:
-        with path.open("rb") as file:
-            content = file.read(HEADER_BYTES)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_CLOUD) from error
-    header = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(path, content)
-    count = header.width * header.height
-    if count < 1:
+    with damage_told(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
+        content = file.read(HEADER_BYTES)
+    width, height, data_bytes = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(path, content)
+    if width * height < 1:
         raise UserError(f"{path}: holds no points", legal=LEGAL_CLOUD)
-    refuse_pixels(f"{path}: its cloud", header.width, header.height)
-    found = path.stat().st_size - header.header_bytes
-    if found < header.data_bytes:
-        raise UserError(
-            f"{path}: is truncated: {found} of at least {header.data_bytes} bytes of points",
-            legal="a whole file",
-            fix="copy or export it again",
-        )
+    refuse_pixels(f"{path}: its cloud", width, height)
+    if (found := path.stat().st_size) < data_bytes:
+        what = f"{path}: is truncated: {found} of at least {data_bytes} bytes"
+        raise UserError(what, legal="a whole file", fix="copy or export it again")
     # Open3D's complaints go to the terminal; what they say is checked here and told once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
-    if read != count:
-        raise UserError(
-            f"{path}: is truncated or damaged: {read} of {count} points could be read",
-            legal=LEGAL_CLOUD,
-            fix="copy or export it again",
-        )
+    if read != width * height:
+        what = f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
+        raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
-    points = attributes["positions"]
-    grid = (header.height, header.width) if header.height > 1 else grid_of(points)
-    rgb, grey = attributes.get("colors"), [attributes.get(k) for k in ("intensity", "intensities", "amplitude")]
-    amplitude = next((values for values in grey if values is not None), None)
+    points, rgb = attributes["positions"], attributes.get("colors")
     if rgb is not None and rgb.dtype != np.uint8:  # floating-point colours run from 0 to 1
         rgb = np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
-    return frame_of(
-        path.name,
-        points.reshape(*grid, 3),
-        scale_m,
-        rgb=None if rgb is None else rgb.reshape(*grid, 3),
-        amplitude=None if amplitude is None else amplitude.reshape(grid).astype(np.float32),
-    )
+    grey = (attributes[key] for key in ("intensity", "intensities", "amplitude") if key in attributes)
+    return points, (height, width) if height > 1 else _grid_of(points), rgb, next(grey, None)
 
 
-def _ply_header(path: Path, content: bytes) -> CloudHeader:
+def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
+    """Return width, height (1 without a grid) and the least number of bytes of the file that the header promises."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise UserError(f"{path}: is no PLY, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
-    points, bytes_each, fields = 0, 0, 0
-    element, names = "", set[str]()
+    points, bytes_each, element, names = 0, 0, "", list[str]()
     for words in (line.split() for line in lines if line.strip()):
         if words[0] == "element" and len(words) == 3:
             if words[1] == "vertex" and points:
@@ -175,20 +131,19 @@ def _ply_header(path: Path, content: bytes) -> CloudHeader:
             element = words[1]
             points = int(words[2]) if element == "vertex" and COUNT.fullmatch(words[2]) else points
         elif words[0] == "property" and element == "vertex" and len(words) > 1:
-            names.add(words[-1])
-            fields += 1
+            names.append(words[-1])
             bytes_each += PLY_BYTES.get(words[1], 0)
-    if points and not {"x", "y", "z"} <= names:
+    if points and not {"x", "y", "z"} <= set(names):
         raise UserError(f"{path}: its points lack x, y or z", legal=LEGAL_CLOUD)
     is_ascii = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     # Each number of an ASCII line takes at least a digit and a separator.
-    least = points * 2 * fields - 1 if is_ascii else points * bytes_each
-    columns, rows = stated_size([line for line in lines if line.startswith(("obj_info", "comment"))])
-    is_grid = columns * rows == points and rows > 1
-    return CloudHeader(columns if is_grid else points, rows if is_grid else 1, end.end(), least)
+    least = end.end() + (points * 2 * len(names) - 1 if is_ascii else points * bytes_each)
+    columns, rows = _stated_size([line for line in lines if line.startswith(("obj_info", "comment"))])
+    return (columns, rows, least) if columns * rows == points and rows > 1 else (points, 1, least)
 
 
-def _pcd_header(path: Path, content: bytes) -> CloudHeader:
+def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
+    """Return the same of a PCD."""
     end = re.search(rb"^DATA\s+(\w+)\s*?\r?\n", content, re.MULTILINE)
     if end is None:
         raise UserError(f"{path}: is no PCD, or its header is cut off", legal=LEGAL_CLOUD)
@@ -200,21 +155,17 @@ def _pcd_header(path: Path, content: bytes) -> CloudHeader:
             raise ValueError(f"{text[:20]!r} is no count")
         return int(text)
 
-    try:
+    with damage_told(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
         width, height = count(fields["WIDTH"][0]), count(fields["HEIGHT"][0])
         points = count(fields["POINTS"][0]) if "POINTS" in fields else width * height
         sizes = [count(text) for text in fields["SIZE"]]
         counts = [count(text) for text in fields["COUNT"]] if "COUNT" in fields else [1] * len(sizes)
         if not len(fields["FIELDS"]) == len(fields["TYPE"]) == len(sizes) == len(counts):
             raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
-        if not set(sizes) <= PCD_SIZES or sum(counts) > PCD_NUMBERS:
+        if not set(sizes) <= {1, 2, 4, 8} or sum(counts) > PCD_NUMBERS:
             raise ValueError(f"sizes {sorted(set(sizes))}, {sum(counts)} numbers in a point")
-    except (KeyError, IndexError, ValueError) as error:
-        raise UserError(f"{path}: its PCD header cannot be read ({error!r})", legal=LEGAL_CLOUD) from error
-    if width * height != points:
-        raise UserError(
-            f"{path}: its header states {width} x {height} but {points} points", legal="WIDTH * HEIGHT = POINTS"
-        )
+        if width * height != points:
+            raise ValueError(f"it states {width} x {height} but {points} points")
     unpacked = points * sum(size * times for size, times in zip(sizes, counts, strict=True))
     least = {b"binary": unpacked, b"ascii": points * 2 * len(sizes) - 1}.get(end.group(1))
     if least is None:  # compressed: two sizes, then the points
@@ -224,32 +175,24 @@ def _pcd_header(path: Path, content: bytes) -> CloudHeader:
         packed, states = struct.unpack("<II", stated.ljust(8, b"\0"))
         least = 8 + packed
         if len(stated) == 8 and (states != unpacked or states > LZF_STRONGEST * packed):
-            raise UserError(
-                f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}",
-                legal=LEGAL_CLOUD,
-                fix="copy or export it again",
-            )
-    return CloudHeader(width, height, end.end(), least)
+            what = f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}"
+            raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
+    return width, height, end.end() + least
 
-
-# ---- lists of points -------------------------------------------------------------------------------------------------
 
 LEGAL_LIST = "a point a line: x y z [intensity] [red green blue], apart by blanks, tabs, commas or semicolons"
 MOST_COLUMNS = 20
-HEAD_LINES = 200
-"""Lines within which the numbers must begin."""
+HEAD_LINES = 200  # lines within which the numbers must begin
 COLUMNS = {
     **dict.fromkeys(("intensity", "i", "amplitude", "scalar", "grey", "gray"), "i"),
     **{name: name[0] for name in ("x", "y", "z", "r", "g", "b", "red", "green", "blue")},
 }
 
 
-def _read_list(path: Path, lens: Lens | None, scale_m: float) -> Frame:
+def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
     """Read one list of points. Raises UserError where it cannot be read as numbers."""
-    try:
+    with damage_told(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_LIST) from error
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]
     head = [bool(re.match(r"\s*(#|//|;|$)", line)) or _numbers(line) is None for line in lines]
     skipped = head.index(False) if False in head else len(lines)
@@ -260,16 +203,15 @@ def _read_list(path: Path, lens: Lens | None, scale_m: float) -> Frame:
         raise UserError(f"{path}: no line of numbers among its first {len(lines)}", legal=LEGAL_LIST)
     values = _table(path, content, skipped, lines[skipped])
     columns = _columns(path, values, lines[skipped - 1 - bool(size)] if skipped > bool(size) else "")
-    width, height = size if len(size) == 2 else stated_size(lines[:skipped])
+    width, height = size if len(size) == 2 else _stated_size(lines[:skipped])
     points = np.stack([columns[axis] for axis in "xyz"], axis=-1)
     refuse_pixels(str(path), len(points), 1)
-    grid = (height, width) if width * height == len(points) and height > 1 else grid_of(points, lens)
     rgb = None
     if set("rgb") <= set(columns):
-        rgb = np.stack([columns[channel] for channel in "rgb"], axis=-1).reshape(*grid, 3)
+        rgb = np.stack([columns[channel] for channel in "rgb"], axis=-1)
         rgb = np.nan_to_num(rgb * 255 if np.nanmax(rgb) <= 1 else rgb).clip(0, 255).astype(np.uint8)
-    amplitude = columns["i"].astype(np.float32).reshape(grid) if "i" in columns else None
-    return frame_of(path.name, points.reshape(*grid, 3), scale_m, rgb, amplitude)
+    grid = (height, width) if width * height == len(points) and height > 1 else _grid_of(points, lens)
+    return points, grid, rgb, columns.get("i")
 
 
 def _numbers(line: str) -> list[float] | None:
@@ -287,19 +229,12 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
     content = content.translate(bytes.maketrans(b",;", b". " if is_decimal_comma else b"  "))
     options: Any = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
-    try:
+    with damage_told(f"{path}: cannot be read as points", LEGAL_LIST):
         values: np.ndarray = pandas.read_csv(io.BytesIO(content), skiprows=skipped, **options).to_numpy()
-    except (ValueError, OverflowError, MemoryError) as error:  # pandas' own errors derive from ValueError
-        what = f"{path}: cannot be read as points ({str(error).splitlines()[0][:200]})"
-        raise UserError(what, legal=LEGAL_LIST) from error
     if 3 <= values.shape[1] <= MOST_COLUMNS:
         return values
-    fix = None
-    if values.shape[1] > MOST_COLUMNS:
-        fix = (
-            "of an image of depth: python -c \"import numpy; numpy.save('depth.npy', numpy.loadtxt("
-            f"'{path}', delimiter='{',' if ',' in line else ' '}'))\", then name depth.npy"
-        )
+    is_image = values.shape[1] > MOST_COLUMNS
+    fix = "of an image of depth: save it by numpy.save('depth.npy', ..), then name depth.npy" if is_image else None
     raise UserError(f"{path}: {values.shape[1]} numbers in a line are no point", legal=LEGAL_LIST, fix=fix)
 
 
@@ -307,13 +242,12 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
     """Return columns by name: x, y, z, i, r, g, b. ``line`` stands before the numbers and may name them."""
     bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
-    if len(names) == values.shape[1] and set("xyz") <= set(names):
+    count = values.shape[1]
+    if len(names) == count and set("xyz") <= set(names):
         return {name: values[:, i] for i, name in reversed(list(enumerate(names))) if name}
     if "z" in names:
-        raise UserError(
-            f"{path}: names the columns {bare[:100]!r}, but its lines have {values.shape[1]} numbers", legal=LEGAL_LIST
-        )
-    count = values.shape[1]
+        what = f"{path}: names the columns {bare[:100]!r}, but its lines have {count} numbers"
+        raise UserError(what, legal=LEGAL_LIST)
     colour = {6: "rgb", 7: "irgb"}.get(count, "i" if count in (4, 5) else "")
     found = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
     if "r" in found and ((beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()):

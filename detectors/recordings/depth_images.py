@@ -2,11 +2,13 @@
 
 What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
 that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D (5000 to the metre, colour matched
-by time stamp); all others are millimetres unless a unit is given.
+by time stamp). A picture's kind is told by its first bytes, and Pillow reads its header: OpenCV would take a TIFF
+called ``.png``, and decode a header of 30,000 x 30,000 pixels into gigabytes.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -15,14 +17,63 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
 from detectors.recordings.distances import UNITS_M, frame_of, rounding_step_m
 from detectors.recordings.intrinsics import lens_beside, lens_for
-from detectors.recordings.pictures import PNG_SIGNATURE, decoded, read_picture, refuse_broken_png
-from detectors.recordings.recording import Asked, Recording
-from harness.vocabulary.capture import Frame
+from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.limits import PICTURE_BYTES, bounded_bytes, refuse_pixels
+from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
+from harness.vocabulary.geometry import Frame
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LEGAL_PICTURE = "PNG or JPEG"
+
+
+def read_picture(path: Path, flags: int) -> np.ndarray:
+    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError
+    where it is another kind of file, cannot be decoded, or is too large."""
+    with damage_told(f"{path}: cannot be read", LEGAL_PICTURE):
+        content = bounded_bytes(path, PICTURE_BYTES)
+    return decoded(str(path), content, flags)
+
+
+def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
+    """Return the same of a file's content."""
+    refuse_pixels(name, *_header(name, content).size)
+    with damage_told(f"{name}: cannot be decoded", LEGAL_PICTURE):
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        if picture is None:
+            raise ValueError("its pixels are damaged")
+    return picture
+
+
+def png_texts(content: bytes) -> dict[str, str]:
+    """Return the names and values that a PNG holds as text before its picture; none of what is no PNG."""
+    try:
+        return {str(key): str(value) for key, value in _header("", content).info.items()}
+    except UserError:
+        return {}
+
+
+def refuse_broken_png(name: str, content: bytes) -> None:
+    """Raise UserError where a PNG is cut off or a checksum fails: the decoder may fill a cut picture up with zeros."""
+    try:
+        _header(name, content).verify()
+    except (SyntaxError, OSError, ValueError) as error:
+        what = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
+        raise UserError(
+            f"{name}: is {what} ({error}; {len(content)} bytes)", legal="a whole PNG", fix="copy or export it again"
+        ) from error
+
+
+def _header(name: str, content: bytes) -> ImageFile.ImageFile:
+    """Read a picture's header alone, as the kind that its first bytes say."""
+    kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
+    what = f"{name}: cannot be decoded: it begins neither as PNG nor as JPEG does, or is truncated"
+    with damage_told(what, LEGAL_PICTURE):
+        return kind(io.BytesIO(content))
+
 
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -47,45 +98,34 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
     colours: list[Path | None] = []
     for number in map(_last_number, depths):
-        apart = {stamp: abs(stamp - number) for stamp in stamps} if number is not None else {}
-        best = min(apart, key=apart.__getitem__, default=None)
-        is_near = best is not None and apart[best] <= (TUM_MATCH_S if is_tum else 0.0)
-        colours.append(stamps[best] if best is not None and is_near else None)
-    without = colours.count(None)
-    notes = []
-    if any(colours) and (without or len(pictures) != len(depths)):
-        notes = [f"{len(depths)} depth and {len(pictures)} colour pictures: {without} depth pictures have no colour"]
-    if pictures and not any(colours):
-        what = "time stamp" if is_tum else "number"
-        notes = [f"none of {len(pictures)} colour pictures has the {what} of a depth picture in its name: no colour"]
-    return _open(folder.name, depths, colours, asked, root, is_tum, notes)
+        apart = {abs(stamp - number): path for stamp, path in stamps.items()} if number is not None else {}
+        is_near = bool(apart) and min(apart) <= (TUM_MATCH_S if is_tum else 0.0)
+        colours.append(apart[min(apart)] if is_near else None)
+    note = ""
+    if pictures and (None in colours or len(pictures) != len(depths)):
+        without = f"{colours.count(None)} depth pictures have no colour"
+        note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
+    return _open(folder.name, depths, asked, root, colours, is_tum, note)
 
 
 def open_depth_list(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
     """Open depth PNGs in the order given. Raises UserError where their lens is not known."""
-    return _open(name, tuple(paths), [None] * len(paths), asked, paths[0].parent, False, [])
+    return _open(name, tuple(paths), asked, paths[0].parent, [None] * len(paths), False, "")
 
 
 def _open(
     name: str,
     depths: tuple[Path, ...],
-    colours: list[Path | None],
     asked: Asked,
     root: Path,
+    colours: Sequence[Path | None],
     is_tum: bool,
-    colour_notes: Sequence[str],
+    note: str,
 ) -> Recording:
-    width, height = png_kind(depths[0])[:2]
-    for path in depths:
-        if (size := _depth_size(path)) != (width, height):
-            raise UserError(
-                f"{path}: {size[0]} x {size[1]} pixels, but {depths[0].name} has {width} x {height}",
-                legal="frames of one size, from one camera that did not move",
-                fix="run the differing frames on their own",
-            )
+    width, height = _depth_size(depths[0])
     own = partial(lens_beside, (root, depths[0].parent, root.parent), width, height)
     lens, lens_files = lens_for(str(root), asked, width, height, own)
-    notes = []
+    notes = [note]
     first = next((path for path in colours if path), None)
     if first is not None and (found := _colour(first).shape)[:2] != (height, width):
         colours = [None] * len(colours)
@@ -93,19 +133,18 @@ def _open(
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are taken as undistorted")
     scale_m = asked.scale_m or UNITS_M["tum" if is_tum else "mm"]
-    read = partial(_frames, depths, tuple(colours), scale_m)
     step_m = scale_m
     if scale_m == UNITS_M["tum"]:  # its unit of 0.2 mm is finer than the steps of most cameras
         step_m = rounding_step_m(next(_frames(depths, (None,), scale_m)).z_m) or scale_m
     return Recording(
         name=name,
-        read=read,
+        read=partial(_frames, depths, tuple(colours), scale_m),
         shape=(height, width),
         scale_m=scale_m,
         z_step_m=step_m,
         files=(*depths, *filter(None, colours), *lens_files),
         lens=lens,
-        notes=(*notes, *colour_notes),
+        notes=tuple(notes),
         unit_from="depth.txt, which marks TUM RGB-D" if is_tum else "",
     )
 
@@ -118,10 +157,7 @@ def _frames(depths: tuple[Path, ...], colours: tuple[Path | None, ...], scale_m:
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return the depth pictures of a folder in the order of the numbers in their names, without masks and previews.
-
-    Raises UserError where there is none.
-    """
+    """Return a folder's depth pictures in the order of their numbers, without masks. Raises UserError where none is."""
     pictures = [path for path in folder.iterdir() if path.suffix.lower() == ".png"]
     named = [path for path in pictures if "depth" in path.stem.lower()]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
@@ -137,15 +173,9 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) from a PNG's header. Raises UserError where it is none, or too large.
-
-    Pillow's header does not tell 16 bits of colour from 8.
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(26)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})", legal=LEGAL_PNG) from error
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is none, or too large."""
+    with damage_told(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
+        head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
         raise UserError(f"{path}: is no PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])

@@ -1,19 +1,15 @@
-"""Stored numbers as distances: which of them mean "no return", what one of them is in metres, and who says so.
-
-Codes for no return are decided frame by frame (`no_return_codes`), the unit once for a capture (`decided_unit`).
-"""
+"""Stored numbers as distances: which of them mean "no return", what one of them is in metres, and who says so."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Frame, Reason
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "tum": 1 / 5000}
 """Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
@@ -43,24 +39,19 @@ def default_metres(dtype: np.dtype) -> float:
 
 def refuse_narrow(name: str, dtype: np.dtype) -> None:
     """Raise UserError where the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
-    if dtype.kind in "iu" and dtype.itemsize == 1:
-        raise UserError(
-            f"{name}: holds 8-bit numbers, which is a picture or a mask and not a depth image",
-            legal="16-bit or wider integers, or floating point",
-            fix="export the depth itself; a preview scaled to 0..255 has lost it",
-        )
-    if dtype.kind not in "iuf":
-        raise UserError(f"{name}: holds {dtype}, not numbers", legal="integers of 16 bits or more, or floating point")
+    is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
+    if is_narrow or dtype.kind not in "iuf":
+        what = "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
+        legal = "integers of 16 bits or more, or floating point"
+        raise UserError(f"{name}: holds {what}", legal=legal, fix="export the depth itself, not a preview")
 
 
 def frame_of(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
-    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres.
-
-    A distance of 0 and `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError
-    where points lie both in front of and behind the camera.
-    """
+    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres. A distance of 0 and
+    `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError where most points,
+    not all, lie behind the camera."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -81,11 +72,9 @@ def frame_of(
         )
         behind = ~behind & valid
     elif behind.sum() > 0.5 * valid.sum():
-        raise UserError(
-            f"{name}: most points lie behind the camera (z below 0), but not all",
-            legal="the camera's frame: x right, y down, z forward from the lens",
-            fix="turn the cloud before saving it (a cloud with y up and z back: negate y and z)",
-        )
+        what = f"{name}: most points lie behind the camera (z below 0), but not all"
+        legal = "the camera's frame: x right, y down, z forward from the lens"
+        raise UserError(what, legal=legal, fix="turn the cloud (with y up and z back: negate y and z)")
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
     if stored.ndim == 3:
@@ -97,22 +86,17 @@ def frame_of(
     return Frame(name, z_m, reason, xy_m=xy_m, rgb=rgb, amplitude=amplitude, notes=tuple(notes))
 
 
-# ---- numbers that mean no return -------------------------------------------------------------------------------------
-
-SHARED_CODE = 20
-"""Pixels that must share a number before it can be a full scale."""
+SHARED_CODE = 20  # pixels that must share a number before it can be a full scale
 ISOLATED = 4.0
 """Factor between codes and all distances: a wall four times as far as all else has more than a few distances."""
 FEW_CODES = 8
 
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
-    """Return the numbers among ``stored`` (n,), finite and not 0, that no surface explains: they mean "no return".
-
-    Four kinds: the largest number that the type can hold; a full scale of fewer bits (4095, 65534 ..) that many pixels
-    share, well beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than all
-    others, or of integers as much nearer; at most three different negative ones. Not found: a code amid the distances.
-    """
+    """Return the numbers among ``stored`` (n,), finite and not 0, that no surface explains: they mean "no return". Four
+    kinds: the largest number of the type; a full scale of fewer bits (4095, 65534 ..) that many pixels share, well
+    beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than all others, or of
+    integers as much nearer; at most three different negative ones. Not found: a code amid the distances."""
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
@@ -145,40 +129,27 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     return tuple(codes)
 
 
-# ---- the unit --------------------------------------------------------------------------------------------------------
-
 UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfactor", "pngdepthscale", "zunits")
 UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
 READINGS = {
-    "mm": (0.867, 0.15),
-    "4000/m": (0.08, 0.0),
-    "tum": (0.03, 0.0),
-    "10000/m": (0.015, 0.0),
-    "cm": (0.003, 0.04),
-    "um": (0.005, 0.01),
-    "m": (0.0, 0.8),
-}
-"""Units and how common each is among integers and floating-point numbers: guesses, in which a factor of 2 moves no
-decision by more than a fifth of the distance. 0.25 mm: RealSense L515, Helios; 0.1 mm: structured light, Orbbec."""
+    **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
+    **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "m": (0.0, 0.8)},
+}  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
 NEAR_M = (0.8, 1.8)
 """Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
 """Any distance above the first keeps at least the second as its part of the commonest distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: above the first nothing is said but the unit, below the second the user is asked, below the third a
-reading is not offered."""
+"""Probabilities: above the first only the unit is told, below the second the user is asked, the third hides a
+reading."""
 MILLIMETRE_SIZES = {
-    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0},
-    **{(512, 424): 8.0, (256, 192): 8.0},
-}
-"""Image sizes of cameras that all store 1 mm (Azure Kinect and Femto, Kinect v2, iPhone) and the median distance in
-metres that they can reach: the data sheets' range and what bright walls add to it."""
+    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0},
+}  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
 """Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(NamedTuple):
     """Metres in one stored number, and who says so. ``warning``: why to doubt it, "" for no doubt."""
 
     scale_m: float
@@ -187,11 +158,9 @@ class Unit:
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Return metres in one stored number as names with values state it, None where they do not.
-
-    Values are metres (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000, ORB-SLAM: 5000)
-    or a unit's name; they are three powers of ten apart, and the ``median`` stored number tells which it is.
-    """
+    """Return metres in one stored number as names with values state it, None where they do not. Values are metres
+    (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name; they are three
+    powers of ten apart, and the ``median`` stored number tells which it is."""
     for key, value in statements.items():
         if re.sub("[^a-z]", "", str(key).lower()) not in UNIT_KEYS:
             continue
@@ -211,15 +180,12 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
-    """Decide the unit of numbers (n,), without those that mean no return, that nothing states.
+    """Decide the unit of numbers (n,) that nothing states; ``size``: width and height of the image.
 
     Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
-    where targets are: 0.8 m within a factor of 1.8 (`NEAR_M`). A common divisor of all numbers speaks for the unit in
-    which they are whole millimetres. ``size``: width and height of the image; sizes that only cameras with 1 mm have
-    speak for it (`MILLIMETRE_SIZES`), and against distances beyond their reach. Noise is not used: read in a unit
-    four times coarser it grows as the distance does, as it would in a camera.
-
-    Raises UserError where no reading is clearly the likeliest, with the distance that each gives.
+    where targets are (`NEAR_M`). A common divisor of all numbers speaks for the unit in which they are whole
+    millimetres; sizes that only cameras with 1 mm have speak for it (`MILLIMETRE_SIZES`), and against distances beyond
+    their reach. Raises UserError where no reading is clearly the likeliest, with the distance that each gives.
     """
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
@@ -240,36 +206,32 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
         off = math.log(max(near * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
         weights[unit] = weight * (math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M))
     total = sum(weights.values())
-    ranked = sorted(weights, key=lambda unit: -weights[unit])
-    best, chance = ranked[0], weights[ranked[0]] / total if total > 0 else 0.0
-    likely = [unit for unit in ranked if total > 0 and weights[unit] / total > SHOWN]
-    shown = [f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)" for unit in likely]
-    if chance < LIKELY:
+    chances = {unit: weight / total if total > 0 else 0.0 for unit, weight in weights.items()}
+    ranked = sorted(chances, key=lambda unit: -chances[unit])
+    shown = [f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)" for unit in ranked if chances[unit] > SHOWN]
+    best = ranked[0]
+    if chances[best] < LIKELY:
         what = "several units are plausible" if shown else "no usual unit is plausible"
         raise UserError(
             f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})",
             fix=f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}",
         )
-    scale_m = metres_per_unit(best)
-    usual = math.isclose(scale_m, usual_m)
-    kind = "integers" if integers else "floating-point numbers"
-    origin = f"what is usual for {kind}" if usual else f"the data: in the usual unit of {kind}, {1e3 * usual_m:g} mm,"
-    origin += "" if usual else f" the median distance would be {median * usual_m:.4g} m"
-    if usual and chance >= SURE:
-        return Unit(scale_m, origin)
+    scale_m, usual = metres_per_unit(best), f"what is usual for {'integers' if integers else 'floating-point numbers'}"
+    if math.isclose(scale_m, usual_m):
+        if chances[best] >= SURE:
+            return Unit(scale_m, usual)
+    else:
+        usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
     others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
     warning = (
         f"nothing states the depth unit; {1e3 * scale_m:.4g} mm is taken, which puts the median at"
         f" {median * scale_m:.3g} m{others}; state it with --unit {best}"
     )
-    return Unit(scale_m, origin, warning)
+    return Unit(scale_m, usual, warning)
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:
-    """Return the coarsest common rounding step that all valid distances are multiples of; 0 where they follow none.
-
-    A cloud in floating-point metres that came from a camera with 1 mm output still has steps of 1 mm.
-    """
+    """Return the coarsest common rounding step that all valid distances are multiples of; 0 where they follow none."""
     values = z_m[np.isfinite(z_m)].astype(np.float64)
     for step_m in COMMON_STEPS_M:
         turns = values / step_m
@@ -280,10 +242,7 @@ def rounding_step_m(z_m: np.ndarray) -> float:
 
 
 def refuse_implausible(frame: Frame, scale_m: float) -> None:
-    """Raise UserError where the median distance of a frame with a valid pixel speaks for a wrong unit.
-
-    A factor that leaves the distance plausible (5000 to the metre read as millimetres) cannot be noticed here.
-    """
+    """Raise UserError where the median distance of a frame with a valid pixel speaks for a wrong unit."""
     valid = frame.z_m[np.isfinite(frame.z_m)]
     median_m = float(np.median(valid[:: max(1, valid.size // 50_000)]))
     if NEAREST_M <= median_m <= FARTHEST_M:

@@ -1,22 +1,112 @@
-"""The lens of a capture from a file: plain JSON, Open3D, OpenCV, ROS camera_info, or an Azure Kinect calibration."""
+"""The lens of a capture from a file: plain JSON, Open3D, OpenCV, ROS camera_info, an Azure Kinect's calibration."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from detectors.recordings.azure_calibration import depth_lens, depth_mode_of_size, parse_calibration
-from detectors.recordings.pictures import png_texts
-from detectors.recordings.recording import Asked
-from harness.vocabulary.declaration.problems import DeclarationError
-from harness.vocabulary.declaration.yaml_source import MAX_BYTES, parse_yaml
+import numpy as np
+
+from detectors.recordings.recording import Asked, damage_told
+from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.lens import Lens, OtherLens
-from harness.vocabulary.limits import PICTURE_BYTES, TEXT_BYTES, bounded_bytes, refuse_bytes
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
+from harness.vocabulary.geometry import Lens, OtherLens
+
+Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
+"""A read-out of the sensor: the binned sensor, the offset of the crop in it, and the image; (x, y) pixels."""
+DEPTH_MODES: dict[str, Mode] = {
+    "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
+    "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
+    "WFOV_2X2BINNED": ((512, 512), (0, 0), (512, 512)),
+    "WFOV_UNBINNED": ((1024, 1024), (0, 0), (1024, 1024)),
+}
+COLOUR_MODES: tuple[Mode, ...] = (
+    ((1280, 960), (0, 120), (1280, 720)),
+    ((1920, 1440), (0, 180), (1920, 1080)),
+    ((2560, 1920), (0, 240), (2560, 1440)),
+    ((2048, 1536), (0, 0), (2048, 1536)),
+    ((3840, 2880), (0, 360), (3840, 2160)),
+    ((4096, 3072), (0, 0), (4096, 3072)),
+)
+MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
+OWN_LENS = "record again, or give a lens with --intrinsics FILE"
+
+
+class ColourCamera(NamedTuple):
+    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from depth to colour."""
+
+    lens: Lens
+    T_colour_depth: np.ndarray
+
+
+def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
+    refuse_bytes(name, len(content), TEXT_BYTES)
+    legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
+    with damage_told(f"{name}: is no Azure Kinect calibration", legal, OWN_LENS):
+        cameras = strict_json(content.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
+        return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
+
+
+def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
+    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode or a bad file."""
+    if mode not in DEPTH_MODES:
+        raise UserError(f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES))
+    camera, numbers = _camera(name, cameras, "Depth")
+    if (camera["SensorWidth"], camera["SensorHeight"]) != (1024, 1024):
+        raise UserError(f"{name}: calibration of a sensor that is not 1024 x 1024, an Azure Kinect's")
+    return _lens(name, numbers, DEPTH_MODES[mode])
+
+
+def depth_mode_of_size(width: int, height: int) -> str | None:
+    """Return the depth mode whose image has this size, None where there is none."""
+    return next((name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None)
+
+
+def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
+    """Return the colour camera in the mode of this image's size, None without. Raises UserError without a lens."""
+    mode = next((mode for mode in COLOUR_MODES if mode[2] == (width, height)), None)
+    if mode is None:
+        return None
+    camera, parameters = _camera(name, cameras, "PhotoVideo")
+    if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
+        # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
+        parameters[1] = (parameters[1] * 2304 + 384) / 3072
+        parameters[3] = parameters[3] * 2304 / 3072
+    T_colour_depth = np.eye(4)
+    with damage_told(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
+        T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
+        T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
+    return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
+
+
+def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str, Any], list[float]]:
+    """Return a camera and its 14 numbers cx, cy, fx, fy, k1..k6, codx, cody, p2, p1."""
+    if purpose not in cameras:
+        raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
+    camera: dict[str, Any] = cameras[purpose]
+    legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
+    with damage_told(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
+        is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
+        model, numbers = camera["Intrinsics"]["ModelType"], [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
+    known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
+    if not known or numbers[10] or numbers[11]:
+        what = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
+        raise UserError(f"{name}: {what}", legal=legal, fix=OWN_LENS)
+    return camera, numbers
+
+
+def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
+    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters
+    if not (fx > 0 and fy > 0):
+        raise UserError(f"{name}: focal length {fx:g}, {fy:g}", legal="above 0")
+    (across, down), (left, top), image = mode
+    centre = cx * across - left - 0.5, cy * down - top - 0.5
+    return Lens(*image, fx * across, fy * down, *centre, (k1, k2, p1, p2, k3, k4, k5, k6))
+
 
 LEGAL_LENS = (
     "JSON or YAML with fx, fy, cx, cy in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
@@ -25,14 +115,9 @@ LEGAL_LENS = (
 FOUND_BESIDE = (
     *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
     "rtabmap_calib",
-)
-"""Stems of the files that are taken for the lens of the frames beside or below them."""
+)  # stems of the files that are taken for the lens of the frames beside or below them
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-BESIDE = 20
-"""Files beside a capture that are asked for its unit."""
-SHOWN_KEYS = 20
-LARGEST = 1e12
-"""Largest number that a lens may state, in any unit."""
+LARGEST = 1e12  # largest number that a lens may state, in any unit
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
 
 Own = Callable[[], tuple[Lens | None, Path | None]]
@@ -42,10 +127,8 @@ Own = Callable[[], tuple[Lens | None, Path | None]]
 def lens_for(
     name: str, asked: Asked, width: int, height: int, own: Own, hint: str = ""
 ) -> tuple[Lens, tuple[Path, ...]]:
-    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, or ``own``.
-
-    Raises UserError where nobody states a lens (``hint`` ends its advice), or the one stated is of other images.
-    """
+    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, or ``own``. Raises
+    UserError where nobody states a lens (``hint`` ends its advice), or the one stated is of other images."""
     lens, file = asked.lens, asked.intrinsics
     if file is not None:
         lens = read_lens(file, width, height)
@@ -59,9 +142,9 @@ def lens_for(
         )
     files = (file,) if file else ()
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
-    found = next((mode for mode in modes if (mode.width, mode.height) == (width, height)), None)
-    if found is not None:
-        return found, files
+    for mode in modes:
+        if (mode.width, mode.height) == (width, height):
+            return mode, files
     known = [f"{mode.mode} {mode.width} x {mode.height}" for mode in modes[1:] if isinstance(mode, OtherLens)]
     raise UserError(
         f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
@@ -80,93 +163,66 @@ def lens_beside(folders: Sequence[Path], width: int, height: int) -> tuple[Lens 
     return None, None
 
 
-def statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file, and the
-    text in that file where it is a PNG. Files that cannot be read are passed over: they may belong to something else.
-    """
-    folders = dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ())
-    if files and files[0].suffix.lower() == ".png":
-        yield files[0], png_texts(bounded_bytes(files[0], PICTURE_BYTES))
-    for folder in folders:
-        beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
-        for path in islice(beside, BESIDE):
-            try:
-                yield path, _parsed(path)
-            except UserError:
-                continue
-
-
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """Return the lens in a file, for images of ``width`` x ``height``.
-
-    Raises UserError where the file is missing, unreadable, of another image size, or of a lens model that is not known.
-    """
-    data = _parsed(path)
+    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError where it is missing,
+    unreadable, of another image size, or of a lens model that is not known."""
+    data = parsed_lens(path)
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
         if mode is None:
             raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
         return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
     data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
-    stated = None
-    for keys in (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px")):
-        if stated is None and all(key in data for key in keys):
-            if not all(isinstance(data[key], int) for key in keys):
-                raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
-            stated = data[keys[0]], data[keys[1]]
-    if stated is not None and stated != (width, height) and stated[0] * height != stated[1] * width:
+    pairs = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"))
+    keys = next((keys for keys in pairs if all(key in data for key in keys)), None)
+    across, down = (data[key] for key in keys) if keys else (width, height)
+    if not isinstance(across, int) or not isinstance(down, int):
+        raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
+    if across * height != down * width:
         raise UserError(
-            f"{path}: is for images of {stated[0]} x {stated[1]} pixels, but the depth images have {width} x {height}",
+            f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}",
             fix="give the lens of the depth images themselves (or of the colour camera that they are aligned to)",
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
-    side = stated[0] / width if stated else 1.0
+    side = across / width
     fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
-    if not (0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        raise UserError(
-            f"{path}: focal length fx = {fx:g}, fy = {fy:g} for an image {width} pixels wide",
-            legal=f"pixels, {0.1 * width:g} to {100 * width:g}",
-            fix="multiply a normalised focal length by the image's width",
-        )
-    if not (-width < cx < 2 * width and -height < cy < 2 * height):
-        raise UserError(
-            f"{path}: principal point cx = {cx:g}, cy = {cy:g} for {width} x {height} pixels",
-            legal="pixels from the centre of the first one, near the image's centre",
-        )
+    is_near = -width < cx < 2 * width and -height < cy < 2 * height
+    if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
+        what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} of no {width} x {height} image"
+        fix = "multiply a normalised focal length by the image's width"
+        raise UserError(f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix)
     distortion = _distortion(path, data)
-    if stated in (None, (width, height)):
+    if (across, down) == (width, height):
         return Lens(width, height, fx, fy, cx, cy, distortion)
     warning = (
-        f"{path.name} is the lens of images of {stated[0]} x {stated[1]} pixels; it is scaled to {width} x {height},"
+        f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
         " which is right unless the smaller image is cut out of the larger"
     )
     return OtherLens(width, height, fx, fy, cx, cy, distortion, warning=warning)
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def parsed_lens(path: Path) -> dict[str, Any]:
     """Return the file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
-    try:
+    if not path.exists():
+        raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
+    with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
-        if text.lstrip().startswith("{"):
-            data = strict_json(text, nan=True)  # `_number` names the key that is no number
-        else:
-            refuse_bytes(str(path), len(text), MAX_BYTES)
-            # OpenCV's first line, "%YAML:1.0", is no directive of YAML; its matrices are plain mappings under a tag
-            body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
-            data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file", legal=LEGAL_LENS) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read ({error})", legal=LEGAL_LENS) from error
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
-    except DeclarationError as error:
-        first = error.problems[0]
-        where = first.place.head if first.place else str(path)
-        raise UserError(f"{where}: {first.message}", legal=LEGAL_LENS) from error
-    except ValueError as error:
-        raise UserError(f"{path}: {error}", legal=LEGAL_LENS) from error
+        try:
+            if text.lstrip().startswith("{"):
+                data = strict_json(text, nan=True)  # `_number` names the key that is no number
+            else:
+                refuse_bytes(str(path), len(text), MAX_BYTES)
+                # OpenCV's first line, "%YAML:1.0", is no directive of YAML; its matrices are mappings under a tag
+                body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+                data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
+        except json.JSONDecodeError as error:
+            raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
+        except DeclarationError as error:
+            first = error.problems[0]
+            raise UserError(
+                f"{first.place.head if first.place else path}: {first.message}", legal=LEGAL_LENS
+            ) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: holds no names with values", legal=LEGAL_LENS)
     return data
@@ -183,8 +239,8 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
         if key in data:
             m = _numbers(path, key, data[key], 9)
             return m[0], m[4], m[2], m[5]
-    keys = ", ".join(str(key)[:40] for key in list(data)[:SHOWN_KEYS]) + (", .." if len(data) > SHOWN_KEYS else "")
-    raise UserError(f"{path}: holds no lens (its keys: {keys or 'none'})", legal=LEGAL_LENS)
+    keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
+    raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
@@ -196,18 +252,14 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     if key is None:
         return (0.0,) * 8
     if isinstance(data[key], dict) and "data" not in data[key]:
-        unknown = set(data[key]) - set(DISTORTION_NAMES)
+        unknown = ", ".join(sorted(map(str, set(data[key]) - set(DISTORTION_NAMES))))
         if unknown:
-            raise UserError(
-                f"{path}: {key} has {', '.join(sorted(map(str, unknown)))}", legal=", ".join(DISTORTION_NAMES)
-            )
+            raise UserError(f"{path}: {key} has {unknown}", legal=", ".join(DISTORTION_NAMES))
         return tuple(_number(path, f"{key}.{name}", data[key].get(name, 0.0)) for name in DISTORTION_NAMES)
     numbers = _numbers(path, key, data[key], None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):
-        raise UserError(
-            f"{path}: {key} has {len(numbers)} numbers",
-            legal="0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt",
-        )
+        legal = "0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt"
+        raise UserError(f"{path}: {key} has {len(numbers)} numbers", legal=legal)
     return (numbers + (0.0,) * 8)[:8]
 
 
@@ -217,7 +269,7 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [x for row in value for x in row]
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise UserError(f"{path}: {key} is no list of {count or ''} numbers".replace("  ", " "), legal=LEGAL_LENS)
+        raise UserError(f"{path}: {key} is no list of {count or 'any'} numbers", legal=LEGAL_LENS)
     return tuple(_number(path, key, x) for x in value)
 
 

@@ -1,7 +1,6 @@
 """ROS' messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
 
-``compressedDepth`` is image_transport's: twelve bytes (a form, then two numbers of the quantisation of 32FC1), then a
-PNG or an RVL stream (Wilson 2017, "Fast lossless depth image compression").
+``compressedDepth``: twelve bytes (a form, two numbers of the quantisation), then a PNG or RVL (Wilson 2017).
 """
 
 from __future__ import annotations
@@ -12,14 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from detectors.recordings.depth_images import PNG_SIGNATURE, decoded, refuse_broken_png
 from detectors.recordings.distances import frame_of
-from detectors.recordings.pictures import PNG_SIGNATURE, decoded, refuse_broken_png
-from harness.vocabulary.capture import Frame, Reason
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.limits import refuse_pixels
+from harness.vocabulary.files import refuse_pixels
+from harness.vocabulary.geometry import Frame, Reason
 
-FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""PointField's codes."""
+FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's codes
 AMPLITUDE_FIELDS = ("intensity", "amplitude", "i")
 LEGAL_CLOUD = "sensor_msgs/PointCloud2 with the fields x, y, z, each a single number"
 DEPTH_NUMBERS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -37,10 +35,7 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32, whatever their byte order and row padding.
-
-    Raises UserError where the message holds no depth, or less than its size needs.
-    """
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where there is no or less depth."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")
@@ -48,19 +43,19 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
     if hasattr(message, "format"):
         return _unpacked(name, encoding, bytes(message.data))
     kind = np.dtype((">" if message.is_bigendian else "<") + DEPTH_NUMBERS[encoding])
-    height, width, step = int(message.height), int(message.width), int(message.step)
+    stored = _rows(name, message, kind, int(message.step))
+    return stored.astype(kind.newbyteorder("="))
+
+
+def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray:
+    """Return a (height, width) view of a message's data. Raises UserError where it is shorter than that needs."""
+    height, width = int(message.height), int(message.width)
     refuse_pixels(name, width, height)
     data = np.asarray(message.data, np.uint8)
-    needed = (height - 1) * step + width * kind.itemsize
-    if step < width * kind.itemsize or data.size < needed:
-        raise UserError(
-            f"{name}: is truncated: {data.size} bytes in rows of {step}, but {width} x {height} pixels of"
-            f" {kind.itemsize} bytes",
-            legal="height * step bytes, each row with all its pixels",
-            fix="record or convert it again",
-        )
-    stored = np.ndarray((height, width), kind, data.data, strides=(step, kind.itemsize))
-    return stored.astype(kind.newbyteorder("="))
+    if row_bytes < width * kind.itemsize or data.size < (height - 1) * row_bytes + width * kind.itemsize:
+        what = f"{data.size} bytes in rows of {row_bytes} cannot hold {width} of {kind.itemsize} bytes, {height} times"
+        raise UserError(f"{name}: is truncated: {what}", fix="record or convert it again")
+    return np.ndarray((height, width), kind, data.data, strides=(row_bytes, kind.itemsize))
 
 
 def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
@@ -83,11 +78,7 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
 
 
 def _rvl(name: str, content: bytes) -> np.ndarray:
-    """Unpack width and height, then runs of zeros and of differences in numbers of three bits a nibble.
-
-    Words of 32 bits hold their first nibble on top; a nibble's top bit says that the number goes on. Differences are
-    folded (0, -1, 1, -2, ..) and count from the last pixel that was not 0.
-    """
+    """Unpack width and height, then runs of zeros and of differences in numbers of three bits a nibble."""
     width, height = struct.unpack_from("<II", content.ljust(8, b"\0"))
     refuse_pixels(name, width, height)
     words = np.frombuffer(content, "<u4", (len(content) - 8) // 4, 8)
@@ -102,11 +93,11 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
     folded: list[np.ndarray] = []
     pixel = at = 0
     while pixel < filled.size:
-        if at + 1 >= numbers.size or (run := int(numbers[at + 1])) > numbers.size - at - 2:
-            raise UserError(f"{name}: its RVL stream ends too early", legal=LEGAL_IMAGE, fix="record it again")
+        run = int(numbers[at + 1]) if at + 1 < numbers.size else numbers.size
+        if run > numbers.size - at - 2 or pixel + numbers[at] + run > filled.size or run + numbers[at] == 0:
+            what = f"{name}: its RVL stream is damaged or ends too early"
+            raise UserError(what, legal=LEGAL_IMAGE, fix="record it again")
         pixel += int(numbers[at])
-        if pixel + run > filled.size or run + numbers[at] == 0:
-            raise UserError(f"{name}: its RVL stream is damaged", legal=LEGAL_IMAGE, fix="record it again")
         filled[pixel : pixel + run] = True
         folded.append(numbers[at + 2 : at + 2 + run])
         pixel, at = pixel + run, at + 2 + run
@@ -117,11 +108,8 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
 
 
 def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
-    """Make a frame of a depth image, or of a PointCloud2, (1, n) without a grid. NaN means no return.
-
-    Fields may lie anywhere in a point, be of any numeric type and byte order, and rows may be padded. Raises UserError
-    where x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs.
-    """
+    """Make a frame of a depth image, or of a PointCloud2, (1, n) without a grid; NaN means no return. Raises UserError
+    where x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
     if not hasattr(message, "point_step"):
         frame = frame_of(name, stored_depth(name, message), scale_m)
     else:
@@ -149,19 +137,6 @@ def _points(name: str, message: Any) -> np.ndarray:
     height, width, step, row = (int(n) for n in (message.height, message.width, message.point_step, message.row_step))
     if height * width == 0:
         raise UserError(f"{name}: holds no points ({width} x {height})", legal=LEGAL_CLOUD)
-    refuse_pixels(name, width, height)
-    row = row if height > 1 or row else width * step
-    data = np.asarray(message.data, np.uint8)
-    needed = (height - 1) * row + width * step
-    if row < width * step:
-        raise UserError(f"{name}: rows of {row} bytes cannot hold {width} points of {step} bytes", legal=LEGAL_CLOUD)
-    if data.size < needed:
-        raise UserError(
-            f"{name}: is truncated: {data.size} bytes of points, but {width} x {height} points of {step} bytes"
-            f" in rows of {row} need {needed}",
-            legal="height * row_step bytes",
-            fix="record or convert it again",
-        )
     order = ">" if message.is_bigendian else "<"
     # some drivers leave count at 0 where they mean 1
     single = {f.name: f for f in message.fields if f.count <= 1 and f.datatype in FIELD_TYPES}
@@ -178,4 +153,4 @@ def _points(name: str, message: Any) -> np.ndarray:
             types[key] = np.dtype(order + "u4")  # four packed bytes, whatever the field calls them
     offsets = [single[key].offset for key in types]
     layout: Any = {"names": list(types), "formats": list(types.values()), "offsets": offsets, "itemsize": step}
-    return np.ndarray((height, width), np.dtype(layout), data.data, strides=(row, step))
+    return _rows(name, message, np.dtype(layout), row if height > 1 or row else width * step)

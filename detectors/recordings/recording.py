@@ -3,31 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from detectors.recordings.distances import refuse_implausible
-from harness.vocabulary.capture import Frame, Reason
+from detectors.recordings.distances import refuse_implausible, rounding_step_m
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.files import limited_memory
+from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
 """A pixel whose ray does not come back to it within this has no direction that the lens model can give."""
 NO_GRID = "the cloud has no pixel grid; it is treated as single points"
 
 
+@contextmanager
+def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
+    """Turn what a library raises on a damaged file into a UserError that begins with ``what``; limit its memory."""
+    try:
+        with limited_memory():
+            yield
+    except UserError:
+        raise
+    except Exception as error:
+        why = "there is not memory enough for what it states" if isinstance(error, MemoryError) else str(error)
+        raise UserError(f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix) from error
+
+
 @dataclass(frozen=True)
 class Asked:
-    """The user's statements about a capture: the options of `detectors.recordings.opening.open_capture`.
-
-    ``scale_m``: metres in one stored unit, None where the format's usual unit counts.
-    """
+    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
+    ``intrinsics``: a file with the depth pixels' lens, which counts before one that comes with the frames; ``lens``:
+    the same as a value. ``frames`` selects frames by number. ``topic`` of a ROS bag. ``array``: NAME or NAME:NUMBER in
+    a file of arrays. ``pitch``: distance between the pixels of a height map (``0.5mm``). ``raw``: layout of bare
+    numbers."""
 
     scale_m: float | None = None
     intrinsics: Path | None = None
@@ -41,14 +55,12 @@ class Asked:
 
 @dataclass(frozen=True)
 class Recording:
-    """A real capture as a `harness.vocabulary.capture.FrameSource`.
+    """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
-    ``read`` yields the frames in order, one at a time; each call starts again from the first. ``shape``: (height,
-    width). ``files``: all files whose content can change a number (frames, colour, intrinsics). ``scale_m``: metres in
-    one stored unit, and ``unit_from`` who says so: "" where a reader only takes what is usual for its format, so that
-    `detectors.recordings.opening` decides by the data. ``notes``: what the user should know about how the files were
-    understood. ``warnings``: full sentences on what makes the distances doubtful; every program shows them before
-    anything else. ``selection`` picks frames. ``projection``: see `harness.vocabulary.capture.Cloud`.
+    ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
+    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` who says so: "" where the
+    data shall decide. ``notes``: what the user should know about how the files were understood. ``warnings``: full
+    sentences on what makes the distances doubtful; every program shows them first. ``selection`` picks frames.
     """
 
     name: str
@@ -64,6 +76,17 @@ class Recording:
     projection: Literal["central", "parallel"] = "central"
     selection: slice | None = None
     unit_from: str = ""
+
+    @classmethod
+    def begun(
+        cls, name: str, read: Callable[[], Iterator[Frame]], scale_m: float, is_whole: bool = False, **more: Any
+    ) -> Recording:
+        """Return a recording of the first frame's size and step. Raises UserError without a frame."""
+        first = next(read(), None)
+        if first is None:
+            raise UserError(f"{name}: no frame in it", legal="at least one frame", fix="copy or record it again")
+        step_m = scale_m if is_whole else rounding_step_m(first.z_m)
+        return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
 
     @property
     def region(self) -> Region:
@@ -89,13 +112,12 @@ class Recording:
         """Yield the selected frames. Raises UserError on differing sizes, a wrong unit, or when no pixel is valid."""
         count, judged = 0, False
         for frame in self.selected():
+            count += 1
             if frame.z_m.shape != self.shape:
                 what = "pixels" if self.organised else "points"
-                raise UserError(
-                    f"{frame.name}: {_size(frame.z_m.shape)} {what}, but the first frame has {_size(self.shape)}",
-                    legal="frames of one size, from one camera that did not move",
-                    fix="run the differing frames on their own",
-                )
+                sizes = [f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)]
+                what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
+                raise UserError(what, legal="frames of one size", fix="run the differing frames on their own")
             if self.slopes is not None and frame.xy_m is None:
                 rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
                 if rayless.any():
@@ -105,28 +127,19 @@ class Recording:
             if not judged and np.isfinite(frame.z_m).any():
                 refuse_implausible(frame, self.scale_m)
                 judged = True
-            count += 1
             yield frame
-        if count == 0:
-            raise UserError(f"{self.name}: no frame in it", legal="at least one frame", fix="check the selected frames")
         if not judged:
-            raise UserError(
-                f"{self.name}: not one valid pixel in {count} frame{'s' if count > 1 else ''}",
-                legal="depth above 0 and finite in some pixels",
-                fix="check that these are depth images and that the target was within the camera's range",
-            )
+            fix = "check the selected frames, and that the target was within the camera's range"
+            raise UserError(f"{self.name}: not one valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
 
     def first_frame(self) -> Frame:
         """Return the first selected frame, checked. Raises UserError as `frames` does."""
-        for frame in self.frames():
-            return frame
-        raise AssertionError("frames() raises before it yields nothing")
+        return next(self.frames())
 
 
 @lru_cache(maxsize=2)
 def slopes_of(lens: Lens, region: Region) -> np.ndarray:
-    """Return (h, w, 2) x/z and y/z per pixel, not to be written to: kept, because captures that are views of one target
-    share their lens, and undistorting a sensor takes longer than averaging a frame of it."""
+    """Return (h, w, 2) x/z and y/z per pixel, not to be written to: kept, as views of one target share their lens."""
     return lens.region_slopes(region)
 
 
@@ -140,7 +153,3 @@ def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
     v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
     missed_px = np.abs(lens.project(rays) - np.stack([u, v], axis=-1)).max(axis=-1)
     return np.where((missed_px < ROUND_TRIP_PX)[..., None], slopes, np.nan)
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]} x {shape[0]}" if shape[0] > 1 else str(shape[1])

@@ -1,3 +1,1 @@
 """Rigid registration of views of one target: where each stands to the first, how well that is known, and when not."""
-
-from __future__ import annotations

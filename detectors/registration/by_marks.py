@@ -1,24 +1,44 @@
-"""Registration by marks: matched by code or by their mutual distances, placed by weighted least squares.
+"""Registration by marks: matched by code or by distances, placed by weighted least squares; alone or jointly.
 
-`detectors.marks.pairing` matches, `detectors.marks.placing` places. Two views of one target disagree by more than the
-marks' noise where range or lens are wrong by what the marks of one view do not share; `SHARED_M` allows for that when
-it is judged whether the views belong together. The covariance that is given holds the noise, widened where the marks
-disagree by more than chance allows (Birge's ratio).
-"""
+Where it is judged whether the views belong together, `SHARED_M` allows for what range or lens are wrong by in one view
+alone. The covariance holds the noise, widened where the marks disagree by more than chance allows (Birge's ratio).
+
+The joint adjustment is one of bundles (Triggs et al., 2000) with one smooth surface in place of many points: in the
+plane the marks decide, across it the surface. Unknown are the poses of all views but the first, the surface z(x, y) (a
+cubic), the marks' places on it, and each view's own smooth error across it:
+
+z(T_v p) - S(x, y) - b_v(x, y) = noise for some 2000 target points p of each view v, and P (T_v c - M) = noise for each
+mark c of each view that is one of the reference's, in the surface's frame. Noise across is that of the sampling, with
+one independent value in 25 pixels; Tukey's weights keep holes out. b_v is what all pixels of a view share smoothly
+(wiggling, multipath): the ten terms of a cubic, with one prior deviation. A level or a tilt of it cannot be told from
+the pose's; the scatter of the seven other terms between views gives the deviation (by expectation maximisation), so
+that the poses' covariance holds the three. Where a camera's level wanders by more than its curvature, that is too
+little. Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from detectors.marks.mark import Mark, off_line_problem
-from detectors.marks.pairing import SHARED_M, Pairing, pair_marks
-from detectors.marks.placing import Placement, place
-from detectors.registration.registered import Registration, failed, guess_of
+from detectors.marks.pairing import SHARED_M, Placement, pair_marks, place
+from detectors.registration.registered import (
+    MEDIAN_TO_SIGMA,
+    Registration,
+    displacement_jacobian,
+    failed,
+    guess_of,
+    independent,
+    moved_by,
+    sampling_of,
+    thinned,
+)
+from detectors.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
 from detectors.views import PreparedView
-from harness.vocabulary.geometry import transform_points
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, invert, transform_points
 
-Marks = tuple[Mark, ...]
 WIDEN_BELOW = 0.01
 """Chance of marks that disagree so much by their noise alone, below which the covariance is widened."""
 REFUSE_BELOW = 1e-4
@@ -26,24 +46,16 @@ REFUSE_BELOW = 1e-4
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> Registration:
-    """Return the pose of a view relative to the reference, from their trusted marks. ``overlap`` stays NaN.
-
-    ``covariance`` is the closed form of the weighted fit. Never raises for the content of the views: too few marks,
-    marks on a line, marks that fit nowhere, in several ways, or badly, are its ``failure``; the transform is then the
-    best known, or else the guess, or else the identity.
-    """
+    """Return the pose of a view relative to the reference, from their trusted marks. ``overlap`` stays NaN. Never
+    raises for the content of the views: too few marks, marks on a line, marks that fit nowhere, in several ways, or
+    badly, are its ``failure``; the transform is then the best known, or else the guess, or else the identity."""
     from scipy.special import gammaincc
 
     guess = guess_of(reference, view)
-    problem = _problem_of_sets(reference, view)
-    if problem:
-        return failed(view, "marks", guess, problem)
-    pairing = pair_marks(reference.marks.trusted, view.marks.trusted, guess)
-    notes = pairing.notes
-    if len(pairing.pairs) < 3:
-        return failed(view, "marks", guess, pairing.problem, *notes)
-    ours, theirs = _matched(reference, view, pairing)
-    problem = pairing.problem or off_line_problem(ours) or off_line_problem(theirs)
+    ours, theirs, problem, notes = _matched(reference, view)
+    if len(ours) < 3:
+        return failed(view, "marks", guess, problem, *notes)
+    problem = problem or off_line_problem(ours) or off_line_problem(theirs)
     try:
         placement = _placed(ours, theirs, 0.0)
     except np.linalg.LinAlgError:
@@ -76,40 +88,236 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> Registrati
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
-    """Root mean square distance between each matched mark and where the registration by the others puts it, metres.
-
-    None where fewer than four marks match, or where leaving one out leaves the rest on a line.
-    """
-    if _problem_of_sets(reference, view):
+    """Return the root mean square distance between each matched mark and where the registration by the others puts it,
+    metres; None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
+    ours, theirs, problem, _ = _matched(reference, view)
+    if problem or len(ours) < 4:
         return None
-    pairing = pair_marks(reference.marks.trusted, view.marks.trusted, guess_of(reference, view))
-    if pairing.problem or len(pairing.pairs) < 4:
-        return None
-    ours, theirs = _matched(reference, view, pairing)
     squares = []
-    for left_out in range(len(ours)):
-        kept = [i for i in range(len(ours)) if i != left_out]
-        our_rest, their_rest = tuple(ours[i] for i in kept), tuple(theirs[i] for i in kept)
-        if off_line_problem(our_rest):
+    for i, (our, their) in enumerate(zip(ours, theirs, strict=True)):
+        rest = ours[:i] + ours[i + 1 :]
+        if off_line_problem(rest):
             return None
-        T_reference_view = _placed(our_rest, their_rest, 0.0).T_to_from
-        miss = transform_points(T_reference_view, theirs[left_out].centre_m) - ours[left_out].centre_m
-        squares.append(float(miss @ miss))
+        T_reference_view = _placed(rest, theirs[:i] + theirs[i + 1 :], 0.0).T_to_from
+        squares.append(np.sum((transform_points(T_reference_view, their.centre_m) - our.centre_m) ** 2))
     return float(np.sqrt(np.mean(squares)))
 
 
-def _problem_of_sets(reference: PreparedView, view: PreparedView) -> str:
-    return "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
-
-
-def _matched(reference: PreparedView, view: PreparedView, pairing: Pairing) -> tuple[Marks, Marks]:
+def _matched(
+    reference: PreparedView, view: PreparedView
+) -> tuple[tuple[Mark, ...], tuple[Mark, ...], str, tuple[str, ...]]:
+    """Trusted marks of both views that are pairs, the reason why they must not be used (or empty), and notes."""
+    problem = "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
+    if problem:
+        return (), (), problem, ()
     ours, theirs = reference.marks.trusted, view.marks.trusted
-    return tuple(ours[i] for i, _ in pairing.pairs), tuple(theirs[j] for _, j in pairing.pairs)
+    pairing = pair_marks(ours, theirs, guess_of(reference, view))
+    i, j = pairing.pairs.T
+    return tuple(ours[k] for k in i), tuple(theirs[k] for k in j), pairing.problem, pairing.notes
 
 
-def _placed(ours: Marks, theirs: Marks, shared_m: float) -> Placement:
+def _placed(ours: Sequence[Mark], theirs: Sequence[Mark], shared_m: float) -> Placement:
     """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis of each mark."""
     extra = shared_m**2 * np.eye(3)
     our_places, their_places = (np.stack([mark.centre_m for mark in marks]) for marks in (ours, theirs))
     our_spread, their_spread = (np.stack([mark.covariance_m2 for mark in marks]) for marks in (ours, theirs))
     return place(their_places, their_spread + extra, our_places, our_spread + extra)
+
+
+MAX_STEPS = 40
+CONVERGED_M, CONVERGED_SHARED = 1e-6, 0.02
+"""Largest last move of an unknown, and largest last change of the views' own deviation, as a part of it."""
+LEAST_SHARED_M = 1e-6
+DEGREE = 3
+TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
+"""Chebyshev orders in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
+POSE_TERMS = 3
+MARK_GATE = 16.3
+"""Chi-square limit of a mark's position, three degrees of freedom: a true mark is missed once in a thousand."""
+
+
+@dataclass(frozen=True)
+class ViewData:
+    """One view's part: thinned target points (n, 3) and marks in its camera frame, and of each mark its index among the
+    reference's. ``noise_m``: of one point across the surface. ``sigma_m``: the same, so inflated that the points count
+    as if they were independent."""
+
+    points_m: np.ndarray
+    marks: tuple[tuple[Mark, int], ...]
+    noise_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Estimates of the unknowns: ``T`` (v, 4, 4) from the views to the surface's frame; ``surface`` (10,) and ``own``
+    (v, 10) coefficients, metres; ``marks_m`` (m, 2) places in the plane. ``shared_m``: prior deviation of each term of
+    ``own``. ``half_m`` (2,) scales x and y to -1..1. Vectors of all unknowns hold the poses of views 1.., the surface,
+    the marks, and the own errors of views 0.., in this order."""
+
+    T: np.ndarray
+    surface: np.ndarray
+    own: np.ndarray
+    marks_m: np.ndarray
+    shared_m: float
+    half_m: np.ndarray
+
+    def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or of their indices."""
+        sizes = np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
+        poses, surface, marks, own = np.split(values, sizes)
+        return poses.reshape(-1, 6), surface, marks.reshape(-1, 2), own.reshape(-1, len(TERMS))
+
+    def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
+        """Return the state after a motion of all unknowns; poses move about the frame's origin."""
+        poses, surface, marks, own = self.split(motion)
+        T = np.stack([self.T[0], *(moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))])
+        return JointState(T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m)
+
+    def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Return the (n, 10) terms of the cubic."""
+        products = np.polynomial.chebyshev.chebvander2d(x_m / self.half_m[0], y_m / self.half_m[1], [DEGREE, DEGREE])
+        return np.asarray(products[:, [i * (DEGREE + 1) + j for i, j in TERMS]])
+
+    def across(self, data: ViewData, v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return a view's points against the surface: residuals (n,), basis (n, 10), derivatives (n, 6) by the pose's
+        motion, and robust weights (n,) in 1/m^2."""
+        points = transform_points(self.T[v], data.points_m)
+        x, y, z = points.T
+        basis = self.basis(x, y)
+        residual = z - basis @ (self.surface + self.own[v])
+        dx, dy = 1e-3 * self.half_m
+        by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
+        by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
+        normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
+        by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
+        scale = max(data.noise_m, float(np.median(np.abs(residual))) * MEDIAN_TO_SIGMA)
+        tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
+        return residual, basis, by_pose, tukey / data.sigma_m**2
+
+    def equations(self, data: Sequence[ViewData]) -> tuple[np.ndarray, np.ndarray]:
+        """Return matrix and right side of the normal equations of one Gauss-Newton step."""
+        size = 6 * (len(self.T) - 1) + len(TERMS) * (len(self.T) + 1) + self.marks_m.size
+        matrix, right = np.zeros((size, size)), np.zeros(size)
+        poses, surface, marks, own = self.split(np.arange(size))
+
+        def add(columns: np.ndarray, rows: np.ndarray, residual: np.ndarray, weight: np.ndarray) -> None:
+            weighted = rows * weight[:, None] if weight.ndim == 1 else weight @ rows
+            matrix[np.ix_(columns, columns)] += rows.T @ weighted
+            right[columns] -= weighted.T @ residual
+
+        for v, each in enumerate(data):
+            # the first view's pose is no unknown
+            pose, moves = (poses[v - 1], 6) if v else (np.empty(0, dtype=int), 0)
+            residual, basis, by_pose, weight = self.across(each, v)
+            rows = np.concatenate([-basis, -basis, by_pose[:, :moves]], axis=1)
+            add(np.concatenate([surface, own[v], pose]), rows, residual, weight)
+            turn = self.T[v][:2, :3]
+            for mark, label in each.marks:
+                place = transform_points(self.T[v], mark.centre_m)
+                within = displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
+                rows = np.concatenate([-np.eye(2), within], axis=1)
+                weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
+                add(np.concatenate([marks[label], pose]), rows, place[:2] - self.marks_m[label], weight)
+            add(own[v], np.eye(len(TERMS)), self.own[v], np.full(len(TERMS), self.shared_m**-2))
+        return matrix, right
+
+
+def register_jointly(views: Sequence[PreparedView]) -> list[Registration]:
+    """Register views but the first to the first, from all views together. ``covariance`` is each view's marginal,
+    smooth errors of the views included; ``residual_m`` the root mean square across the surface of the points that
+    count. A view whose marks fail keeps that failure and takes no part."""
+    found = [register_by_marks(views[0], view) for view in views[1:]]
+    usable = [i for i, each in enumerate(found) if not each.failure]
+    if usable:
+        adjusted = _adjust([views[0], *(views[i + 1] for i in usable)], [found[i] for i in usable])
+        for i, each in zip(usable, adjusted, strict=True):
+            found[i] = each
+    return [replace(each, method="joint") for each in found]
+
+
+def _adjust(views: Sequence[PreparedView], by_marks: Sequence[Registration]) -> list[Registration]:
+    """Registrations of views 1.. adjusted from those by their marks, none of which failed."""
+    T_reference = [np.eye(4), *(found.T_reference_view for found in by_marks)]
+    data = [_view_data(view, views[0], T) for view, T in zip(views, T_reference, strict=True)]
+    T_surface_reference = _surface_frame(views[0])
+    T = np.stack([T_surface_reference @ each for each in T_reference])
+    half_m = np.maximum(np.abs(transform_points(T[0], views[0].points_m)[:, :2]).max(axis=0), 1e-6)
+    x, y, z = np.concatenate([transform_points(T[v], each.points_m) for v, each in enumerate(data)]).T
+    places = transform_points(T[0], np.stack([mark.centre_m for mark in views[0].marks.trusted]))[:, :2]
+    noise = float(np.median([each.noise_m for each in data]))
+    state = JointState(T, np.zeros(len(TERMS)), np.zeros((len(data), len(TERMS))), places, noise, half_m)
+    start = fit_surface(x, y, z, SurfaceConfig(degree=DEGREE)).evaluate(x, y)
+    state = replace(state, surface=np.linalg.lstsq(state.basis(x, y), start, rcond=None)[0])
+    steps, converged = 0, False
+    while steps < MAX_STEPS and not converged:
+        steps += 1
+        matrix, right = state.equations(data)
+        covariance = np.linalg.inv(matrix)
+        motion = covariance @ right
+        # the maximisation step of EM: beside the squares of the terms that no pose can imitate stands their variance
+        squares = (state.own + state.split(motion)[3]) ** 2 + state.split(np.diag(covariance))[3]
+        shared = max(float(np.sqrt(squares[:, POSE_TERMS:].mean())), LEAST_SHARED_M)
+        settled = abs(shared - state.shared_m) <= CONVERGED_SHARED * state.shared_m
+        converged = settled and bool(np.abs(motion).max() <= CONVERGED_M)
+        state = state.moved(motion, shared)
+    covariance = np.linalg.inv(state.equations(data)[0])
+    T_reference_surface = invert(T_surface_reference)
+    both = np.kron(np.eye(2), T_reference_surface[:3, :3])
+    note = (
+        f"each view's own smooth error is {state.shared_m / MM:.2f} mm (deviation of each term of a cubic), as the"
+        " views disagree; the covariance holds it"
+    )
+    adjusted = []
+    for v, found in enumerate(by_marks, start=1):
+        residual, _, _, weight = state.across(data[v], v)
+        pose = slice(6 * (v - 1), 6 * v)
+        adjusted.append(
+            replace(
+                found,
+                T_reference_view=T_reference_surface @ state.T[v],
+                covariance=both @ covariance[pose, pose] @ both.T,
+                centre_m=T_reference_surface[:3, 3],
+                residual_m=float(np.sqrt(np.average(residual**2, weights=weight))),
+                pairs=len(data[v].marks),
+                iterations=steps,
+                converged=converged,
+                failure="" if converged else f"did not converge in {steps} steps of the joint adjustment",
+                notes=(*found.notes, note),
+            )
+        )
+    return adjusted
+
+
+def _surface_frame(reference: PreparedView) -> np.ndarray:
+    """(4, 4) from the reference to the frame of the surface z(x, y): z along its mean normal, towards the camera."""
+    sampling = sampling_of(reference)
+    z = sampling.normal
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    T[:3, 3] = -T[:3, :3] @ sampling.centre_m
+    return T
+
+
+def _view_data(view: PreparedView, reference: PreparedView, T_reference_view: np.ndarray) -> ViewData:
+    """The data of a view; its marks are those of the reference that ``T_reference_view`` brings them to, once each."""
+    points = thinned(view.points_m)
+    noise = max(sampling_of(view).noise_m, 1e-9)
+    inflation = max(len(points) / independent(int(view.inside.sum())), 1.0)
+    turn = T_reference_view[:3, :3]
+    fits = []
+    for i, mark in enumerate(view.marks.trusted):
+        for j, other in enumerate(reference.marks.trusted):
+            apart = transform_points(T_reference_view, mark.centre_m) - other.centre_m
+            spread = turn @ mark.covariance_m2 @ turn.T + other.covariance_m2 + 2 * SHARED_M**2 * np.eye(3)
+            chi2 = float(apart @ np.linalg.solve(spread, apart))
+            if mark.code == other.code and chi2 <= MARK_GATE:
+                fits.append((chi2, i, j))
+    label: dict[int, int] = {}
+    for _, i, j in sorted(fits):
+        if i not in label and j not in label.values():
+            label[i] = j
+    marks = tuple((view.marks.trusted[i], label[i]) for i in sorted(label))
+    return ViewData(points, marks, noise, noise * float(np.sqrt(inflation)))

@@ -1,4 +1,8 @@
-"""Registration of views by the method that its settings name, and its consistency around loops of three views."""
+"""Registration of views by the method that its settings name, and the judgement whether it can be trusted.
+
+Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
+does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
+by more than `BLUR_M`, or by more than a pixel where pixels are coarser. The limits follow from the sampling."""
 
 from __future__ import annotations
 
@@ -9,112 +13,266 @@ from time import perf_counter
 
 import numpy as np
 
-from detectors.registration.judged import ReferenceTarget, judge, moved_m
-from detectors.registration.registered import Registration, failed, guess_of, reference_registration
-from detectors.registration.sampling import thinned
-from detectors.registration.settings import (
-    PAIRWISE,
-    AnyRegistration,
-    CpdRegistration,
-    IcpRegistration,
-    JointRegistration,
-    MarksRegistration,
-    NominalRegistration,
-    OdometryRegistration,
+from detectors.average import CORRELATED_PIXELS
+from detectors.registration.by_marks import register_by_marks, register_jointly
+from detectors.registration.by_points import register_by_cpd, register_by_icp, register_by_odometry
+from detectors.registration.registered import (
+    MEDIAN_TO_SIGMA,
+    MIN_OVERLAP,
+    Registration,
+    Sampling,
+    guess_of,
+    independent,
+    local_normals,
+    moved_m,
+    predicted_error_m,
+    reference_registration,
+    sampling_of,
+    thinned,
 )
+from detectors.registration.settings import PAIRWISE, AnyRegistration, CpdRegistration, IcpRegistration
 from detectors.views import PreparedView
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import invert
+from harness.vocabulary.geometry import MM, invert, transform_points
+
+FALSE_ALARM_SIGMAS = 3.09
+"""Multiple of the residual's own scatter: a good registration is refused once in a thousand."""
+MEDIAN_SCATTER = 1.65
+"""Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
+BLUR_M = 2.0 * MM
+"""Distance between registered views beyond which a map of them is blurred too much: with two views each lies 1 mm from
+their mean, which is a time-of-flight camera's noise in a single frame."""
+UNDETERMINED_PITCHES = 3.0
+"""A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel."""
+MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
+"""Ten times the error that a nominal pose usually has (some degrees, about 10 mm)."""
+UNJUDGED_AGREEMENT = ("nominal", "odometry")
+"""Methods that never look at the reference's surface: what they leave is noted, not refused."""
+TRIMMED = 0.9
+"""Share of the fiducial points, the nearest ones, that must agree: a colour rule lets stray pixels through."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share of the view's target
+    points beside which the reference has a point within a pitch along the surface, at any distance across it, and at no
+    more than a pitch (or three sigma of noise) across. ``apart_m``: robust root mean square distance across the
+    surfaces where they lie beside each other. ``marks_m``: root mean square distance of the fiducial points to the
+    nearest of the reference, the farthest tenth left out; NaN where either has fewer than three. ``noise_m`` and
+    ``grids_m``: what noise, and two grids of one pitch, explain of these; ``scatter`` and ``marks_scatter`` the
+    relative errors of the two distances, times `FALSE_ALARM_SIGMAS`."""
+
+    beside: float
+    overlap: float
+    apart_m: float
+    marks_m: float
+    pitch_m: float
+    noise_m: float
+    grids_m: float
+    scatter: float
+    marks_scatter: float
+
+
+def _agreement(reference: PreparedView, ours: Sampling, view: PreparedView, T_reference_view: np.ndarray) -> Agreement:
+    """The agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ``ours``."""
+    from scipy.spatial import cKDTree
+
+    theirs, points, marks = sampling_of(view), reference.points_m, reference.mark_points_m
+    pitch, noise = max(ours.pitch_m, theirs.pitch_m), float(np.hypot(ours.noise_m, theirs.noise_m))
+    beside, together, apart, marks_m = np.zeros(1, bool), np.zeros(1, bool), float("nan"), float("nan")
+    fiducial = transform_points(T_reference_view, view.mark_points_m)
+    if len(points) >= 3 and view.inside.any():
+        # the reference's surface at a point is the plane through its 25 nearest points
+        placed = transform_points(T_reference_view, thinned(view.points_m))
+        count = min(CORRELATED_PIXELS, len(points))
+        near = points[cKDTree(points).query(placed, k=count)[1]].reshape(len(placed), count, 3)
+        normals = local_normals(near)
+        across = np.einsum("ni,ni->n", placed - near.mean(axis=1), normals)
+        along = np.linalg.norm(placed - across[:, None] * normals - near[:, 0], axis=1)
+        beside = along <= pitch
+        together = beside & (np.abs(across) <= max(pitch, 3 * noise))
+        apart = float(np.median(np.abs(across[beside]))) * MEDIAN_TO_SIGMA if beside.any() else apart
+        if min(len(fiducial), len(marks)) >= 3:
+            distances = np.sort(cKDTree(marks).query(fiducial)[0])[: max(int(TRIMMED * len(fiducial)), 1)]
+            marks_m = float(np.sqrt(np.mean(distances**2)))
+    scatter = FALSE_ALARM_SIGMAS * MEDIAN_SCATTER / float(np.sqrt(2 * independent(int(beside.sum()))))
+    marks_scatter = FALSE_ALARM_SIGMAS / float(np.sqrt(2 * independent(len(fiducial))))
+    shares = float(beside.mean()), float(together.mean())
+    return Agreement(*shares, apart, marks_m, pitch, noise, pitch / float(np.sqrt(6)), scatter, marks_scatter)
+
+
+def judge(registration: Registration, reference: PreparedView, view: PreparedView) -> Registration:
+    """Return the registration with its overlap and, where it cannot be trusted, its ``failure`` or, for baselines, a
+    note. A failure that the method itself found stays as it is."""
+    T = registration.T_reference_view
+    broken = ""
+    if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)):
+        broken = "no transform was found"
+    elif np.linalg.det(T[:3, :3]) < 0:
+        broken = "mirrored: the transform is a reflection, not a rotation"
+    if broken:
+        return replace(registration, overlap=0.0, failure=registration.failure or broken)
+    ours, points = sampling_of(reference), thinned(reference.points_m, 200)
+    agreement = _agreement(reference, ours, view, T)
+    judged = replace(registration, overlap=agreement.overlap)
+    if judged.failure:
+        return judged
+    if not agreement.beside >= MIN_OVERLAP:
+        elsewhere = (
+            f"the views do not overlap: {100 * agreement.beside:.0f} % of this view's target lies beside the"
+            f" reference's ({100 * MIN_OVERLAP:.0f} % needed)"
+        )
+    else:
+        elsewhere = _jump(judged, reference, view)
+    if elsewhere:
+        return replace(judged, failure=elsewhere)
+    within, across = predicted_error_m(judged, points, ours.normal)
+    undetermined, apart = _undetermined(float(np.hypot(within, across)), ours.pitch_m), _apart(agreement)
+    if judged.method in UNJUDGED_AGREEMENT:
+        return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
+    failure = "; ".join(reason for reason in (undetermined, apart) if reason)
+    return replace(judged, failure=failure) if failure else _widened(judged, ours.normal, within, across, agreement)
+
+
+def _undetermined(error_m: float, pitch_m: float) -> str:
+    """Return the reason why the points do not determine the pose; empty where they do, or the error is not known."""
+    limit = max(UNDETERMINED_PITCHES * pitch_m, BLUR_M)
+    if not error_m > limit:
+        return ""
+    return (
+        "not determined: the points let the target slide or turn (they lie on a line, or on a surface that slides in"
+        f" itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the map (up to"
+        f" {limit / MM:.1f} mm are merged)"
+    )
+
+
+def _jump(registration: Registration, reference: PreparedView, view: PreparedView) -> str:
+    """Return the reason why a pose is too far from its guess to be credible; empty where it is credible."""
+    guess = guess_of(reference, view)
+    if guess is None:
+        return ""
+    change = registration.T_reference_view @ invert(guess)
+    turn = np.rad2deg(np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1.0, 1.0)))
+    centre = view.points_m.mean(axis=0)
+    shift = np.linalg.norm(transform_points(registration.T_reference_view, centre) - transform_points(guess, centre))
+    if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
+        return ""
+    return (
+        f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess (up to {MAX_JUMP_DEG:.0f} degrees and"
+        f" {MAX_JUMP_M / MM:.0f} mm are credible): marks matched wrongly, another target, or a wrong guess"
+    )
+
+
+def _apart(agreement: Agreement) -> str:
+    """Return the reason why surfaces or marks are too far apart to be merged; empty where they are not."""
+    # views may differ by their noise beside BLUR_M, or a pixel where it is larger
+    blur = float(np.hypot(agreement.noise_m, max(BLUR_M, agreement.pitch_m)))
+    limit = blur * (1 + agreement.scatter)
+    marks_limit = float(np.hypot(blur, agreement.grids_m)) * (1 + agreement.marks_scatter)
+    if agreement.apart_m > limit:
+        said, distance = "the surfaces lie {} mm apart where the views overlap", agreement.apart_m
+    elif agreement.marks_m > marks_limit:
+        said, distance = "the marks of the views do not coincide: their points lie {} mm apart", agreement.marks_m
+        limit = marks_limit
+    else:
+        return ""
+    return (
+        f"{said.format(f'{distance / MM:.1f}')}, which would blur the map (up to {limit / MM:.1f} mm are merged): a"
+        " wrong registration, or different targets"
+    )
+
+
+def _widened(
+    registration: Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
+) -> Registration:
+    """Return the registration with a covariance that includes the errors that a whole view shares, and a note, where
+    the views show such errors. Their mean square is the part of the distances between the views that neither noise nor
+    the covariance explains. It is added to the shift, across the surface and within it. An offset of a whole view does
+    not show: the registration absorbs it."""
+
+    def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
+        beyond = measured_m > explained_m * (1 + scatter)
+        return float(np.sqrt(measured_m**2 - explained_m**2)) if beyond else 0.0
+
+    more_across = beyond_m(agreement.apart_m, float(np.hypot(agreement.noise_m, across)), agreement.scatter)
+    explained = float(np.linalg.norm([agreement.noise_m, across, within, agreement.grids_m, more_across]))
+    more_within = beyond_m(agreement.marks_m, explained, agreement.marks_scatter)
+    if not more_across and not more_within:
+        return registration
+    along = np.outer(normal, normal)
+    covariance = registration.covariance.copy()
+    # an error within the plane has two axes to share its mean square
+    covariance[3:, 3:] += more_across**2 * along + 0.5 * more_within**2 * (np.eye(3) - along)
+    parts = [f"{m / MM:.2g} mm {way}" for m, way in ((more_across, "across"), (more_within, "along")) if m]
+    note = (
+        f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: an error that each view"
+        " shares (offset, wiggling, lens); the covariance is widened by it"
+    )
+    return replace(registration, covariance=covariance, notes=(*registration.notes, note))
+
 
 LOOP_POINTS = 500
 """Number of points of the first view's target over which the error of a loop is averaged."""
 
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[Registration, ...]:
-    """Return one registration for each view; the first is that of the reference.
-
-    Never raises for the content of the views: a registration that cannot be trusted has a ``failure``. Raises
-    UserError where the method needs something that these views never have (colour, a pixel grid, a guess).
-    """
+    """Return one registration for each view; the first is that of the reference. Never raises for the content of the
+    views: a registration that cannot be trusted has a ``failure``. Raises UserError where the method needs something
+    that these views never have (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
-    check_views(views, config)
+    _check_views(views, config)
     of_reference = reference_registration(views[0].view.name, config.method)
     if len(views) == 1:
         return (of_reference,)
-    reference = ReferenceTarget(views[0])
     if config.method in PAIRWISE:
         found = [_pair(views[0], view, config) for view in views[1:]]
     else:
         started = perf_counter()
-        if isinstance(config, OdometryRegistration):
-            from detectors.registration.odometry import register_by_odometry
-
-            found = register_by_odometry(views)
-        else:
-            from detectors.registration.joint import register_jointly
-
-            found = register_jointly(views)
+        found = register_by_odometry(views) if config.method == "odometry" else register_jointly(views)
         share = (perf_counter() - started) / len(found)
         found = [replace(each, seconds=share) for each in found]
-    return (of_reference, *(judge(each, reference, view) for each, view in zip(found, views[1:], strict=True)))
+    return (of_reference, *(judge(each, views[0], view) for each, view in zip(found, views[1:], strict=True)))
 
 
-def check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
+def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
     """Raise UserError where the method needs something that a view does not have."""
-    by_colour = isinstance(config, OdometryRegistration | MarksRegistration | JointRegistration) or (
-        isinstance(config, CpdRegistration | IcpRegistration) and config.points == "marks"
-    )
+    by_colour = config.method != "nominal" and getattr(config, "points", "marks") == "marks"
+    of_odometry = config.method == "odometry"
     for view in views:
-        cloud = view.view.cloud
-        if by_colour and cloud.rgb is None:
-            missing = "colour, and this capture has none"
-            legal = "captures with colour for every point"
-            fix = "record colour, or use registration.method: icp or cpd with points: target"
-        elif isinstance(config, OdometryRegistration) and (not cloud.organised or cloud.lens is None):
-            missing = "a pixel grid and the lens, and this capture has none"
-            legal = "organised captures of a camera whose intrinsics are known"
-            fix = "give the intrinsics, or use another registration.method"
-        elif isinstance(config, NominalRegistration) and view.view.T_reference_view_guess is None:
-            missing = "the nominal pose of every view, and this view has none"
-            legal = "a guess of the pose of each view relative to the first"
-            fix = "give the guesses, or use registration.method: marks"
-        else:
-            continue
-        raise UserError(f"{view.view.name}: registration by {config.method} needs {missing}", legal=legal, fix=fix)
+        cloud, guess = view.view.cloud, view.view.T_reference_view_guess
+        no_grid = not cloud.organised or cloud.lens is None
+        by_points = "registration.method: icp or cpd with points: target"
+        for lacks, what, fix in (
+            (by_colour and cloud.rgb is None, "colour for every point", f"record colour, or use {by_points}"),
+            (of_odometry and no_grid, "a pixel grid and the lens", "give the intrinsics, or use another method"),
+            (config.method == "nominal" and guess is None, "the nominal pose of every view", "give the guesses"),
+        ):
+            if lacks:
+                raise UserError(f"{view.view.name}: registration by {config.method} needs {what}", fix=fix)
 
 
 def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> Registration:
     """Return the registration of a view to a reference that need not be the first view, not judged yet."""
     started = perf_counter()
-    if isinstance(config, NominalRegistration):
-        # nobody has said how good the guess is
-        guess = guess_of(reference, view)
-        if guess is None:
-            return failed(view, "nominal", None, "no nominal pose is known")
-        found = Registration(view.view.name, "nominal", guess)
-    elif isinstance(config, IcpRegistration):
-        from detectors.registration.icp import register_by_icp
-
+    if isinstance(config, IcpRegistration):
         found = register_by_icp(reference, view, config)
     elif isinstance(config, CpdRegistration):
-        from detectors.registration.cpd import register_by_cpd
-
         found = register_by_cpd(reference, view, config)
-    else:
-        from detectors.registration.by_marks import register_by_marks
-
+    elif config.method == "marks":
         found = register_by_marks(reference, view)
+    else:
+        # nobody has said how good the guess is
+        guess = guess_of(reference, view)
+        found = Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)
 
 
 @dataclass(frozen=True)
 class LoopError:
-    """The closure error of a loop of three views, each step of which was registered separately.
-
-    ``views``: names, in the order of the loop. ``rotation_deg``: of the composed transform; ``translation_m``: root
-    mean square displacement of the first view's target by it. NaN where a step failed; ``failure`` names the step.
-    """
+    """The closure error of a loop of three separately registered steps: ``rotation_deg`` of the composed transform, and
+    ``translation_m``, the root mean square displacement of the first view's target by it. NaN where a step failed;
+    ``failure`` names the step."""
 
     views: tuple[str, str, str]
     rotation_deg: float
@@ -123,35 +281,30 @@ class LoopError:
 
 
 def loop_errors(views: Sequence[PreparedView], config: AnyRegistration, most: int = 40) -> tuple[LoopError, ...]:
-    """Return the closure errors of loops i -> j -> k -> i, at most ``most`` of them, evenly taken from all.
-
-    Every pair is registered directly, with the guess that those of both views imply. The errors of the three steps add,
-    so a loop shows about sqrt(3) times the error of a step; an error that a view brings equally into both of its
-    registrations is not seen. Empty for fewer than three views. Raises UserError as `register` does, and for methods
-    that do not register pairs.
-    """
+    """Return the closure errors of loops i -> j -> k -> i, at most ``most`` of them, evenly taken from all. Every pair
+    is registered directly, with the guess that those of both views imply. The errors of the three steps add; an error
+    that a view brings equally into both of its registrations is not seen. Empty for fewer than three views. Raises
+    UserError as `register` does, and for methods that do not register pairs."""
     if config.method in ("nominal", "joint", "odometry"):
         raise UserError(
             f"loops cannot be closed with {config.method}: it does not register pairs of views separately",
             legal="icp, cpd, marks",
         )
-    check_views(views, config)
+    _check_views(views, config)
     loops = list(combinations(range(len(views)), 3))
     loops = loops[:: max(1, -(-len(loops) // most))]
     sides = sorted({pair for i, j, k in loops for pair in ((i, j), (j, k), (i, k))})
-    placed = {(i, j): judge(_pair(views[i], views[j], config), ReferenceTarget(views[i]), views[j]) for i, j in sides}
+    placed = {(i, j): judge(_pair(views[i], views[j], config), views[i], views[j]) for i, j in sides}
+    names = [view.view.name for view in views]
     errors = []
     for i, j, k in loops:
-        names = (views[i].view.name, views[j].view.name, views[k].view.name)
         steps = [((a, b), placed[a, b]) for a, b in ((i, j), (j, k), (i, k))]
-        failures = [
-            f"{views[b].view.name} to {views[a].view.name}: {step.failure}" for (a, b), step in steps if step.failure
-        ]
-        if failures:
-            errors.append(LoopError(names, float("nan"), float("nan"), "; ".join(failures)))
-            continue
-        T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
-        closed = T_ij @ T_jk @ invert(T_ik)
-        turn = np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2))
-        errors.append(LoopError(names, float(turn), moved_m(closed, thinned(views[i].points_m, LOOP_POINTS))))
+        failures = [f"{names[b]} to {names[a]}: {step.failure}" for (a, b), step in steps if step.failure]
+        turn, shift = float("nan"), float("nan")
+        if not failures:
+            T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
+            closed = T_ij @ T_jk @ invert(T_ik)
+            turn = float(np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2)))
+            shift = moved_m(closed, thinned(views[i].points_m, LOOP_POINTS))
+        errors.append(LoopError((names[i], names[j], names[k]), turn, shift, "; ".join(failures)))
     return tuple(errors)

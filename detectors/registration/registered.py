@@ -1,4 +1,4 @@
-"""The result of a registration: a rigid transform, its covariance, and the reasons to trust it or not."""
+"""The result of a registration, and the sampling of a view: the scale of residuals, overlaps and tolerances."""
 
 from __future__ import annotations
 
@@ -7,36 +7,30 @@ from typing import Literal
 
 import numpy as np
 
+from detectors.average import CORRELATED_PIXELS
 from detectors.views import PreparedView
-from harness.vocabulary.geometry import invert
+from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
-NO_GUESS = "no guess: started from the reference's own place"
 CLUSTER_PITCHES = 5.0
 """Side of the cubes within which errors are taken to be common: the window of the widest depth filter."""
-
-
-def unknown_covariance() -> np.ndarray:
-    """Return (6, 6) of NaN: the method has no estimate."""
-    return np.full((6, 6), np.nan)
+UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
+SLIDES = "not determined: the points can slide or turn without matching worse, as they can in a flat or smooth surface"
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The pose of a view relative to the reference view.
-
-    ``T_reference_view`` (4, 4), rigid, no scale. ``covariance`` (6, 6) of a small error (w, t): a point p of the
-    reference frame is wrong by w x (p - ``centre_m``) + t, radians and metres; NaN where the method has no estimate.
-    It contains the errors that the method knows: noise of its points, not an error that a whole view shares.
-    ``residual_m``: root mean square of the minimised distances. ``overlap``: share of the view's target points that lie
-    within a pixel's pitch of the reference's target, 0..1. ``failure``: why the view must not be merged; empty where it
-    may. ``pairs``: marks or points that were matched. ``seconds``: time that this registration took (an equal share
-    where all views are registered together).
-    """
+    """The pose of a view relative to the reference view. ``T_reference_view`` (4, 4), rigid, no scale. ``covariance``
+    (6, 6) of a small error (w, t): a point p of the reference frame is wrong by w x (p - ``centre_m``) + t, radians and
+    metres; NaN where the method has no estimate. It contains the errors that the method knows: noise of its points, not
+    an error that a whole view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share
+    of the view's target points that lie within a pixel's pitch of the reference's target, 0..1. ``failure``: why the
+    view must not be merged; empty where it may. ``pairs``: marks or points that were matched. ``seconds``: time that
+    this registration took (an equal share where all views are registered together)."""
 
     view: str
     method: str
     T_reference_view: np.ndarray
-    covariance: np.ndarray = field(default_factory=unknown_covariance)
+    covariance: np.ndarray = field(default_factory=UNKNOWN_COVARIANCE.copy)
     centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
     residual_m: float = float("nan")
     overlap: float = float("nan")
@@ -57,13 +51,8 @@ def failed(
     view: PreparedView, method: str, T_reference_view: np.ndarray | None, failure: str, *notes: str
 ) -> Registration:
     """Return a registration that found nothing: it stands at its guess, or else at the reference's own place."""
-    place = np.eye(4) if T_reference_view is None else T_reference_view
-    return Registration(view.view.name, method, place, converged=False, failure=failure, notes=notes)
-
-
-def cloud_of(view: PreparedView, points: Literal["marks", "target"]) -> np.ndarray:
-    """Return the points (n, 3) of the fiducials or of the whole target, camera frame of the view."""
-    return view.mark_points_m if points == "marks" else view.points_m
+    T = np.eye(4) if T_reference_view is None else T_reference_view
+    return Registration(view.view.name, method, T, converged=False, failure=failure, notes=notes)
 
 
 def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
@@ -84,35 +73,42 @@ def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndar
     return jacobian
 
 
+def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
+    """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a turn by the vector w, and a shift by t."""
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
+    T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
+    return T
+
+
 def predicted_error_m(registration: Registration, points_m: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     """Return the root mean square target registration error over points (n, 3) of the reference frame that the
     covariance predicts: in the plane normal to the unit vector ``normal`` (3,), and across it. NaN without a
-    covariance.
-    """
+    covariance."""
     jacobian = displacement_jacobian(points_m, registration.centre_m)
-    spread = np.einsum("nij,jk,nlk->nil", jacobian, registration.covariance, jacobian)
-    across = np.einsum("i,nij,j->n", normal, spread, normal)
-    total = np.trace(spread, axis1=1, axis2=2)
-    return float(np.sqrt(max((total - across).mean(), 0.0))), float(np.sqrt(max(across.mean(), 0.0)))
+    spread = (jacobian @ registration.covariance @ np.swapaxes(jacobian, 1, 2)).mean(axis=0)
+    across = float(normal @ spread @ normal)
+    return float(np.sqrt(max(np.trace(spread) - across, 0.0))), float(np.sqrt(max(across, 0.0)))
 
 
 def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.ndarray, pitch_m: float) -> np.ndarray:
     """Return the covariance (6, 6) H^-1 S H^-1; S is the sum over cubes of points (n, 3) of the outer square of their
-    summed scores (n, 6).
-
-    ``curvature`` H (6, 6) and ``scores`` belong to the same objective, in any unit. NaN where H is not positive
-    definite to working precision, or where there are too few cubes to see a scatter in six directions.
-    """
+    summed scores (n, 6). ``curvature`` H (6, 6) and ``scores`` belong to the same objective, in any unit. NaN where H
+    is not positive definite to working precision, or where there are too few cubes to see a scatter in six
+    directions."""
     # rotations and shifts compared at the points' own arm, so that definiteness does not depend on units
-    arm = max(float(np.sqrt(np.mean(np.sum((points_m - points_m.mean(axis=0)) ** 2, axis=1)))), 1e-12)
+    arm = max(float(np.sqrt(np.sum(np.var(points_m, axis=0)))), 1e-12)
     unit = np.array([1 / arm] * 3 + [1.0] * 3)
     scaled = curvature * np.outer(unit, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    if not np.isfinite(values).all() or values[0] <= 1e-9 * max(values[-1], 0.0):
-        return unknown_covariance()
-    summed = cluster_sums(scores * unit, points_m, pitch_m)
-    if len(summed) < 7:
-        return unknown_covariance()
+    cubes = np.floor((points_m - points_m.min(axis=0)) / max(CLUSTER_PITCHES * pitch_m, 1e-9)).astype(np.int64)
+    _, which = np.unique(cubes, axis=0, return_inverse=True)
+    summed = np.zeros((int(which.max()) + 1, 6))
+    np.add.at(summed, which.ravel(), scores * unit)
+    if len(summed) < 7 or not np.isfinite(values).all() or values[0] <= 1e-9 * max(values[-1], 0.0):
+        return UNKNOWN_COVARIANCE.copy()
     # the scores sum to zero at the optimum, which takes one cube's worth of scatter away
     scatter = summed.T @ summed * len(summed) / (len(summed) - 1)
     inverse = (vectors / values) @ vectors.T
@@ -120,11 +116,140 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
     return (covariance + covariance.T) / 2
 
 
-def cluster_sums(scores: np.ndarray, points_m: np.ndarray, pitch_m: float) -> np.ndarray:
-    """Return the sums (c, 6) of scores (n, 6) over the occupied cubes of 5 pitches, in the cubes' order."""
-    side = max(CLUSTER_PITCHES * pitch_m, 1e-9)
-    cubes = np.floor((points_m - points_m.min(axis=0)) / side).astype(np.int64)
-    _, which = np.unique(cubes, axis=0, return_inverse=True)
-    sums = np.zeros((int(which.max()) + 1, scores.shape[1]))
-    np.add.at(sums, which.ravel(), scores)
-    return sums
+NOISE_LAG = 6
+"""Pixels between the points of a second difference: beyond the widest depth filter, so that errors are independent."""
+MEDIAN_TO_SIGMA = 1 / 0.6745
+"""Standard deviation of a Gaussian over its median absolute deviation."""
+MIN_OVERLAP = 0.1
+"""Share of the view beside the reference's target below which nothing is left to judge the rest by."""
+MOVING_PITCHES = 0.5
+"""An iteration that still moves the target by more has not found its place."""
+MAX_POINTS = 10_000
+"""Most points of a cloud that is registered: the time of coherent point drift grows with the product."""
+THINNED_POINTS = 2000
+"""Points on which overlap and agreement are judged: a share is then known to 1 %."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """One view's target, camera frame of the view, metres. ``pitch_m``: median distance between neighbouring points,
+    the longer way of the grid. ``noise_m``: standard deviation of one point across the surface, fixed pattern included,
+    smooth errors not. ``centre_m`` (3,), ``normal`` (3,): of the plane through the points, towards the camera.
+    ``extent_m``: half the diagonal of the points' box."""
+
+    pitch_m: float
+    noise_m: float
+    centre_m: np.ndarray
+    normal: np.ndarray
+    extent_m: float
+
+
+def sampling_of(view: PreparedView) -> Sampling:
+    """Measure a view's target. A target of fewer than three points has no plane: its normal is the optical axis'."""
+    points, cloud = view.points_m, view.view.cloud
+    pitch, noise = float("nan"), float("nan")
+    if cloud.organised and cloud.points_m.shape[0] > 1:
+        pitch, noise = _on_grid(cloud, view.inside)
+    if not np.isfinite(pitch + noise):
+        loose_pitch, loose_noise = _without_grid(points)
+        pitch, noise = (pitch if np.isfinite(pitch) else loose_pitch), (noise if np.isfinite(noise) else loose_noise)
+    extent = float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(points) else 0.0
+    least = cloud.z_step_m / np.sqrt(12.0 * max(cloud.n_frames, 1))
+    return Sampling(pitch, max(noise, least), *plane_through(points), extent)
+
+
+def plane_through(points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the centroid (3,) of points (n, 3) and the unit normal (3,) of their plane, towards the origin."""
+    if len(points_m) < 3:
+        middle = points_m.mean(axis=0) if len(points_m) else np.zeros(3)
+        return middle, np.array([0.0, 0.0, -1.0])
+    centre = points_m.mean(axis=0)
+    normal = local_normals(points_m[None])[0]
+    return centre, normal if normal @ centre <= 0 else -normal
+
+
+def thinned(points_m: np.ndarray, most: int = THINNED_POINTS) -> np.ndarray:
+    """Return at most ``most`` of points (n, 3), evenly strided in the order of the grid."""
+    return points_m[:: max(1, -(-len(points_m) // most))]
+
+
+def clouds_of(
+    reference: PreparedView, view: PreparedView, points: Literal["marks", "target"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
+    """Return what registrations of points start from: those of the fiducials or of the whole target, of the reference
+    and of the view, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4), a note where there is none, and the reason
+    why they cannot be registered (fewer than three points in either), empty where they can."""
+    fixed, moving = (
+        thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
+    )
+    guess = guess_of(reference, view)
+    notes = () if guess is not None else ("no guess: started from the reference's own place",)
+    few = ""
+    if min(len(fixed), len(moving)) < 3:
+        few = f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: {len(fixed)} in the"
+        few += f" reference and {len(moving)} in the view, 3 needed in each"
+    return fixed, moving, guess, notes, few
+
+
+def independent(points: int) -> float:
+    """Return the number of independent values among correlated pixels, for the widest depth filter; at least 1."""
+    return max(points / CORRELATED_PIXELS, 1.0)
+
+
+def local_normals(near_m: np.ndarray) -> np.ndarray:
+    """Return unit normals (n, 3) of the planes through sets of points (n, k, 3); their sign is not fixed."""
+    arm = near_m - near_m.mean(axis=1, keepdims=True)
+    normals: np.ndarray = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)[1][:, :, 0]
+    return normals
+
+
+def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
+    """Pitch and noise; NaN where too few neighbours are known."""
+    grid = np.where(inside[..., None], cloud.points_m, np.nan)
+    steps, bends = [0.0], []
+    for axis in (0, 1):
+        step = np.diff(grid, axis=axis)
+        step = step[np.isfinite(step[..., 2])]
+        if len(step):
+            # the way along a tilted surface, from x and y and the median step in z: noise in z is no distance
+            lengths = np.linalg.norm(step[:, :2], axis=-1)
+            steps.append(float(np.hypot(np.median(lengths), np.median(step[:, 2]))))
+        z = np.moveaxis(grid[..., 2], axis, 0)
+        bends.append((z[2 * NOISE_LAG :] - 2 * z[NOISE_LAG:-NOISE_LAG] + z[: -2 * NOISE_LAG]).ravel())
+    values = np.concatenate(bends)
+    values = values[np.isfinite(values)]
+    # fewer values say nothing; a second difference of white noise has sqrt(6) of its sigma
+    noise = float(np.median(np.abs(values))) * MEDIAN_TO_SIGMA / np.sqrt(6.0) if len(values) >= 100 else float("nan")
+    return max(steps) or float("nan"), noise
+
+
+def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
+    """Pitch, and noise from the distances of points to the plane through their 25 nearest points, which removes 3 of 25
+    parts of the variance; 0 where there are too few points."""
+    from scipy.spatial import cKDTree
+
+    if len(points_m) < 2:
+        return 0.0, 0.0
+    # neighbours along the surface: those in space would be chosen by their noise
+    arm = points_m - points_m.mean(axis=0)
+    places = arm @ np.linalg.eigh(arm.T @ arm)[1][:, 1:]
+    count = min(CORRELATED_PIXELS, len(points_m))
+    distances, nearest = cKDTree(places).query(thinned(places), k=count)
+    pitch = float(np.median(distances[:, 1]))
+    if count < 4:
+        return pitch, 0.0
+    near = points_m[nearest]
+    across = np.einsum("ij,ij->i", thinned(points_m) - near.mean(axis=1), local_normals(near))
+    return pitch, float(np.median(np.abs(across))) * MEDIAN_TO_SIGMA / np.sqrt(1 - 3 / count)
+
+
+def still_moving(step_m: float, pitch_m: float) -> str:
+    """Return the reason why an iteration whose last step moved the target by ``step_m`` failed; empty if it did not."""
+    if step_m <= MOVING_PITCHES * pitch_m:
+        return ""
+    return f"did not converge: the last step still moved the target by {step_m / MM:.2f} mm"
+
+
+def moved_m(change: np.ndarray, points_m: np.ndarray) -> float:
+    """Return the root mean square distance by which the 4x4 transform ``change`` moves points (n, 3)."""
+    return float(np.sqrt(np.mean(np.sum((transform_points(change, points_m) - points_m) ** 2, axis=1))))

@@ -16,7 +16,7 @@ class NominalRegistration(Config):
 
 
 class IcpRegistration(Config):
-    """Iterative closest point (Open3D), from the guess."""
+    """Iterative closest point, from the guess."""
 
     method: Literal["icp"] = "icp"
     points: Literal["marks", "target"] = "marks"
@@ -51,14 +51,8 @@ class OdometryRegistration(Config):
     method: Literal["odometry"] = "odometry"
 
 
-AnyRegistration = (
-    NominalRegistration
-    | IcpRegistration
-    | CpdRegistration
-    | MarksRegistration
-    | JointRegistration
-    | OdometryRegistration
-)
+OfPairs = NominalRegistration | IcpRegistration | CpdRegistration | MarksRegistration
+AnyRegistration = OfPairs | JointRegistration | OdometryRegistration
 RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="method")]
 PAIRWISE = ("nominal", "icp", "cpd", "marks")
 """Methods that register each view to the first by itself, so that other views cannot change it."""

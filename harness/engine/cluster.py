@@ -8,8 +8,10 @@ node dies, its jobs go to others; a job that was aboard of `TRIES` nodes as they
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import importlib
+import importlib.metadata
 import logging
 import platform
 import queue
@@ -18,55 +20,70 @@ import secrets
 import sys
 import time
 import warnings
-from collections import Counter, OrderedDict, deque
-from collections.abc import Coroutine, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from harness.engine import node
-from harness.engine.node import Bundle, Carried, NodeFacts
-from harness.engine.processes import MOST_RENDERERS
+from harness.engine.processes import MOST_RENDERERS, Answers, LocalEngine
 from harness.engine.work import Code, Ended, Job, Limits, Stage
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
-from harness.vocabulary.sources import source_digest
+from harness.vocabulary.provenance import source_digest
 
 BUNDLE_S = 0.25
 """Work in a bundle, for each process of a node: calling a node takes some 10 ms, of it 2 ms of the driver's time."""
-MOST_IN_BUNDLE = 32
-"""Jobs in a bundle, for each process of a node."""
-WITH_NODE = 2
-"""Bundles at a node: its processes work on one while the other waits."""
-LOOKS_S = 1.0
-"""Interval at which the driver looks which nodes are there."""
-WAIT_FOR_NODES_S = 60.0
-"""Wait for workers that are started by hand. A batch system's queue may take hours: a line is printed now and then."""
-TELL_AGAIN_S = 300.0
+MOST_IN_BUNDLE = 32  # jobs in a bundle, for each process of a node
+WITH_NODE = 2  # bundles at a node: its processes work on one while the other waits
+LOOKS_S = 1.0  # interval at which the driver looks which nodes are there
+WAIT_FOR_NODES_S = 60.0  # wait for workers that are started by hand. A batch system's queue may take hours.
 TRIES = 5
-ANSWERS_S = 5
-"""A scheduler that is there answers a connection in milliseconds."""
-EXAMINED_S = 60.0
-"""Time for a node to say what it is: it reads the sources, from a network's disk perhaps."""
+ANSWERS_S = 5  # a scheduler that is there answers a connection in milliseconds
+EXAMINED_S = 60.0  # time for a node to say what it is: it reads the sources, from a network's disk perhaps
 CLOSES_S = 1.0
-KINDS = {
-    "slurm": "SLURMCluster",
-    "pbs": "PBSCluster",
-    "lsf": "LSFCluster",
-    "sge": "SGECluster",
-    "htcondor": "HTCondorCluster",
-    "oar": "OARCluster",
-    "moab": "MoabCluster",
-    "local": "LocalCluster",
-}
+KEPT_VIEWS = 32  # views that were sent and stay on a node's disk, 4 MB each; beside those of bundles under way
+NAMES = ("SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local")
+KINDS = {name.lower(): f"{name}Cluster" for name in NAMES}
 """Classes of dask-jobqueue, each in a module of the kind's name; "local" starts its jobs on this machine."""
-LEGAL = "tcp://host:8786, tls://host:8786, or jobqueue: followed by one of " + ", ".join(KINDS)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Jobs of one stage for one node. ``shares``: it sees the driver's cache; else ``views`` are contents of some that
+    the jobs read, by name."""
+
+    jobs: tuple[Job, ...]
+    limits: Limits
+    shares: bool
+    views: dict[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """The ends of a bundle's jobs, in order. ``rendered``: files for the driver's cache that the node does not see.
+    ``missing``: views that are not here and were not sent; then no job was begun."""
+
+    ended: tuple[Ended, ...] = ()
+    rendered: dict[str, bytes] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class NodeFacts:
+    """A node's description of itself. ``digests``: of code and packages by stage, without those that are not installed;
+    ``processes``: jobs at once; ``sees``: content of the file that it was asked for."""
+
+    python: str
+    digests: Mapping[Stage, str]
+    processes: int
+    offers_render: bool
+    sees: str | None
 
 
 @dataclass
 class _Node:
-    """A node that takes jobs. ``shares``: it sees the driver's cache of renders; otherwise ``holds`` names the views
-    that were sent to it, the last ones last."""
+    """A node that takes jobs. ``bundles``: those under way, by number, ``renders`` of them renders."""
 
     address: str
     processes: int
@@ -74,10 +91,7 @@ class _Node:
     offers_render: bool
     shares: bool
     bundles: dict[int, Bundle] = field(default_factory=dict)
-    """Bundles under way, by number."""
     renders: int = 0
-    """Number of renders under way."""
-    holds: OrderedDict[str, None] = field(default_factory=OrderedDict)
 
 
 class ClusterEngine:
@@ -92,8 +106,7 @@ class ClusterEngine:
         self._nodes: dict[str, _Node] = {}
         self._refused: dict[str, UserError] = {}
         """Nodes that would give other numbers than this machine, by address: left out while others are there."""
-        self._asked: set[str] = set()
-        """Addresses of nodes that were asked what they are."""
+        self._asked: set[str] = set()  # addresses of nodes that were asked what they are
         self._waiting: dict[Stage, deque[Job]] = {"renders": deque(), "trials": deque()}
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
@@ -101,15 +114,11 @@ class ClusterEngine:
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
         """(address, number of the bundle, answer) of a node; without a number the answer is what the node is."""
         self._number = 0
-        self._mean_s = BUNDLE_S
-        """Mean duration of a trial; at first as if each were worth a bundle of its own."""
+        self._mean_s = BUNDLE_S  # mean duration of a trial; at first as if each were worth a bundle of its own
         self._looked = float("-inf")
-        self._lacking = ""
-        """Nodes that could do what waits, lacking since then; told last at ``_lack_told``."""
-        self._lacking_since = self._lack_told = time.monotonic()
+        self._lacking, self._lacking_since = "", time.monotonic()  # nodes that could do what waits, lacking since then
         self._probe: Path | None = None
-        self._nonce = secrets.token_hex(16)
-        """Names this driver to the nodes."""
+        self._nonce = secrets.token_hex(16)  # names this driver to the nodes
         self._told: set[str] = set()
         self._stack = contextlib.ExitStack()
 
@@ -126,17 +135,14 @@ class ClusterEngine:
             with contextlib.suppress(OSError):
                 self._probe.unlink(missing_ok=True)
         busy = [one.address for one in self._nodes.values() if one.bundles]
-        if busy and self._is_connected():
-            with contextlib.suppress(Exception):  # a node that cannot be told ends its bundles at its own time
-                dropped = self._client.run(node.drop, self._nonce, workers=busy, on_error="ignore", asynchronous=True)
-                asyncio.run_coroutine_threadsafe(_awaited(dropped), self._loop).result(CLOSES_S)
-        self._stack.close()
+        if busy and self._client.status == "running":
 
-    @property
-    def worker_count(self) -> int:
-        """The processes of all nodes that take jobs."""
-        self._step(0.0)
-        return sum(one.processes for one in self._nodes.values())
+            async def dropped() -> None:
+                await self._client.run(drop, self._nonce, workers=busy, on_error="ignore", asynchronous=True)
+
+            with contextlib.suppress(Exception):  # a node that cannot be told ends its bundles at its own time
+                asyncio.run_coroutine_threadsafe(dropped(), self._client.loop.asyncio_loop).result(CLOSES_S)
+        self._stack.close()
 
     def room(self, stage: Stage) -> int:
         """Room for as much as keeps all nodes busy, and the next bundles ready."""
@@ -162,14 +168,11 @@ class ClusterEngine:
         done, self._done = self._done, []
         return done
 
-    # ---------------------------------------------------------------- what goes out
-
     def _bundle_size(self) -> int:
-        """Trials in a bundle, for each process of a node."""
         return max(1, min(MOST_IN_BUNDLE, round(BUNDLE_S / max(self._mean_s, 1e-4))))
 
     def _hand_out(self) -> None:
-        """Send every node first a bundle of trials, then a second one, and renders where it may render."""
+        """Send every node a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
         some_offer = any(one.offers_render and one.can_render for one in self._nodes.values())
         for most in range(WITH_NODE):
@@ -181,14 +184,14 @@ class ClusterEngine:
                 if renders and may_render and to.renders < min(MOST_RENDERERS, to.processes):
                     job = renders.popleft()
                     if to.shares or not self._is_in_cache(job):
-                        self._send(to, [job])
+                        self._send(to, (job,))
                 elif trials and len(to.bundles) - to.renders <= most and not (to.processes == 1 and to.renders):
                     share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
                     count = min(self._bundle_size() * to.processes, max(share, to.processes), len(trials))
-                    self._send(to, [trials.popleft() for _ in range(count)])
+                    self._send(to, tuple(trials.popleft() for _ in range(count)))
 
     def _is_in_cache(self, job: Job) -> bool:
-        """Return whether this machine's cache holds a render that a node cannot see; then the job is done."""
+        """Return whether this machine's cache holds a render for a node that does not see it; then the job is done."""
         from scenes.render.cache import read_view
 
         found = read_view(Path(job.arguments[-1]) / job.name)
@@ -196,26 +199,19 @@ class ClusterEngine:
             self._over(job, Ended("done", (True, found.seconds), worker="this process"))
         return found is not None
 
-    def _send(self, to: _Node, jobs: list[Job]) -> None:
+    def _send(self, to: _Node, jobs: tuple[Job, ...], missing: Iterable[str] = ()) -> None:
+        """Send a bundle, with missing views; one that cannot be read here goes empty, so that its trials say so."""
+        paths = {path.name: path for job in jobs for path in job.needs}
+        views = {}
+        for name in missing:
+            try:
+                views[name] = paths[name].read_bytes()
+            except OSError:
+                views[name] = b""
         self._number += 1
-        number = self._number
-        needs: list[str] = []
-        views: dict[str, bytes] = {}
-        for path in () if to.shares else dict.fromkeys(path for job in jobs for path in job.needs):
-            if path.name not in to.holds:
-                try:
-                    views[path.name] = path.read_bytes()
-                except OSError:
-                    continue  # the trial itself tells that the view cannot be read
-            needs.append(path.name)
-            to.holds[path.name] = None
-            to.holds.move_to_end(path.name)
-        while len(to.holds) > node.KEPT_VIEWS:
-            to.holds.popitem(last=False)
-        bundle = Bundle(tuple(jobs), self._limits, to.shares, tuple(needs), views)
-        to.bundles[number] = bundle
+        bundle = to.bundles[self._number] = Bundle(jobs, self._limits, to.shares, views)
         to.renders += jobs[0].stage == "renders"
-        self._call(to.address, number, node.carry_out, bundle, self._code, self._nonce)
+        self._call(to.address, self._number, carry_out, bundle, self._code, self._nonce)
 
     def _call(self, address: str, number: int | None, function: Any, *arguments: Any) -> None:
         """Have a node run a function; what it returns or raises becomes an event."""
@@ -237,14 +233,7 @@ class ClusterEngine:
                     break
             self._events.put((address, number, said))
 
-        asyncio.run_coroutine_threadsafe(call(), self._loop)
-
-    @property
-    def _loop(self) -> asyncio.AbstractEventLoop:
-        loop: asyncio.AbstractEventLoop = self._client.loop.asyncio_loop
-        return loop
-
-    # ---------------------------------------------------------------- what comes in
+        asyncio.run_coroutine_threadsafe(call(), self._client.loop.asyncio_loop)
 
     def _step(self, waits_s: float = LOOKS_S) -> None:
         """Take what has happened, waiting for it at most so long."""
@@ -257,30 +246,22 @@ class ClusterEngine:
                 self._heed(*self._events.get_nowait())
 
     def _look_for_nodes(self) -> None:
-        """Ask new nodes what they are, and give up those that are gone."""
-        there = set(self._addresses())
+        """Ask new nodes what they are, and give up those that are gone. Raises UserError without a scheduler."""
+        there = None
+        if self._client.status == "running":
+            with contextlib.suppress(OSError):
+                there = set(self._client.scheduler_info(n_workers=-1)["workers"])
+        if there is None:
+            fix = "start it again; finished trials are kept, and the same command goes on"
+            raise UserError(f"the scheduler at {self._scheduler} is gone", fix=fix)
         for address in there - self._asked:
             self._asked.add(address)
-            self._call(address, None, node.examine, self._code, None if self._probe is None else str(self._probe))
+            self._call(address, None, examine, self._code, None if self._probe is None else str(self._probe))
         for address in self._asked - there:
             self._asked.discard(address)
             self._refused.pop(address, None)
             self._gone(address)
         self._look_for_lack()
-
-    def _addresses(self) -> list[str]:
-        """The workers that the scheduler knows. Raises UserError where it is gone."""
-        if self._is_connected():
-            with contextlib.suppress(OSError):
-                return list(self._client.scheduler_info(n_workers=-1)["workers"])
-        raise UserError(
-            f"the scheduler at {self._scheduler} is gone",
-            fix="start it again; finished trials are kept, and the same command goes on",
-        )
-
-    def _is_connected(self) -> bool:
-        """Return whether the scheduler is there. One that was away has forgotten its workers."""
-        return self._client is not None and bool(self._client.status == "running")
 
     def _heed(self, address: str, number: int | None, said: Any) -> None:
         if number is None:
@@ -291,11 +272,17 @@ class ClusterEngine:
         if one is None or bundle is None:
             return  # the node was given up meanwhile
         one.renders -= bundle.jobs[0].stage == "renders"
-        if isinstance(said, Carried):
-            self._carried(one, bundle, said)
+        if isinstance(said, Carried) and said.missing:
+            self._send(one, bundle.jobs, said.missing)
+        elif isinstance(said, Carried):
+            for name, content in said.rendered.items():
+                write_bytes(Path(bundle.jobs[0].arguments[-1]) / name, content)
+            for job, ended in zip(bundle.jobs, said.ended, strict=True):
+                if job.stage == "trials":
+                    self._mean_s += 0.1 * (ended.seconds - self._mean_s)
+                self._over(job, ended)
         elif isinstance(said, UserError):  # its processes run other code, or cannot start
-            self._refused[address] = UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix)
-            self._tell_once(f"{self._refused[address].message}; it is not used any more")
+            self._refuse(address, UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix))
             self._return(bundle.jobs)
             self._gone(address)
         else:
@@ -306,56 +293,29 @@ class ClusterEngine:
         """Use a node, or leave it out with a line that says why."""
         if address not in self._asked:
             return
-        if isinstance(said, BaseException) and not isinstance(said, ImportError | AttributeError):
-            # it died meanwhile, or the network failed: no sign of another installation
-            why = f"did not say what it is ({type(said).__name__}: {said}); it is not used"
-            self._tell_once(f"the worker at {_bare(address)} {why}")
-            return
-        try:
-            self._nodes[address] = self._node_of(address, said)
-        except UserError as mistake:
-            self._refused[address] = mistake
-            self._tell_once(f"{mistake.message}; it is not used")
-
-    def _node_of(self, address: str, said: NodeFacts | BaseException) -> _Node:
-        """Raise UserError where a node would give other numbers than this machine, or none."""
         where = f"the worker at {_bare(address)}"
-        if isinstance(said, BaseException):
-            raise UserError(
-                f"{where} cannot run tofpod: {type(said).__name__}: {said}",
-                fix="install the same version of tofpod there and start its workers again",
-            )
-        if said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
-            raise UserError(
-                f"{where} runs Python {said.python}, this machine {platform.python_version()}",
-                fix="use the same Python on all",
-            )
-        if said.digests.get("trials") != self._digests.get("trials"):
-            raise UserError(
-                f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
-                " than this machine",
-                fix="install the same there, and start its workers again: they keep the code that they began with",
-            )
-        can_render = said.digests.get("renders") == self._digests.get("renders")
-        shares = said.sees == self._nonce
-        if self._probe is not None and not shares:
+        if isinstance(said, ImportError | AttributeError):
+            fix = "install the same version of tofpod there and start its workers again"
+            self._refuse(address, UserError(f"{where} cannot run tofpod: {type(said).__name__}: {said}", fix=fix))
+        elif isinstance(said, BaseException):
+            # it died meanwhile, or the network failed: no sign of another installation
+            self._tell_once(f"{where} did not say what it is ({type(said).__name__}: {said}); it is not used")
+        elif said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
+            message = f"{where} runs Python {said.python}, this machine {platform.python_version()}"
+            self._refuse(address, UserError(message, fix="use the same Python on all"))
+        elif said.digests.get("trials") != self._digests.get("trials"):
+            message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
+            fix = "install the same there, and start its workers again: they keep the code that they began with"
+            self._refuse(address, UserError(f"{message} than this machine", fix=fix))
+        else:
+            can_render = said.digests.get("renders") == self._digests.get("renders")
             # it may have been looked at before there was anything to see
-            shares = self._sees([address]).get(address) == self._nonce
-        return _Node(address, said.processes, can_render, said.offers_render, shares)
+            shares = said.sees == self._nonce or (self._probe is not None and bool(self._sharing([address])))
+            self._nodes[address] = _Node(address, said.processes, can_render, said.offers_render, shares)
 
-    def _carried(self, one: _Node, bundle: Bundle, said: Carried) -> None:
-        if said.missing:  # the node has let go of views that it was thought to hold
-            for name in said.missing:
-                one.holds.pop(name, None)
-            self._return(bundle.jobs)
-            return
-        for name, content in said.rendered.items():
-            write_bytes(Path(bundle.jobs[0].arguments[-1]) / name, content)
-            one.holds[name] = None
-        for job, ended in zip(bundle.jobs, said.ended, strict=True):
-            if job.stage == "trials":
-                self._mean_s += 0.1 * (ended.seconds - self._mean_s)
-            self._over(job, ended)
+    def _refuse(self, address: str, why: UserError) -> None:
+        self._refused[address] = why
+        self._tell_once(f"{why.message}; it is not used")
 
     def _gone(self, address: str) -> None:
         """Give a node up; what it had goes to others."""
@@ -366,11 +326,11 @@ class ClusterEngine:
 
     def _lost(self, jobs: tuple[Job, ...], why: str, address: str) -> None:
         """Jobs that were at a node as it died run again; after `TRIES` such deaths they are taken for the cause."""
-        for job in jobs:
-            self._tries[job.name] += 1
-            if self._tries[job.name] >= TRIES:
-                self._over(job, Ended("crashed", why=why, worker=_bare(address)))
-        self._return(tuple(job for job in jobs if 0 < self._tries[job.name] < TRIES))
+        self._tries.update(job.name for job in jobs)
+        hopeless = [job for job in jobs if self._tries[job.name] >= TRIES]
+        self._return(tuple(job for job in jobs if job not in hopeless))
+        for job in hopeless:
+            self._over(job, Ended("crashed", why=why, worker=_bare(address)))
 
     def _return(self, jobs: tuple[Job, ...]) -> None:
         """Put jobs to the front of the queue."""
@@ -383,8 +343,7 @@ class ClusterEngine:
         self._done.append((job, ended))
 
     def _look_for_lack(self) -> None:
-        """Raise UserError where for long no node could do what waits. A batch system's queue is waited for as long as
-        it takes; its jobs are alike, so not for one that renders."""
+        """Raise UserError where for long no node could do what waits; a batch system's queue may take any time."""
         lacking, fix = "", ""
         if not self._nodes and self._refused and self._asked <= self._refused.keys():
             raise next(iter(self._refused.values()))
@@ -393,78 +352,76 @@ class ClusterEngine:
         elif self._waiting["renders"] and not any(one.can_render for one in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
             fix = f"install tofpod on the workers just as here; {len(self._nodes)} that cannot render are there"
-        now = time.monotonic()
         if lacking != self._lacking:
-            self._lacking, self._lacking_since, self._lack_told = lacking, now, now
-        spent_s = now - self._lacking_since
+            self._lacking, self._lacking_since = lacking, time.monotonic()
         if lacking == "worker" and self._scheduler.startswith("jobqueue:"):
             self._tell_once(f"waiting for workers of {self._scheduler}, as long as its queue takes")
-            if now - self._lack_told >= TELL_AGAIN_S:
-                self._lack_told = now
-                _tell(f"no worker of {self._scheduler} after {spent_s / 60:.0f} minutes: look into its queue")
         elif lacking:
             self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
-            if spent_s > WAIT_FOR_NODES_S:
+            if time.monotonic() - self._lacking_since > WAIT_FOR_NODES_S:
                 raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
 
-    # ---------------------------------------------------------------- the cache
-
     def _place_probe(self, folder: Path) -> None:
-        """Write a file that tells whether a node sees the driver's cache of renders; to `scenes.render.cache` it is a
-        leftover, where this process is killed."""
+        """Write a file that tells whether a node sees the driver's cache; to the cache it is a leftover."""
         self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
         write_text(self._probe, self._nonce)
-        seen = self._sees(list(self._nodes))
+        sharing = self._sharing(list(self._nodes))
         for one in self._nodes.values():
-            one.shares = seen.get(one.address) == self._nonce
-        apart = sum(not one.shares for one in self._nodes.values())
-        if apart:
-            self._tell_once(
-                f"{apart} of {len(self._nodes)} workers do not see {folder}: renders are sent over the network"
-            )
+            one.shares = one.address in sharing
+        if apart := len(self._nodes) - len(sharing):
+            of_all = f"{apart} of {len(self._nodes)} workers"
+            self._tell_once(f"{of_all} do not see {folder}: renders are sent over the network")
 
-    def _sees(self, addresses: list[str]) -> dict[str, str | None]:
-        """The content of the probe, as each node sees it; a node that does not answer sees nothing."""
-        return dict(self._client.run(node.seen, str(self._probe), workers=addresses, on_error="ignore"))
+    def _sharing(self, addresses: list[str]) -> set[str]:
+        """The nodes that see the probe; a node that does not answer sees nothing."""
+        said = self._client.run(seen, str(self._probe), workers=addresses, on_error="ignore")
+        return {address for address, content in said.items() if content == self._nonce}
 
     def _tell_once(self, message: str) -> None:
         if message not in self._told:
             self._told.add(message)
-            _tell(message)
-
-
-async def _awaited(doing: Coroutine[Any, Any, Any]) -> Any:
-    return await doing
+            print(message, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
-    """Connect to a scheduler by its address, or start the user's own dask-jobqueue cluster. Yields dask's client.
-
-    Raises UserError where it is neither, is not installed or configured, or does not answer.
-    """
+    """Connect to a scheduler by its address, or start the user's own dask-jobqueue cluster. Yields dask's client."""
     is_address = re.fullmatch(r"(tcp|tls)://.+:\d+", scheduler) is not None
     kind = scheduler.removeprefix("jobqueue:")
     if not is_address and (kind == scheduler or kind not in KINDS):
-        raise UserError(f"--scheduler {scheduler}: is neither an address nor a kind of job queue", legal=LEGAL)
+        legal = "tcp://host:8786, tls://host:8786, or jobqueue: followed by one of " + ", ".join(KINDS)
+        raise UserError(f"--scheduler {scheduler}: is neither an address nor a kind of job queue", legal=legal)
     try:
         import dask
-        from distributed import Client
+        import distributed
     except ImportError as error:
         raise UserError("--scheduler needs dask.distributed", fix='pip install "tofpod[cluster]"') from error
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{ANSWERS_S}s"}))
-        stack.enter_context(_quiet())
-        cluster = None if is_address else _cluster_of(kind, workers_wanted)
-        if cluster is not None:
-            stack.callback(_close, cluster)
+        # how jobs end tells of workers that come and go, and versions are checked here
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")
+        for name in list(logging.root.manager.loggerDict):
+            if name.split(".")[0] in ("distributed", "tornado"):
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        cluster = None
+        if not is_address:  # as the user's own configuration of dask says
+            try:
+                cluster = getattr(importlib.import_module(f"dask_jobqueue.{kind}"), KINDS[kind])()
+                stack.callback(_close, cluster)
+                cluster.scale(jobs=workers_wanted)
+            except ImportError as error:
+                raise UserError("jobqueue: needs dask-jobqueue", fix='pip install "tofpod[cluster]"') from error
+            except (ValueError, TypeError, OSError, RuntimeError) as error:
+                message = f"dask-jobqueue could not start a cluster of kind {kind}: {error}"
+                fix = f"describe it in ~/.config/dask/jobqueue.yaml under jobqueue.{kind}: cores, processes: 1, memory"
+                raise UserError(message, fix=fix) from error
         try:
-            client = Client(cluster or scheduler, timeout=ANSWERS_S, set_as_default=False)
+            client = distributed.Client(cluster or scheduler, timeout=ANSWERS_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise UserError(
-                f"the scheduler at {scheduler} does not answer within {ANSWERS_S} s: {error}",
-                fix="start one with `dask scheduler`, and workers with `dask worker`; docs/scale.md says how",
-            ) from error
+            message = f"the scheduler at {scheduler} does not answer within {ANSWERS_S} s: {error}"
+            fix = "start one with `dask scheduler`, and workers with `dask worker`; docs/scale.md says how"
+            raise UserError(message, fix=fix) from error
         stack.callback(_close, client)
         yield client
 
@@ -474,46 +431,89 @@ def _close(what: Any) -> None:
         what.close(timeout=CLOSES_S)
 
 
-def _cluster_of(kind: str, workers_wanted: int) -> Any:
-    """A cluster of dask-jobqueue as the user's own configuration of dask says, asked for so many jobs."""
-    try:
-        module = importlib.import_module(f"dask_jobqueue.{kind}")
-    except ImportError as error:
-        raise UserError("jobqueue: needs dask-jobqueue", fix='pip install "tofpod[cluster]"') from error
-    try:
-        cluster = getattr(module, KINDS[kind])()
-        cluster.scale(jobs=workers_wanted)
-    except (ValueError, TypeError, OSError, RuntimeError) as error:
-        raise UserError(
-            f"dask-jobqueue could not start a cluster of kind {kind}: {error}",
-            fix=f"describe it in ~/.config/dask/jobqueue.yaml under jobqueue.{kind}: cores, processes: 1, memory",
-        ) from error
-    return cluster
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence dask: how jobs end tells of workers that come and go, and versions are checked here."""
-    import distributed  # noqa: F401 (sets the levels when it is imported)
-
-    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
-
-
-def _tell(message: str) -> None:
-    """Print a line to the user, beside the progress."""
-    print(message, file=sys.stderr, flush=True)
-
-
 def _bare(address: str) -> str:
-    """host:port."""
     return address.rpartition("://")[2]
+
+
+# ---------------------------------------------------------------- in a dask worker, which never computes itself
+
+_engines: dict[str, LocalEngine] = {}  # engines by the code that they run: one, but for drivers of unlike experiments
+_awaited: dict[str, set[Answers]] = {}  # answers that each driver waits for
+_users: Counter[str] = Counter()  # number of bundles under way that need each view that was sent
+
+
+def examine(code: Mapping[Stage, Code], probe: str | None, dask_worker: Any) -> NodeFacts:
+    """Describe this node. Digests are taken once a process: files that change later are not what it runs."""
+    digests: dict[Stage, str] = {}
+    for stage, which in code.items():
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            digests[stage] = source_digest(*which)
+    state = dask_worker.state
+    offers_render = state.total_resources.get("render", 0) > 0
+    return NodeFacts(platform.python_version(), digests, state.nthreads, offers_render, seen(probe))
+
+
+def seen(probe: str | None) -> str | None:
+    """Return the content of a file; None where it is not there."""
+    with contextlib.suppress(OSError):
+        return None if probe is None else Path(probe).read_text()
+    return None
+
+
+def drop(driver: str) -> None:
+    """End all jobs of a driver, which waits for them no longer."""
+    for answers in _awaited.pop(driver, ()):
+        for engine in _engines.values():
+            engine.drop(answers)
+
+
+async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> Carried:
+    """Do the jobs of a bundle. Raises UserError where the node's processes run other code or cannot start."""
+    own = Path(dask_worker.local_directory) / "tofpod-views"
+    key = repr(sorted(code.items()))
+    if key not in _engines:
+        _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code, sent_views=own)
+        _engines[key].__enter__()
+        atexit.register(_engines[key].__exit__)
+    needs = set() if bundle.shares else {path.name for job in bundle.jobs for path in job.needs}
+    missing = _keep(own, needs, bundle.views)
+    if missing:
+        return Carried(missing=missing)
+    answers = Answers()
+    _awaited.setdefault(driver, set()).add(answers)
+    _users.update(needs)
+    try:
+        return await asyncio.to_thread(_carried, bundle, _engines[key], answers, own, dask_worker.address)
+    finally:
+        _awaited.get(driver, set()).discard(answers)
+        _users.subtract(needs)
+
+
+def _carried(bundle: Bundle, engine: LocalEngine, answers: Answers, own: Path, address: str) -> Carried:
+    renders_here = bundle.jobs[0].stage == "renders" and not bundle.shares
+    for job in bundle.jobs:
+        given = replace(job, arguments=(*job.arguments[:-1], str(own))) if renders_here else job
+        engine.put(given, bundle.limits, answers)
+    ended: dict[str, Ended] = {}
+    while len(ended) < len(bundle.jobs) and not answers.is_dropped:
+        said = answers.ended.get()
+        if isinstance(said, UserError):
+            engine.drop(answers)
+            raise said
+        ended[said[0].name] = replace(said[1], worker=_bare(address))
+    there = [name for name, how in ended.items() if renders_here and how.state == "done"]
+    rendered = {name: (own / name).read_bytes() for name in there}
+    return Carried(tuple(ended[job.name] for job in bundle.jobs if job.name in ended), rendered)
+
+
+def _keep(own: Path, needs: set[str], views: Mapping[str, bytes]) -> tuple[str, ...]:
+    """Store views that came, let go of the oldest, and return the names of those that are not here."""
+    for name in needs:
+        if (own / name).exists():
+            (own / name).touch()
+        elif name in views:
+            write_bytes(own / name, views[name], durable=False)
+    for path in sorted(own.glob("*.npz"), key=lambda path: path.stat().st_mtime)[: -2 * KEPT_VIEWS]:
+        if path.name not in needs and not _users[path.name]:
+            path.unlink()
+    return tuple(name for name in needs if not (own / name).exists())

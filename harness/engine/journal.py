@@ -9,24 +9,19 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
 import re
 import secrets
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.engine.work import STATES, Ended, State
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import explained, open_plain
-from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.limits import RECORD_BYTES
+from harness.vocabulary.files import RECORD_BYTES, explained, open_plain, strict_json
+from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
-from harness.vocabulary.versions import check_version, stamp_of, stamped
 
 JOURNAL_VERSION = 6
 """Raised by every change to the records' content or to what a trial computes. Segments of older versions are passed
@@ -34,33 +29,8 @@ over, so that their trials run again; so are the files of versions before 6, whi
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"
 """Begins the keys of entries that hold no trial, but the thresholds at which trials were judged."""
-NOTHING = "null"
-"""Stands in the place of the record of a trial that is not done."""
-DIGEST_CHARACTERS = 32
-
-
-@dataclass(frozen=True)
-class Entry:
-    """The end of a trial. ``text``: its record as JSON where it is done, otherwise None; other fields as in `Ended`."""
-
-    state: State
-    text: str | None = None
-    why: str = ""
-    is_bug: bool = False
-    seconds: float = 0.0
-    peak_mb: float = 0.0
-    worker: str = ""
-
-    @classmethod
-    def of(cls, ended: Ended) -> Entry:
-        """The entry of a job whose value is a record's text."""
-        text = ended.value if ended.state == "done" else None
-        return cls(ended.state, text, ended.why, ended.is_bug, round(ended.seconds, 4), ended.peak_mb, ended.worker)
-
-    @cached_property
-    def record(self) -> dict[str, Any] | None:
-        """Rows by table of a trial that is done."""
-        return None if self.text is None else json.loads(self.text)
+NOTHING = "null"  # stands in the place of the record of a trial that is not done
+KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
 
 class _Place(NamedTuple):
@@ -73,45 +43,41 @@ class _Place(NamedTuple):
 
 
 class Journal:
-    """Entries in a folder, by key. Raises UserError where the folder or a segment is a link, cannot be written, or was
-    written by a newer tofpod."""
+    """Entries in a folder, by key: the end of a trial, with the text of its record as value. Raises UserError where the
+    folder or a segment is a link, cannot be written, or was written by a newer tofpod. ``damaged``: lines that are torn
+    or altered, as file and byte, and segments of another version."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.damaged: list[str] = []
-        """Lines that are torn or altered, as file and byte, and segments of another version."""
         self._places: dict[str, _Place] = {}
-        self._thresholds: set[str] = set()
         self._read_to: dict[str, int] = {}
-        """Bytes of each segment that were read."""
         self._own: Path | None = None
         self._is_read = False
 
     def __len__(self) -> int:
-        return len(self._known()) - len(self._thresholds)
+        return sum(not key.startswith(THRESHOLDS) for key in self._known())
 
     def trials(self) -> list[str]:
-        """The keys of all trials, sorted."""
-        return sorted(self._known().keys() - self._thresholds)
+        """Return the keys of all trials, sorted."""
+        return sorted(key for key in self._known() if not key.startswith(THRESHOLDS))
 
-    @property
-    def thresholds(self) -> frozenset[str]:
-        """The keys of stored thresholds."""
-        self._known()
-        return frozenset(self._thresholds)
+    def thresholds(self) -> list[str]:
+        """Return the keys of stored thresholds, sorted."""
+        return sorted(key for key in self._known() if key.startswith(THRESHOLDS))
 
     def state(self, key: str) -> State | None:
-        """The end of a trial; None where there is no entry."""
+        """Return how a trial ended; None where there is no entry."""
         place = self._known().get(key)
         return None if place is None else place.state
 
     def size(self, key: str) -> int:
-        """Bytes of an entry on the disk; 0 where there is none."""
+        """Return the bytes of an entry on the disk; 0 where there is none."""
         place = self._known().get(key)
         return 0 if place is None else place.length
 
-    def read(self, key: str) -> Entry | None:
-        """The entry of a trial; None where there is none."""
+    def read(self, key: str) -> Ended | None:
+        """Return the entry of a trial; None where there is none."""
         place = self._known().get(key)
         if place is None:
             return None
@@ -123,19 +89,26 @@ class Journal:
             return None
         return found[1] if found is not None and found[0] == key else None
 
-    def entries(self) -> Iterator[tuple[str, Entry]]:
-        """(key, entry) of all trials and thresholds, in the order in which they stand in the segments."""
+    def entries(self) -> Iterator[tuple[str, Ended]]:
+        """Yield (key, entry) of all trials and thresholds, in the order in which they stand in the segments."""
         for key, _ in sorted(self._known().items(), key=lambda item: item[1][:2]):
             if (entry := self.read(key)) is not None:
                 yield key, entry
 
-    def write(self, key: str, entry: Entry) -> None:
+    def write(self, key: str, entry: Ended) -> None:
         """Append how a trial ended. Raises UserError where the folder cannot be written or the disk is full."""
         self._known()
-        line = _line(key, entry)
+        said = {name: getattr(entry, name) for name in KEPT} | {"key": key, "seconds": round(entry.seconds, 4)}
+        text = f"{canonical_json(said)}\t{NOTHING if entry.value is None else entry.value}".encode()
+        line = _digest(text) + b" " + text + b"\n"
         try:
-            if self._own is None:
-                self._own = self._new_segment()
+            if self._own is None:  # names count up, so that they sort by the time at which the segments were begun
+                self.folder.mkdir(parents=True, exist_ok=True)
+                numbers = [int(name[:6]) for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name)]
+                own = self.folder / f"{max(numbers, default=0) + 1:06d}-{secrets.token_hex(4)}.jsonl"
+                with open_plain(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file:
+                    file.write(stamped("journal", JOURNAL_VERSION).encode())
+                self._own = own
             with open_plain(self._own, os.O_WRONLY | os.O_APPEND) as file:
                 start = os.fstat(file.fileno()).st_size
                 if os.write(file.fileno(), line) < len(line):
@@ -157,27 +130,23 @@ class Journal:
         if self.folder.is_symlink():
             raise UserError(f"{self.folder}: is a link, and a journal is not read through one", fix="remove the link")
         self._is_read = True
-        try:
-            names = sorted(name for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name))
-        except (FileNotFoundError, NotADirectoryError):
-            return
-        for name in names:
-            self._read_segment(name)
+        with suppress(FileNotFoundError, NotADirectoryError):
+            for name in sorted(filter(SEGMENT_NAME.fullmatch, os.listdir(self.folder))):
+                self._read_segment(self.folder / name)
 
     def _known(self) -> dict[str, _Place]:
         if not self._is_read:
             self.refresh()
         return self._places
 
-    def _read_segment(self, name: str) -> None:
-        path = self.folder / name
+    def _read_segment(self, path: Path) -> None:
         try:
             with open_plain(path, os.O_RDONLY) as file:
-                start = self._read_to.get(name, 0)
+                start = self._read_to.get(path.name, 0)
                 if os.fstat(file.fileno()).st_size <= start:
                     return
                 if not start and not self._is_ours(path, file.readline(200)):
-                    self._read_to[name] = 1 << 62  # never looked into again
+                    self._read_to[path.name] = 1 << 62  # never looked into again
                     return
                 file.seek(start := max(start, file.tell()))
                 while (line := file.readline(RECORD_BYTES)).endswith(b"\n"):
@@ -185,11 +154,11 @@ class Journal:
                     if found is None:
                         self.damaged.append(f"{path}: byte {start}")
                     else:
-                        self._remember(found[0], _Place(name, start, len(line), found[1].state))
+                        self._remember(found[0], _Place(path.name, start, len(line), found[1].state))
                     start += len(line)
-                if line and name not in self._read_to:
+                if line and path.name not in self._read_to:
                     self.damaged.append(f"{path}: byte {start}")  # torn, or being written now
-                self._read_to[name] = start
+                self._read_to[path.name] = start
         except OSError:
             self.damaged.append(str(path))
 
@@ -207,26 +176,9 @@ class Journal:
         before = self._places.get(key)
         if before is None or before.state != "done" or place.state == "done":
             self._places[key] = place
-        if key.startswith(THRESHOLDS):
-            self._thresholds.add(key)
-
-    def _new_segment(self) -> Path:
-        """Names count up, so that they sort by the time at which the segments were begun."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        numbers = [int(name[:6]) for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name)]
-        path = self.folder / f"{max(numbers, default=0) + 1:06d}-{secrets.token_hex(4)}.jsonl"
-        with open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file:
-            file.write(stamped("journal", JOURNAL_VERSION).encode())
-        return path
 
 
-def _line(key: str, entry: Entry) -> bytes:
-    said = {name: value for name, value in asdict(entry).items() if name != "text"}
-    text = f"{canonical_json({'key': key, **said})}\t{NOTHING if entry.text is None else entry.text}".encode()
-    return _digest(text) + b" " + text + b"\n"
-
-
-def _parsed(line: bytes) -> tuple[str, Entry] | None:
+def _parsed(line: bytes) -> tuple[str, Ended] | None:
     """The key and the entry of a line; None where it is damaged."""
     digest, _, text = line.rstrip(b"\n").partition(b" ")
     if digest != _digest(text):
@@ -234,27 +186,25 @@ def _parsed(line: bytes) -> tuple[str, Entry] | None:
     try:
         head, _, record = text.decode().partition("\t")
         said = strict_json(head)
-        key = said.pop("key")
-        entry = Entry(text=None if record == NOTHING else record, **said)
+        key, entry = said.pop("key"), Ended(value=None if record == NOTHING else record, **said)
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    is_whole = entry.state in STATES and (entry.text is not None) == (entry.state == "done")
+    is_whole = entry.state in STATES and (entry.value is not None) == (entry.state == "done")
     return (key, entry) if is_whole and isinstance(key, str) else None
 
 
 def _digest(text: bytes) -> bytes:
-    return hashlib.blake2b(text, digest_size=DIGEST_CHARACTERS // 2).hexdigest().encode()
+    return hashlib.blake2b(text, digest_size=16).hexdigest().encode()
 
 
 def record_text(record: dict[str, Any]) -> str:
-    """A trial's record as one line of JSON; NaN, which JSON cannot hold, becomes null."""
-    return canonical_json(without_nan(record))
+    """Return a trial's record as one line of JSON; NaN, which JSON cannot hold, becomes null."""
+    return canonical_json(_without_nan(record))
 
 
-def without_nan(record: Any) -> Any:
-    """The record with None in the place of NaN."""
+def _without_nan(record: Any) -> Any:
     if isinstance(record, dict):
-        return {key: without_nan(value) for key, value in record.items()}
+        return {key: _without_nan(value) for key, value in record.items()}
     if isinstance(record, list):
-        return [without_nan(value) for value in record]
+        return [_without_nan(value) for value in record]
     return None if isinstance(record, float) and record != record else record

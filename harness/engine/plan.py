@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from detectors import DETECTORS
 from harness.engine.journal import JOURNAL_VERSION
 from harness.engine.setup import SetUpRef
-from harness.engine.shard import Shard
 from harness.engine.trial import PointTask, Role, TrialTask
-from harness.experiment.points import Experiment, Point
-from harness.experiment.schema import SimulatedSource
+from harness.engine.work import Shard
+from harness.experiment.schema import Experiment, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.provenance import source_digest
 from harness.vocabulary.seeds import canonical_json, digest
-from harness.vocabulary.sources import source_digest
-from harness.vocabulary.units import MM
+from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews, poses_of
 from scenes.render.cache import render_key
-from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
@@ -34,12 +33,11 @@ PACKAGES = (
 """A trial's numbers are decided, beside its task, by all sources that this module and the detector's reach, and by the
 versions of these packages: a change of any makes stored trials count as not done. Mitsuba's version is part of the
 names of the rendered views."""
-MOST_REPEATS = 256
-"""Repeats of a part of a plan, which is looked up and queued as one."""
+MOST_REPEATS = 256  # repeats of a part of a plan, which is looked up and queued as one
 
 
 def trial_code(detector: str) -> tuple[str, ...]:
-    """Modules whose sources decide a trial with a detector, a plug-in's included."""
+    """Return the modules whose sources decide a trial with a detector, a plug-in's included."""
     return (CODE, DETECTORS.offer(detector).target.partition(":")[0])
 
 
@@ -60,25 +58,24 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: of its one view, or
-    of each of those from which maps are made.
-
-    ``board``: its number among a study's boards of this role; None for the one target of any other experiment.
-    """
+    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: one for each view.
+    ``board``: its number among a study's boards of this role; None for any other experiment."""
 
     role: Role
     renders: tuple[RenderJob, ...]
     set_ups: tuple[SetUpRef, ...]
     board: int | None = None
 
+    @cached_property
+    def paths(self) -> tuple[Path, ...]:
+        """The files of its views."""
+        return tuple(job.path for job in self.renders)
+
 
 @dataclass(frozen=True)
 class Group:
-    """Points that share their frames: one set-up, one seed. Trials draw the frames once for all of them.
-
-    The batches that come ``first`` are hole-free and set the points' thresholds; ``then`` those that are judged by
-    them. ``poses``: the declaration of the views, where there are several.
-    """
+    """Points that share their frames: one set-up, one seed. The batches ``first`` are hole-free and set the points'
+    thresholds; ``then`` those judged by them. ``poses``: the declaration of the views, where there are several."""
 
     points: tuple[Point, ...]
     first: tuple[Batch, ...]
@@ -102,8 +99,8 @@ class Group:
         return next(batch for batch in self.then if batch.role == "damaged")
 
     def repeats(self, batch: Batch, point: Point) -> int:
-        """Number of trials of a batch that a point wants: with a given threshold, as many hole-free as damaged ones;
-        one of each board that sets a study's threshold."""
+        """Return the number of trials of a batch that a point wants: with a given threshold, as many hole-free as
+        damaged ones; one of each board that sets a study's threshold."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
@@ -112,17 +109,16 @@ class Group:
         return point.config.repeats
 
     def most_repeats(self, batch: Batch) -> int:
-        """Number of trials of a batch."""
+        """Return the number of trials of a batch."""
         return max(self.repeats(batch, point) for point in self.points)
 
     def trials(
         self, batch: Batch, thresholds: Mapping[str, float] | None, repeats: Iterable[int] | None = None
     ) -> Iterator[tuple[str, TrialTask]]:
-        """(journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest, empty
-        while calibrating; a point that got none is not judged. With None in place of thresholds the trials are named
-        that cannot be judged at all."""
-        unjudged = thresholds is None or batch in self.first
+        """Yield (journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest,
+        empty while calibrating; a point that got none is not judged; None names trials that cannot be judged."""
         given = {point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k) for point in self.points}
+        unjudged = thresholds is None or batch in self.first
         points = [point for point in self.points if unjudged or given[point.digest] is not None]
         asked = {point.digest: _point_task(point, given[point.digest]) for point in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
@@ -136,7 +132,7 @@ class Group:
         content = [
             JOURNAL_VERSION,
             *(source_digest(trial_code(name), PACKAGES) for name in sorted({each.detector for each in task.points})),
-            *(render.path.stem for render in batch.renders),
+            *(path.stem for path in batch.paths),
             None if self.poses is None else self.poses.to_data(),
             task.role,
             task.board,
@@ -148,18 +144,10 @@ class Group:
 
 
 def _point_task(point: Point, threshold: float | None) -> PointTask:
-    config = point.config
+    capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
+    asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
     return PointTask(
-        digest=point.digest,
-        variant=point.variant,
-        frames=config.capture.frames,
-        detector=config.detector.name,
-        settings_json=canonical_json(config.detector.settings),
-        average=config.capture.average,
-        exact=config.capture.exact,
-        radius_m=config.matching.radius_mm * MM,
-        threshold=threshold,
-        mapping=config.mapping,
+        point.digest, point.variant, capture.frames, *asked, mapping=point.config.mapping, exact=capture.exact
     )
 
 
@@ -195,11 +183,8 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
     target, seed = source.target, points[0].config.seed
     if study is not None and isinstance(target, DrawnTargetConfig):
         calibrate = points[0].config.threshold.calibrate
-        counts: dict[Role, int] = {
-            "calibration": 0 if calibrate is None else calibrate.boards or 0,
-            "hole_free": study.hole_free_boards,
-            "damaged": study.boards,
-        }
+        boards = 0 if calibrate is None else calibrate.boards or 0
+        counts: dict[Role, int] = {"calibration": boards, "hole_free": study.hole_free_boards, "damaged": study.boards}
         first, hole_free, damaged = (
             tuple(_batch(target.drawn(role, n), role, source, cache, n) for n in range(count))
             for role, count in counts.items()
@@ -207,13 +192,10 @@ def _group(points: tuple[Point, ...], cache: Path) -> Group:
         return Group(points, first, (*damaged, *hole_free), seed, source.views)
     declared = target.declare()
     if not declared.damages:
-        raise UserError(
-            "the target has neither holes nor dents, so that there is nothing to find",
-            legal="at least one hole or dent",
-            fix="declare source.target.holes or source.target.dents",
-        )
-    batches = [_batch(declared, role, source, cache) for role in ("hole_free", "damaged")]
-    return Group(points, (batches[0],), (batches[1],), seed, source.views)
+        what = "the target has neither holes nor dents, so that there is nothing to find"
+        raise UserError(what, fix="declare source.target.holes or source.target.dents")
+    first, then = ((_batch(declared, role, source, cache),) for role in ("hole_free", "damaged"))
+    return Group(points, first, then, seed, source.views)
 
 
 def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None) -> Batch:
@@ -228,30 +210,14 @@ def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: P
     return Batch(role, tuple(renders), tuple(set_ups), board)
 
 
-@dataclass(eq=False)
-class PlanPart:
-    """Some repeats of one batch, and how far they are. ``group``: its number in the plan; ``sets_threshold``: whether
-    the trials set the points' thresholds; ``left``: trials that have not ended; ``absent``: views that the ``trials``
-    wait for."""
+class PlanPart(NamedTuple):
+    """Some repeats of one batch. ``group``: its number in the plan; ``sets_threshold``: whether the trials set the
+    points' thresholds."""
 
     group: int
     batch: Batch
     sets_threshold: bool
     repeats: range
-    left: int = 0
-    absent: set[Path] = field(default_factory=set)
-    trials: list[Any] = field(default_factory=list)
-    is_over: bool = False
-
-    @property
-    def count(self) -> int:
-        """Number of trials, if all points of the group are judged."""
-        return len(self.repeats)
-
-    @cached_property
-    def paths(self) -> tuple[Path, ...]:
-        """The files of the batch's views."""
-        return tuple(job.path for job in self.batch.renders)
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
@@ -260,8 +226,8 @@ def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)
-        ends = (min(start + MOST_REPEATS, repeats.stop) for start in starts)
-        return [PlanPart(number, batch, sets_threshold, range(*ends)) for ends in zip(starts, ends, strict=True)]
+        slices = (range(start, min(start + MOST_REPEATS, repeats.stop)) for start in starts)
+        return [PlanPart(number, batch, sets_threshold, each) for each in slices]
 
     mine, before = shard.part(sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)), 0
     first: list[list[PlanPart]] = []

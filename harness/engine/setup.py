@@ -9,41 +9,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
-import numba
 import numpy as np
 
-from harness.vocabulary.capture import Cloud
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud, invert, rotate_vectors, transform_points
 from scenes.render.cache import read_view
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
-from scenes.target.face import Face, face_of
-from scenes.target.truth import Damage, truth_of
-from scenes.view import NoiseFreeView
+from scenes.target.truth import Damage, Face, face_of, truth_of
 
 INTACT_MARGIN_PX = 8
 """Pixels nearer than this to damage or to the board's rim do not count as undamaged: twice the engine's window."""
 FEWEST_PROBES = 100
 PROBES = 500
 """Pixels on which temporal noise and systematic error are followed over repeats: known to 0.5 % with 50 repeats."""
-
-
 FACE_STEPS = 8
 """Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
+FACE_ONLY_M = 50 * MM  # points this far behind the face are nearest to no place on it
 
 
 @dataclass(frozen=True)
 class SetUpRef:
-    """Names a set-up in few bytes, for sending to a worker: a stored view, camera and target.
-
-    ``target`` has its damage in any case; ``damaged`` tells whether the view shows it.
-    """
+    """Names a set-up in few bytes, for a worker. ``target`` has its damage; ``damaged``: whether the view shows it."""
 
     view_path: str
     camera: CameraConfig
@@ -69,23 +59,17 @@ class SetUp:
         T_board_camera = invert(self.T_camera_board)
         rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
         origin = np.broadcast_to(T_board_camera[:3, 3], rays.shape)
-        size = self.target.board
-        met = met_on_face(origin, rotate_vectors(T_board_camera, rays), face_of(size))
+        board = self.target.board
+        met = met_on_face(origin, rotate_vectors(T_board_camera, rays), face_of(board))
         x, y, z = np.moveaxis(met, -1, 0)
         with np.errstate(invalid="ignore"):
-            over = (np.abs(x) < size.width_mm / 2 * MM) & (np.abs(y) < size.height_mm / 2 * MM)
+            over = (np.abs(x) < board.width_mm / 2 * MM) & (np.abs(y) < board.height_mm / 2 * MM)
         return np.where((over & np.isfinite(z))[..., None], met, np.nan)
 
     @property
     def board_xy_m(self) -> np.ndarray:
         """(h, w, 2): the same, along the face in plan."""
         return self.on_face_m[..., :2]
-
-    @cached_property
-    def face_z_m(self) -> np.ndarray:
-        """(h, w): z in the camera's frame of the undamaged face along each pixel's central ray; strips of tape count
-        as face."""
-        return np.asarray(transform_points(self.T_camera_board, self.on_face_m)[..., 2])
 
     @cached_property
     def seen_z_m(self) -> np.ndarray:
@@ -109,15 +93,20 @@ class SetUp:
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
         """Depth by damage at which the central rays through it end behind the face, along the optical axis: median of
-        those that come within 1 mm of the deepest (walls are seen in passing). Behind a through-hole that is the
-        backing."""
-        depth_m = (self.seen_z_m - self.face_z_m).ravel()
-        return {damage.id: _deepest(depth_m[self.outlines[damage.id]]) for damage in self.truth}
+        those that come within 1 mm of the deepest (walls are seen in passing); behind a through-hole the backing's.
+        Strips of tape count as face."""
+        face_z_m = transform_points(self.T_camera_board, self.on_face_m)[..., 2]
+        depth_m, found = (self.seen_z_m - face_z_m).ravel(), {}
+        for damage in self.truth:
+            inside = depth_m[self.outlines[damage.id]]
+            known = inside[np.isfinite(inside)]
+            found[damage.id] = float(np.median(known[known > known.max() - 1 * MM])) if known.size else float("nan")
+        return found
 
     @cached_property
     def intact(self) -> np.ndarray:
         """(h, w) bool: undamaged face well away from damage and rim."""
-        whole = np.isfinite(self.board_xy_m[..., 0])
+        whole = self.on_board.copy()
         whole.ravel()[np.concatenate(list(self.outlines.values()))] = False
         return _eroded(whole)
 
@@ -134,18 +123,14 @@ class SetUp:
     @cached_property
     def pitch_mm(self) -> tuple[float, float]:
         """Median distance on the face between neighbouring columns and between neighbouring rows of pixels."""
-        xy = self.board_xy_m
-        steps = (np.linalg.norm(np.diff(xy, axis=axis), axis=-1) for axis in (1, 0))
+        steps = (np.linalg.norm(np.diff(self.board_xy_m, axis=axis), axis=-1) for axis in (1, 0))
         u, v = (float(np.nanmedian(step)) / MM for step in steps)
         return u, v
 
     @cached_property
     def probes(self) -> np.ndarray:
-        """(p,) flat indices of evenly spread undamaged pixels.
-
-        Where the camera is so far that damage leaves too few, pixels over damage count too: probes are read on the
-        hole-free board only.
-        """
+        """(p,) flat indices of evenly spread undamaged pixels; over damage too where else there are too few (probes are
+        read on the hole-free board only)."""
         intact = np.flatnonzero(self.intact)
         intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
@@ -158,13 +143,8 @@ def _eroded(mask: np.ndarray) -> np.ndarray:
     return np.asarray(left > 0)
 
 
-def _deepest(depth_m: np.ndarray) -> float:
-    known = depth_m[np.isfinite(depth_m)]
-    return float(np.median(known[known > known.max() - 1 * MM])) if known.size else float("nan")
-
-
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
-    """(..., 3): where the lines through points along directions (both (..., 3), board frame) meet a face."""
+    """Return (..., 3): where the lines through points along directions (both (..., 3), board frame) meet a face."""
     place, before = points_m, None
     for _ in range(FACE_STEPS):
         height = np.nan_to_num(face.height_m(place[..., 0], place[..., 1]))
@@ -175,30 +155,19 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
     return np.asarray(place)
 
 
-@lru_cache(maxsize=32)
-def load_set_up(ref: SetUpRef) -> SetUp:
-    """The set-up behind a reference, kept for the worker's next trials."""
-    camera = camera_of(ref.camera)
-    T_camera_board = ref.target.pose.T_camera_board
-    return SetUp(
-        unit=SimulatedUnit(camera, ref.camera, _stored_view(ref.view_path)),
-        damaged=ref.damaged,
-        truth=truth_of(ref.target, T_camera_board),
-        target=ref.target,
-        T_camera_board=T_camera_board,
-    )
-
-
 sent_views: Path | None = None
 """The folder, in a process that does not see the driver's cache, where views that were sent lie under their names."""
 
 
-def _stored_view(path: str) -> NoiseFreeView:
-    place = Path(path)
+@lru_cache(maxsize=32)
+def load_set_up(ref: SetUpRef) -> SetUp:
+    """Return the set-up behind a reference, kept for the worker's next trials."""
+    place, T_camera_board = Path(ref.view_path), ref.target.pose.T_camera_board
     view = read_view(sent_views / place.name if sent_views is not None and not place.exists() else place)
     if view is None:
-        raise UserError(f"{path}: the stored render is missing or damaged", fix="run the same command again")
-    return view
+        raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")
+    unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
+    return SetUp(unit, ref.damaged, truth_of(ref.target, T_camera_board), ref.target, T_camera_board)
 
 
 @dataclass(frozen=True)
@@ -221,12 +190,8 @@ class KnownCloud:
     seen_depth_m: Mapping[int, float]
 
     def on_board(self, centres_m: np.ndarray) -> np.ndarray:
-        """(m, 2) places on the face of findings whose centres (m, 3) are given in the cloud's frame: where the line of
-        known through a centre meets the face.
-
-        The centre itself lies at depth, up to a centimetre aside of where a viewer would point on the face. On a
-        map the line of sight is its z axis.
-        """
+        """Return (m, 2) places on the face of findings whose centres (m, 3) are given in the cloud's frame: where the
+        line of sight through a centre, on a map its z axis, meets the face."""
         board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
         if self.cloud.projection == "parallel":
             direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
@@ -235,53 +200,38 @@ class KnownCloud:
         return met_on_face(board, direction, face_of(self.target.board))[:, :2]
 
     def centre_in_cloud_m(self, damage: Damage) -> np.ndarray:
-        """(3,) true centre of a damage on the face, in the cloud's frame."""
+        """Return the (3,) true centre of a damage on the face, in the cloud's frame."""
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
 
     def area_m2(self, pixels: np.ndarray) -> float:
-        """The face's area in plan that the pixels (h, w) bool cover, tilt and perspective included; of a cloud without
-        a grid the whole face's, in the share of its points."""
+        """Return the face's area in plan that the pixels (h, w) bool cover, tilt and perspective included; of a cloud
+        without a grid the whole face's, in the share of its points."""
         there = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
-            size = self.target.board
-            return size.width_mm * size.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
+            board = self.target.board
+            return board.width_mm * board.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
         areas = pixel_areas(self.places_m)
-        each = areas[there]
-        known = np.isfinite(each)
-        if not known.all():
-            # at the outline a neighbour is off the board: such a pixel is taken for one like the others
-            every = areas[np.isfinite(areas)]
-            each = np.where(known, each, np.median(every) if every.size else 0.0)
-        return float(each.sum())
+        known = np.isfinite(areas)
+        # at the outline a neighbour is off the board: such a pixel is taken for one like the others
+        usual = np.median(areas[known]) if known.any() else 0.0
+        return float(np.where(known, areas, usual)[there].sum())
 
 
 def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
-    """One view's average with the truth along each pixel's central ray."""
+    """Return one view's average with the truth along each pixel's central ray."""
     # where the camera is so far that nothing undamaged is left beside the damage, a hole-free board but for its rim
     undamaged = set_up.bare if hole_free and not set_up.intact.any() else set_up.intact
-    return KnownCloud(
-        cloud=cloud,
-        T_board_cloud=invert(set_up.T_camera_board),
-        target=set_up.target,
-        truth=set_up.truth,
-        outlines=set_up.outlines,
-        places_m=set_up.board_xy_m,
-        undamaged=undamaged,
-        seen_depth_m=set_up.seen_depth_m,
-    )
+    of_truth = (set_up.target, set_up.truth, set_up.outlines, set_up.board_xy_m, undamaged, set_up.seen_depth_m)
+    return KnownCloud(cloud, invert(set_up.T_camera_board), *of_truth)
 
 
 def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> KnownCloud:
-    """A map of several views, ``first`` being the reference view's set-up: the truth by each point's own place.
-
-    A point deep in a hole that was seen at an angle lies beside the place on the face where it was looked for; on the
-    target's scale that is within the margin round the damage.
-    """
+    """Return a map of several views, ``first`` being the reference view's set-up: the truth by each point's own place
+    (deep in a hole that was seen at an angle it is aside, within the margin round the damage)."""
     T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
     place = board_places_m(cloud, T_board_cloud)
     margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
-    size = first.target.board
-    half = np.array([size.width_mm, size.height_mm]) / 2 * MM - margin_m
+    half = np.array([first.target.board.width_mm, first.target.board.height_mm]) / 2 * MM - margin_m
     with np.errstate(invalid="ignore"):
         bare = (np.abs(place) < half).all(axis=-1)
     outlines, intact = {}, bare.copy()
@@ -292,20 +242,13 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
             intact &= apart_m2 > (damage.diameter_m / 2 + margin_m) ** 2
             within = np.flatnonzero(apart_m2.ravel() < (damage.diameter_m / 2) ** 2)
         outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(apart_m2))])
-    return KnownCloud(
-        cloud=cloud,
-        T_board_cloud=T_board_cloud,
-        target=first.target,
-        truth=first.truth,
-        outlines=outlines,
-        places_m=place,
-        undamaged=bare if hole_free and not intact.any() else intact,
-        seen_depth_m=first.seen_depth_m,
-    )
+    undamaged = bare if hole_free and not intact.any() else intact
+    return KnownCloud(cloud, T_board_cloud, first.target, first.truth, outlines, place, undamaged, first.seen_depth_m)
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
-    """(h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid knows."""
+    """Return the (h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid
+    knows."""
     points = cloud.points_m
     if cloud.projection == "parallel":
         x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
@@ -313,24 +256,6 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
         grid = np.stack([*np.meshgrid(x, y), np.full(cloud.valid.shape, z)], axis=-1)
         points = np.where(cloud.valid[..., None], points, grid)
     return np.asarray(transform_points(T_board_cloud, points)[..., :2])
-
-
-def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
-    """(p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along the
-    board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
-    from scipy.spatial import cKDTree
-
-    points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
-    # the undamaged face only: what lies behind a rim is nearest to no place on the face
-    points = points[np.abs(points[:, 2]) < 50 * MM]
-    if not len(points):
-        return np.full(len(places_m), np.nan)
-    tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
-    distance, nearest = tree.query(places_m)
-    spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
-    face = face_of(known.target.board)
-    error = face.height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
-    return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
 
 
 def _ticks(places: np.ndarray) -> np.ndarray:
@@ -343,44 +268,34 @@ def _ticks(places: np.ndarray) -> np.ndarray:
     return np.asarray(filled)
 
 
-PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
+def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
+    """Return (p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along
+    the board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
+    from scipy.spatial import cKDTree
+
+    points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
+    points = points[np.abs(points[:, 2]) < FACE_ONLY_M]
+    if not len(points):
+        return np.full(len(places_m), np.nan)
+    tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
+    distance, nearest = tree.query(places_m)
+    spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
+    error = face_of(known.target.board).height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
+    return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
 
 
-@numba.njit(**PLAIN)
 def highest_within(places_m: np.ndarray, score: np.ndarray, centres_m: np.ndarray, radius_m: float) -> np.ndarray:
-    """(n,) the highest of the finite scores (h, w) within a radius of each centre (n, 2); NaN where there is none.
-
-    ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere.
-    """
-    highest = np.full(len(centres_m), np.nan)
-    for r in range(score.shape[0]):
-        for c in range(score.shape[1]):
-            if not np.isfinite(score[r, c]):
-                continue
-            for n in range(len(centres_m)):
-                dx = places_m[r, c, 0] - centres_m[n, 0]
-                if not abs(dx) <= radius_m:
-                    continue
-                dy = places_m[r, c, 1] - centres_m[n, 1]
-                if np.sqrt(dx * dx + dy * dy) <= radius_m and not score[r, c] <= highest[n]:
-                    highest[n] = score[r, c]
-    return highest
+    """Return (n,) the highest of the finite scores (h, w) within a radius of each centre (n, 2); NaN where there is
+    none. ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere."""
+    finite = np.isfinite(score)
+    places, scores = places_m[finite], score[finite]
+    near = (np.sqrt(((places - centre) ** 2).sum(axis=-1)) <= radius_m for centre in centres_m)
+    return np.array([scores[each].max() if each.any() else np.nan for each in near])
 
 
-@numba.njit(**PLAIN)
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:
-    """(h, w) area that each pixel covers of the plane on which the pixels lie at ``places_m`` (h, w, 2): of the
+    """Return (h, w) area that each pixel covers of the plane on which the pixels lie at ``places_m`` (h, w, 2): of the
     parallelogram of the central differences, at the grid's edge of the one-sided ones. NaN beside a pixel that lies
     nowhere; h and w are 2 at least."""
-    h, w = places_m.shape[:2]
-    areas = np.empty((h, w))
-    for r in range(h):
-        up, down = max(r - 1, 0), min(r + 1, h - 1)
-        for c in range(w):
-            left, right = max(c - 1, 0), min(c + 1, w - 1)
-            ax = (places_m[r, right, 0] - places_m[r, left, 0]) / (right - left)
-            ay = (places_m[r, right, 1] - places_m[r, left, 1]) / (right - left)
-            bx = (places_m[down, c, 0] - places_m[up, c, 0]) / (down - up)
-            by = (places_m[down, c, 1] - places_m[up, c, 1]) / (down - up)
-            areas[r, c] = abs(ax * by - ay * bx)
-    return areas
+    down, across = np.gradient(places_m, axis=(0, 1))
+    return np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])

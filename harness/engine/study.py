@@ -1,4 +1,4 @@
-"""A study with a simulated camera, from a validated experiment to its folder of results."""
+"""A validated experiment becomes its folder of results: one with a simulated camera, or one of real captures."""
 
 from __future__ import annotations
 
@@ -6,87 +6,97 @@ import datetime
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import pandas as pd
 
-from harness.engine.console import progress_display
-from harness.engine.costs import learn
+from detectors import load_detector
+from detectors.average import prefix_averages
+from harness.engine.estimate import learn, progress_display
 from harness.engine.journal import Journal
-from harness.engine.options import EngineOptions, engine_of
-from harness.engine.plan import SweepPlan, plan_of
+from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
 from harness.engine.run import render_missing, run_plan
-from harness.engine.shard import locked
-from harness.engine.tables import origin_of, summaries, tables_of, write_tables
-from harness.engine.work import STATES, JobEngine, Outcome
+from harness.engine.tables import summaries, tables_of, write_tables
+from harness.engine.work import STATES, EngineOptions, JobEngine, Outcome, engine_of, locked
+from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.load import resolved_yaml
-from harness.experiment.points import Experiment
-from harness.experiment.schema import SimulatedSource
-from harness.listing.latest import point_to
-from harness.tables.grid import Grid, show
+from harness.experiment.schema import CaptureSource, Experiment, Point, SimulatedSource, detector_version, recording_of
+from harness.inspection.run import judged as judged_cloud
+from harness.inspection.told import choice_by, choice_facts, pictures, print_warnings
+from harness.listing import point_to
+from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.tables.schema import write_table
-from harness.tables.trials import ResultTables
+from harness.tables.text import Grid, show
+from harness.tables.trials import POINTS_OF_CAPTURES, ResultTables
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_text
-from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
-from harness.vocabulary.provenance import record
-from harness.vocabulary.units import INCH, MM
-from harness.vocabulary.versions import RESULTS_VERSION, check_version
+from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
+from harness.vocabulary.geometry import INCH, MM
+from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
+from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
-from scenes.view import NoiseFreeView
 
-MOST_FAILURES = 200
-"""Failures that are listed; the journal has all."""
-MOST_VIEWS = 64
-"""Views whose render noise is measured: evenly taken from all, 4 MB each."""
+if TYPE_CHECKING:
+    from detectors.crop import Choice
+
+MOST_FAILURES = 200  # failures that are listed; the journal has all
+MOST_VIEWS = 64  # views whose render noise is measured: evenly taken from all, 4 MB each
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
     """Run, write tables and report, print the summary; a shard's trials only go into the journal. Returns 0, 1 where
     trials did not end well, 130 after Ctrl-C."""
     began = time.monotonic()
-    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     origin = record(command)  # now: a commit that is made while the sweep runs is not what it ran
-    folder = experiment.folder(out)
+    origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    folder, cache = experiment.folder(out), out / ".cache" / "renders"
     _refuse_newer(folder)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
-        plan = plan_of(experiment, _cache(out))
-        # The first file written: an unwritable folder shows before any work is done.
+        plan = plan_of(experiment, cache)
+        # the first file written: an unwritable folder shows before any work is done
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         journal = Journal(folder / "journal")
-        with in_use(_cache(out)), locked(folder, options.shard), engine_of(options, detectors) as engine:
-            with progress_display() as show:
-                outcome = run_plan(plan, journal, engine, show, shard=options.shard, retry_failed=options.retry_failed)
-            learn(plan, outcome, journal, out / ".cache", 1 if options.serial else options.jobs)
+        with in_use(cache), locked(folder, options.shard), engine_of(options, detectors) as engine:
+            with progress_display() as report:
+                retry = options.retry_failed
+                outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
+            learn(plan, outcome, journal, cache.parent)
             if not options.shard.is_whole:
-                return _conclude_shard(folder, outcome, options)
+                trials = outcome.trials
+                counts = f"{trials.done} trials done, {trials.found} found, {trials.failed} not ended well"
+                print(f"shard {options.shard}: {counts}")
+                _tell_failures(outcome)
+                print(f"journal: {folder / 'journal'}")
+                print("when all shards have run: python -m harness.merge, then the same command without --shard")
+                return 1 if outcome.failures else 0
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
             print("writing tables and report", file=sys.stderr)
             tables = tables_of(_records(journal, outcome), experiment)
-            provenance = _provenance(experiment, plan, outcome, tables, origin, started)
+            provenance = _provenance(experiment, plan, outcome, tables, origin)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
-            write_tables(folder, tables, provenance)
+            write_tables(folder, tables.stored(), provenance)
             write_text(folder / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
             if experiment.config.study is None:
-                _write_report(folder, experiment, outcome, tables, provenance)
-                shown = _final_table(tables)
+                shown = _write_report(folder, experiment, outcome, tables, provenance)
             else:
                 shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
         if options.cache_limit_gb is not None:
-            trim_cache(_cache(out), round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
+            trim_cache(cache, round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
     point_to(folder)
-    _conclude(folder, shown, outcome)
+    show(shown)
+    _tell_failures(outcome)
+    print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
 
 
@@ -105,11 +115,12 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
     for key in outcome.finished:
         entry = journal.read(key)
         if entry is None or entry.record is None:
-            raise UserError(
-                f"{journal.folder}: the record {key} is gone or damaged since it was written",
-                fix="run the same command again: what is missing is run again",
-            )
+            fix = "run the same command again: what is missing is run again"
+            raise UserError(f"{journal.folder}: the record {key} is gone or damaged since it was written", fix=fix)
         yield entry.record
+
+
+# ---------------------------------------------------------------- pages
 
 
 def _write_study(
@@ -123,7 +134,6 @@ def _write_study(
 ) -> list[str | Grid]:
     """Write a study's record, tables and report. Returns what a terminal shows of it."""
     from harness.engine.pictures import shown_in, study_example
-    from harness.engine.study_record import failed_by_point, record_of
     from harness.evaluation.study.record import record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.report.study_page import study_parts, write_study_report
@@ -134,46 +144,54 @@ def _write_study(
     if not study.set_ups:
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     write_text(folder / STUDY.name, record_text(study))
-    result = evaluate_study(study, tables, experiment.data, diameters_mm=_table_one_mm(experiment))
+    # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
+    targets = [cast("SimulatedSource", point.config.source).target for point in experiment.points]
+    drilled = any(isinstance(target, DrawnTargetConfig) and target.damage.kind != "dent" for target in targets)
+    diameters_mm = [size_in * INCH / MM for size_in in DIAMETERS_IN] if drilled else []
+    result = evaluate_study(study, tables, experiment.data, diameters_mm=diameters_mm)
     shown = list(shown_in(plan, result.limits))
     # of trials that were run on other machines the views may not be here
-    lost = render_missing((job for one in shown for job in one.batch.renders), engine)
+    lost = render_missing((job for damage in shown for job in damage.batch.renders), engine)
     outcome.failures += lost
-    examples = [study_example(one, outcome.thresholds) for one in shown if not lost]
+    examples = [study_example(damage, outcome.thresholds) for damage in shown if not lost]
+    write_tables(folder, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
     title = experiment.config.title or experiment.config.name
-    for table, rows in study_tables(result).items():
-        write_table(folder, table, table.frame(rows), origin_of(provenance))
     write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
     return study_parts(result)
 
 
-def _table_one_mm(experiment: Experiment) -> list[float]:
-    """The diameters of the thesis' holes, where any set-up's damage is drilled holes."""
-    targets = [cast("SimulatedSource", point.config.source).target for point in experiment.points]
-    drilled = any(isinstance(target, DrawnTargetConfig) and target.damage.kind != "dent" for target in targets)
-    return [size_in * INCH / MM for size_in in DIAMETERS_IN] if drilled else []
+def _write_report(
+    folder: Path, experiment: Experiment, outcome: Outcome, tables: ResultTables, provenance: dict[str, Any]
+) -> list[str | Grid]:
+    """Write the summaries and the report of what is no study. Returns what a terminal shows of it."""
+    from harness.report.page import write_report
+    from harness.report.sections import final_tables
+
+    write_tables(folder, summaries(tables, outcome.examples), provenance)
+    title = experiment.config.title or experiment.config.name
+    target = getattr(getattr(experiment.config.source, "target", None), "name", "")
+    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
+    return final_tables(tables)
 
 
-def _cache(out: Path) -> Path:
-    return out / ".cache" / "renders"
+# ---------------------------------------------------------------- failures, provenance
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     """Conclude a run without any result: the user's mistake is raised; a bug keeps its traceback (once) and gives 1."""
     name, detector = experiment.config.name, experiment.config.detector.name
     bug = next((failure for failure in outcome.failures if failure.is_bug), None)
-    if bug is None:
-        first = next((failure for failure in outcome.failures if failure.state != "skipped"), None)
-        alike = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
-        why = first.why if first is not None and len(alike) == 1 else _reasons(outcome)
-        what = "trial was judged" if outcome.finished else "trial succeeded"
-        old = not outcome.trials.done and any(failure.state != "skipped" for failure in outcome.failures)
-        again = "once that is mended, run the same command with --retry-failed: it runs these trials again"
-        raise UserError(f"no {what} of {name}: {why}", fix=again if old and "to do:" not in why else None)
-    print(bug.why, file=sys.stderr)
-    count = outcome.trials.failed
-    print(f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})", file=sys.stderr)
-    return 1
+    if bug is not None:
+        count = outcome.trials.failed
+        told = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
+        print(f"{bug.why}\n{told}", file=sys.stderr)
+        return 1
+    own = [failure for failure in outcome.failures if failure.state != "skipped"]
+    why = own[0].why if len({failure.in_short for failure in own}) == 1 else _reasons(outcome)
+    what = "trial was judged" if outcome.finished else "trial succeeded"
+    again = "once that is mended, run the same command with --retry-failed: it runs these trials again"
+    is_old = own and not outcome.trials.done and "to do:" not in why
+    raise UserError(f"no {what} of {name}: {why}", fix=again if is_old else None)
 
 
 def _reasons(outcome: Outcome) -> str:
@@ -182,28 +200,38 @@ def _reasons(outcome: Outcome) -> str:
     return "; ".join(sorted(own)[:3]) or "nothing was planned"
 
 
-def _counted(outcome: Outcome) -> str:
-    """The number of failures by state, as text; empty where all ended well."""
-    return ", ".join(f"{count} {state}" for state, count in _counts(outcome).items())
-
-
 def _counts(outcome: Outcome) -> dict[str, int]:
     """The number of failures by state."""
-    found = {state: sum(failure.state == state for failure in outcome.failures) for state in STATES}
-    return {state: count for state, count in found.items() if count}
+    counts = Counter(failure.state for failure in outcome.failures)
+    return {state: counts[state] for state in STATES if counts[state]}
+
+
+def _tell_failures(outcome: Outcome) -> None:
+    counts = _counts(outcome)
+    if counts:
+        said = ", ".join(f"{count} {state}" for state, count in counts.items())
+        print(f"{said}: {_reasons(outcome)}", file=sys.stderr)
+    if set(counts) - {"skipped"}:
+        print("the same command with --retry-failed runs again what failed, crashed or timed out", file=sys.stderr)
+    if "skipped" in counts:
+        print("the same command runs again what was skipped", file=sys.stderr)
 
 
 def _provenance(
-    experiment: Experiment,
-    plan: SweepPlan,
-    outcome: Outcome,
-    tables: ResultTables,
-    origin: dict[str, Any],
-    started: str,
+    experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any]
 ) -> dict[str, Any]:
-    """Everything that a reader needs to repeat the numbers or to doubt them."""
-    views = _views_of_set_ups(plan)
-    noise = _indirect_noise_mm(views)
+    """Everything that a reader needs to repeat the numbers or to doubt them. ``indirect_noise_mm``: of the renders."""
+    set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
+    paths = [path for group in set_ups or plan.groups[:1] for path in group.damaged.paths]
+    found = (read_view(path) for path in paths[:: -(-len(paths) // MOST_VIEWS)])
+    views = [view for view in found if view is not None]
+    noise: dict[str, float] = {}
+    for view in views:
+        for index, name in enumerate(view.surface_names):
+            here = view.surface == index
+            if here.any():
+                noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
+                noise[name] = max(noise.get(name, 0.0), noise_mm)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     return {
         "results_version": RESULTS_VERSION,
@@ -212,7 +240,6 @@ def _provenance(
         "digest": experiment.digest,
         "seed": experiment.config.seed,
         "mitsuba_variant": views[0].variant if views else None,
-        "started": started,
         "seconds": {
             "renders (not cached)": round(renders.seconds, 1),
             "frames (all workers, resumed trials too)": round(float(runs["seconds_frames"].sum()), 1),
@@ -229,81 +256,169 @@ def _provenance(
     }
 
 
-def _views_of_set_ups(plan: SweepPlan) -> list[NoiseFreeView]:
-    """The damaged views of all set-ups, variations left out."""
-    set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    jobs = [job for group in set_ups or plan.groups[:1] for job in group.damaged.renders]
-    views = (read_view(job.path) for job in jobs[:: -(-len(jobs) // MOST_VIEWS)])
-    return [view for view in views if view is not None]
+# ---------------------------------------------------------------- a study's record
 
 
-def _indirect_noise_mm(views: list[NoiseFreeView]) -> dict[str, float]:
-    """Monte Carlo noise of the renders: the median over each surface's pixels, the worst over set-ups."""
-    noise: dict[str, float] = {}
-    for view in views:
-        for index, name in enumerate(view.surface_names):
-            here = view.surface == index
-            if here.any():
-                median_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
-                noise[name] = max(noise.get(name, 0.0), median_mm)
-    return noise
+SIMULATION = ("scenes.sensor.source",)
+"""Modules that decide frames, with all that they import: a change of any makes frames count as different."""
+INSPECTED = {
+    "board": int, "hole": str, "repeat": int, "true_diameter_mm": float, "true_depth_mm": float, "true_x_mm": float,
+    "true_y_mm": float, "signal": float,
+}  # fmt: skip
+"""Columns of the holes' table that go into the record, without the word "true"."""
 
 
-def _write_report(
-    folder: Path, experiment: Experiment, outcome: Outcome, tables: ResultTables, provenance: dict[str, Any]
-) -> None:
-    for table, frame in summaries(tables, outcome.examples).items():
-        write_table(folder, table, frame, origin_of(provenance))
-    from harness.report.page import write_report
-
-    title = experiment.config.title or experiment.config.name
-    target = getattr(getattr(experiment.config.source, "target", None), "name", "")
-    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
-
-
-def _conclude(folder: Path, shown: list[str | Grid], outcome: Outcome) -> None:
-    """Print the final table, what did not end well, and where to look."""
-    show(shown)
-    _tell_failures(outcome)
-    print(f"report: {folder / REPORT.name}")
-
-
-def _tell_failures(outcome: Outcome) -> None:
-    if outcome.failures:
-        print(f"{_counted(outcome)}: {_reasons(outcome)}", file=sys.stderr)
-        counts = _counts(outcome)
-        if set(counts) - {"skipped"}:
-            print("the same command with --retry-failed runs again what failed, crashed or timed out", file=sys.stderr)
-        if "skipped" in counts:
-            print("the same command runs again what was skipped", file=sys.stderr)
+def record_of(
+    experiment: Experiment,
+    plan: SweepPlan,
+    tables: ResultTables,
+    failed: Mapping[str, int],
+    provenance: Mapping[str, Any],
+) -> StudyRecord:
+    """Return the record of a study. ``failed``: trials that raised, by point digest. Set-ups no trial of which ended
+    are left out, as nothing can be said of them."""
+    calibrate = experiment.config.threshold.calibrate
+    found = {point.digest: group for group in plan.groups for point in group.points}
+    set_ups = (_set_up(point, found[point.digest], tables, failed.get(point.digest, 0)) for point in experiment.points)
+    return StudyRecord(
+        name=experiment.config.name,
+        digest=experiment.digest,
+        hit_radius_mm=experiment.config.matching.radius_mm,
+        false_calls_per_m2=None if calibrate is None else calibrate.false_calls_per_m2,
+        provenance={key: provenance[key] for key in ("commit", "dirty", "versions", "seed", "command")},
+        set_ups=tuple(one for one in set_ups if one is not None),
+    )
 
 
-def _conclude_shard(folder: Path, outcome: Outcome, options: EngineOptions) -> int:
-    """Print the work of a shard, and the next step."""
-    trials = outcome.trials
-    print(f"shard {options.shard}: {trials.done} trials done, {trials.found} found, {trials.failed} not ended well")
-    _tell_failures(outcome)
-    print(f"journal: {folder / 'journal'}")
-    print("when all shards have run: python -m harness.merge, then the same command without --shard")
-    return 1 if outcome.failures else 0
+def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> SetUpRecord | None:
+    config = point.config
+    frames = config.capture.frames
+
+    def own(table: pd.DataFrame) -> pd.DataFrame:
+        return table if table.empty else table[(table["variant"] == point.variant) & (table["frames"] == frames)]
+
+    holes, runs = own(tables.holes), own(tables.runs)
+    if holes.empty:
+        return None
+    judged, calibrating = runs[runs["threshold"].notna()], runs[runs["role"] == "calibration"]
+    threshold = float(judged["threshold"].iloc[0])
+    boards = [batch.set_ups[0].target for batch in group.then if batch.role == "damaged"]
+    targets = [[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards]
+    renders = (path.stem for batch in group.then for path in batch.paths)
+    by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
+    unflawed = judged[judged["role"] == "hole_free"]
+    no_return = unflawed["no_return_calls"].to_numpy(int)
+    loudest = calibrating[calibrating["quiet_threshold"].notna()]  # runs that judged no pixel are left out
+    return SetUpRecord(
+        variant=point.variant,
+        frames=frames,
+        axes=dict(point.axes),
+        detector=config.detector.name,
+        detector_version=detector_version(config),
+        threshold=threshold,
+        threshold_mm=threshold * float(judged["scale_mm"].mean()),
+        calibration_runs=len(calibrating),
+        failed=failed,
+        # the damage and the size of every damaged board, wherever and before whichever camera it stands
+        targets_digest=digest(targets),
+        # equal where every frame of every judged board is
+        frames_digest=digest(
+            [source_digest(SIMULATION, PACKAGES), *renders, point.frames_key, config.capture.to_data(), config.repeats]
+        ),
+        inspected=Inspected(
+            **{name.removeprefix("true_"): holes[name].to_numpy(kind) for name, kind in INSPECTED.items()},
+            hit=by_depth | by_no_return,
+            by_depth=by_depth,
+            by_no_return=by_no_return,
+        ),
+        unflawed=Unflawed(
+            board=unflawed["board"].to_numpy(int),
+            repeat=unflawed["repeat"].to_numpy(int),
+            calls=unflawed["false_calls"].to_numpy(int) + no_return,
+            area_m2=unflawed["inspected_m2"].to_numpy(float),
+            no_return_calls=no_return,
+        ),
+        calibrated=None
+        if loudest.empty
+        else Calibrated(
+            board=loudest["board"].to_numpy(int),
+            repeat=loudest["repeat"].to_numpy(int),
+            score=loudest["quiet_threshold"].to_numpy(float),
+            x_mm=loudest["loudest_x_mm"].to_numpy(float),
+            y_mm=loudest["loudest_y_mm"].to_numpy(float),
+        ),
+    )
 
 
-def _final_table(tables: ResultTables) -> list[str | Grid]:
-    """Return the terminal's summary at the end, by the kind of experiment."""
-    from harness.evaluation.maps import compare_maps
-    from harness.evaluation.set_ups import compare_set_ups, set_ups_of
-    from harness.evaluation.summary import summarise_holes
-    from harness.report import terminal
-    from harness.report.perspectives import Ways
-    from harness.report.set_ups import Layout
+def failed_by_point(plan: SweepPlan, whats: Iterable[str], thresholds: Mapping[str, float]) -> Counter[str]:
+    """Count the trials of each point that raised, from the journal keys of failures."""
+    keys, counts = set(whats), Counter[str]()
+    for group in plan.groups if keys else ():
+        for batch in group.batches:
+            for key, task in group.trials(batch, {} if batch in group.first else thresholds):
+                counts.update(asked.digest for asked in task.points if key in keys)
+    return counts
 
-    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
-    if not tables.registrations.empty:
-        compared = compare_maps(tables, summary)
-        ways = Ways.of(tables, compared)
-        return [terminal.maps_grid(compared, ways)]
-    if len(set_ups_of(tables)) > 1:
-        compared = compare_set_ups(tables, summary, set_ups_of(tables))
-        layout = Layout.of(tables, compared)
-        return [terminal.set_ups_grid(compared, layout)]
-    return [terminal.holes_grid(summary)]
+
+# ---------------------------------------------------------------- real captures
+
+
+def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: bool) -> int:
+    """Judge every point's capture once and write its findings to ``<folder>/<number>/``, and a table of all points.
+
+    A capture has no repeats and no truth, so rates, sizes against the truth and claims are not given. Returns 0.
+    """
+    folder = experiment.folder(out)
+    if dry_run:
+        print(f"{experiment.config.name}: valid; {len(experiment.points)} points of a real capture; results: {folder}")
+        return 0
+    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
+    rows = []
+    for number, point in enumerate(experiment.points):
+        judged, threshold, choice = _judged(point)
+        cloud, name = judged.cloud, f"point-{number:03d}"
+        about = {
+            "target": choice_facts(choice),
+            "capture": {
+                "frames_used": cloud.n_frames,
+                "frames_left_out": [{"name": left.name, "why": left.why} for left in cloud.left_out],
+            },
+            "threshold": {"k": threshold, "from": "given"},
+            "settings": point.config.to_data(),
+            "provenance": record(command),
+        }
+        write_findings(folder / name, judged, about, point.label or name, beside=pictures(choice))
+        threshold_mm = threshold * judged.evidence.scale_m / MM
+        rows.append(
+            {
+                "point": name,
+                "variant": point.variant,
+                "what": point.label,
+                "frames_used": cloud.n_frames,
+                "frames_left_out": len(cloud.left_out),
+                "threshold_k": threshold,
+                "threshold_mm": round(threshold_mm, 4),
+                "findings": len(judged.findings),
+            }
+        )
+        warnings = (*(choice.warnings if choice else ()), *judged.evidence.warnings)
+        print_warnings(f"{name}: {warning}" for warning in warnings)
+        print(f"{name} {point.label}: {len(judged.findings)} findings beyond {threshold_mm:.2f} mm")
+        for left in cloud.left_out:
+            print(f"  left out: {left.name}: {left.why}")
+    write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
+    point_to(folder)
+    print(f"findings: {folder}")
+    return 0
+
+
+def _judged(point: Point) -> tuple[Judged, float, Choice | None]:
+    config = point.config
+    assert isinstance(config.source, CaptureSource)
+    frames = config.capture.frames
+    cloud = prefix_averages(recording_of(config.source), [frames], config.capture.average)[frames]
+    detector = load_detector(config.detector.name, dict(config.detector.settings))
+    choice = choice_by(getattr(detector, "settings", None), cloud)
+    threshold = config.threshold.k
+    assert threshold is not None  # a capture cannot be calibrated on; the experiment's checks say so
+    return judged_cloud(detector, cloud, detector.analyse(cloud), threshold), threshold, choice

@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from harness.engine.walls import wall_rows
-from harness.evaluation.maps import compare_maps, map_cases, maps_of
-from harness.evaluation.noise import noise_against_frames
-from harness.evaluation.registration import by_views
+from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
+from harness.evaluation.profile import shadowed_shares
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
-from harness.evaluation.summary import false_calls, summarise_holes
-from harness.experiment.points import MAIN, Experiment, Point
-from harness.experiment.schema import LabelledVariation
+from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
+from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point, SimulatedSource
 from harness.experiment.unfold import FRAMES
 from harness.tables.schema import Table, write_table
 from harness.tables.trials import (
@@ -36,149 +34,107 @@ from harness.tables.trials import (
     TRIALS,
     ResultTables,
 )
+from harness.vocabulary.geometry import MM, invert, transform_points
 from harness.vocabulary.path_names import names_of, unit_of
-from harness.vocabulary.units import MM
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.provenance import RESULTS_VERSION
+from scenes.perspectives import poses_of
+from scenes.sensor.camera import camera_of
+from scenes.target.truth import truth_of
 
 RECORDED = {"holes": TRIALS, "runs": RUNS, "noise": NOISE, "registrations": REGISTRATIONS}
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
 OF_STUDY = {table.name: table for table in STUDY_ONLY}
-
-ROWS_AT_ONCE = 2000
-"""Rows that are held as mappings, some 3 MB, before they become a frame."""
-UNKNOWN = np.iinfo(np.int32).min
-"""Stands among whole numbers for a value that is not known."""
-PIXELS_AT_ONCE = 64
+RECORDS_AT_ONCE = 100  # records that are held as mappings before they become frames, which take a tenth of the memory
+UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that is not known
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> ResultTables:
     """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
     every axis is a column of all tables but those of a study alone."""
-    collected = {name: _Rows() for name in (*RECORDED, *OF_STUDY)}
+    frames: dict[str, list[pd.DataFrame]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     probes: list[dict[str, Any]] = []
-    for record in records:
-        for row in record.get("probes", ()):
+    waiting = iter(records)
+    while chunk := list(islice(waiting, RECORDS_AT_ONCE)):
+        for row in (row for record in chunk for row in record.get("probes", ())):
             errors = np.array([UNKNOWN if value is None else value for value in row["error_tenth_um"]], np.int32)
             probes.append({**row, "error_tenth_um": errors})
-        for name, rows in collected.items():
-            rows.add(record.get(name, ()))
+        for name, made in frames.items():
+            rows = [row for record in chunk for row in record.get(name, ())]
+            if rows:
+                made.append(_frame(rows))
     paths = list(experiment.points[0].axes)
     names = names_of(paths)
-    axes = pd.DataFrame(
-        [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths],
-        columns=["path", "name", "unit"],
-    )
+    said = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
+    axes = pd.DataFrame(said, columns=["path", "name", "unit"])
     variants = _variants(experiment)
     placed = variants.set_index("variant")[paths]
 
     def with_axes(table: pd.DataFrame) -> pd.DataFrame:
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
-    ordered = {name: with_axes(_ordered(collected[name].table(), table)) for name, table in RECORDED.items()}
-    of_study = {name: _ordered(collected[name].table(), table) for name, table in OF_STUDY.items()}
-    walls = wall_rows(experiment) if experiment.config.study is None else pd.DataFrame()
+    def ordered(name: str, declared: Table) -> pd.DataFrame:
+        if not frames[name]:
+            return pd.DataFrame()
+        table = pd.concat(frames.pop(name), ignore_index=True)
+        order = [column for column in declared.order if column in table]
+        return table.sort_values(order, kind="stable", ignore_index=True)
+
+    walls = _walls(experiment) if experiment.config.study is None else pd.DataFrame()
     return ResultTables(
-        **ordered, **of_study, probes=with_axes(_probes(probes)), variants=variants, axes=axes, walls=walls
+        **{name: with_axes(ordered(name, table)) for name, table in RECORDED.items()},
+        **{name: ordered(name, table) for name, table in OF_STUDY.items()},
+        probes=with_axes(_probes(probes)),
+        variants=variants,
+        axes=axes,
+        walls=walls,
     )
 
 
-class _Rows:
-    """Rows on their way into a table: a row as a mapping takes ten times the memory that it takes in a frame."""
-
-    def __init__(self) -> None:
-        self._frames: list[pd.DataFrame] = []
-        self._rows: list[Mapping[str, Any]] = []
-
-    def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Some more rows."""
-        self._rows.extend(rows)
-        if len(self._rows) >= ROWS_AT_ONCE:
-            self._flush()
-
-    def table(self) -> pd.DataFrame:
-        """All rows; nothing is left here."""
-        self._flush()
-        frames, self._frames = self._frames, []
-        return pd.concat(frames, ignore_index=True) if len(frames) > 1 else frames[0]
-
-    def _flush(self) -> None:
-        if self._rows or not self._frames:
-            frame = pd.DataFrame(_one_a_threshold(self._rows))
-            for column in [name for name in frame.columns if frame[name].dtype == object]:
-                # each word once: every record brings its own copy
-                frame[column] = [sys.intern(value) if type(value) is str else value for value in frame[column]]
-            self._frames.append(frame)
-        self._rows = []
-
-
-def _one_a_threshold(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Rows with lists over thresholds, as one row for each threshold."""
-    if not rows or not isinstance(rows[0].get("threshold"), list):
-        return rows
-    lists = [name for name, value in rows[0].items() if isinstance(value, list)]
-    return [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
-
-
-def _ordered(table: pd.DataFrame, declared: Table) -> pd.DataFrame:
-    """The rows in the declared order; columns that JSON filled with None hold numbers with NaN."""
-    order = [name for name in declared.order if name in table]
-    table = table if table.empty else table.sort_values(order, kind="stable", ignore_index=True)
-    for column in table.columns:
-        if table[column].dtype == object and not table[column].map(lambda v: isinstance(v, str)).any():
-            table[column] = table[column].astype(float)
-    return table
+def _frame(rows: list[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as a frame: those with lists over thresholds as one row for each threshold; columns that JSON filled with
+    None hold numbers with NaN."""
+    if isinstance(rows[0].get("threshold"), list):
+        lists = [name for name, value in rows[0].items() if isinstance(value, list)]
+        rows = [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
+    frame = pd.DataFrame(rows)
+    for column in [name for name in frame if frame[name].dtype == object]:
+        if frame[column].map(lambda value: isinstance(value, str)).any():
+            # each word once: every record brings its own copy
+            frame[column] = [sys.intern(value) if type(value) is str else value for value in frame[column]]
+        else:
+            frame[column] = frame[column].astype(float)
+    return frame
 
 
 def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """Mean error and temporal deviation of each probe over the hole-free repeats, and how clouds move as a whole.
-
-    A frame that jumps moves its whole cloud, which no detector on a fitted surface notices; what a repeat's median
-    error differs from the median repeat's is told as ``displacement_std_mm`` and taken out of the other two.
-    """
-    grouped: dict[tuple[str, int], list[list[Any]]] = {}
-    for row in sorted(rows, key=lambda r: (r["variant"], r["frames"], r["repeat"])):
+    """Mean error and temporal deviation of each probe over the hole-free repeats; what a repeat's median error differs
+    from the median repeat's is told as ``displacement_std_mm`` and taken out of the other two."""
+    grouped: dict[tuple[str, int], list[np.ndarray]] = {}
+    for row in sorted(rows, key=lambda row: (row["variant"], row["frames"], row["repeat"])):
         grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])
     tables = []
     for (variant, frames), errors in grouped.items():
         tenth_um = np.array(errors)
-        displacement = _displacements(tenth_um)
-        mean, std = np.empty((2, tenth_um.shape[1]))
-        for pixels in np.array_split(np.arange(tenth_um.shape[1]), -(-tenth_um.shape[1] // PIXELS_AT_ONCE) or 1):
-            mm = _in_mm(tenth_um[:, pixels]) - displacement[:, None]
-            mean[pixels] = mm.mean(axis=0)
-            with np.errstate(invalid="ignore"):
-                std[pixels] = mm.std(axis=0, ddof=1) if len(mm) > 1 else np.nan
-        tables.append(
-            pd.DataFrame(
-                {
-                    "variant": variant,
-                    "frames": frames,
-                    "pixel": np.arange(tenth_um.shape[1]),
-                    "mean_error_mm": mean,
-                    "temporal_std_mm": std,
-                    "displacement_std_mm": displacement.std(ddof=1) if len(displacement) > 1 else np.nan,
-                    "repeats": len(displacement),
-                }
-            )
-        )
-    columns = [column.name for column in PROBES.columns]
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
-
-
-def _in_mm(tenth_um: np.ndarray) -> np.ndarray:
-    """Errors in mm; NaN where they are not known."""
-    return np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
-
-
-def _displacements(tenth_um: np.ndarray) -> np.ndarray:
-    """(repeats,) mm: each repeat's median error over the probes, less the median repeat's; 0 where none is known."""
-    known = (tenth_um != UNKNOWN).any(axis=1)
-    medians = np.zeros(len(tenth_um))
-    for repeat in np.flatnonzero(known):
-        medians[repeat] = np.nanmedian(_in_mm(tenth_um[repeat]))
-    if known.any():
-        medians[known] -= np.median(medians[known])
-    return medians
+        mm = np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
+        known = np.isfinite(mm).any(axis=1)
+        displacement = np.zeros(len(mm))
+        if known.any():
+            displacement[known] = np.nanmedian(mm[known], axis=1)
+            displacement[known] -= np.median(displacement[known])
+        mm -= displacement[:, None]
+        several = len(mm) > 1
+        columns = {
+            "variant": variant,
+            "frames": frames,
+            "pixel": np.arange(mm.shape[1]),
+            "mean_error_mm": mm.mean(axis=0),
+            "temporal_std_mm": mm.std(axis=0, ddof=1) if several else np.nan,
+            "displacement_std_mm": displacement.std(ddof=1) if several else np.nan,
+            "repeats": len(mm),
+        }
+        tables.append(pd.DataFrame(columns))
+    empty = pd.DataFrame(columns=[column.name for column in PROBES.columns])
+    return pd.concat(tables, ignore_index=True) if tables else empty
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
@@ -186,11 +142,9 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:
-        if point.variant in seen:
-            continue
         values = {k: v for k, v in point.values.items() if k != FRAMES}
         switches = values.get(experiment.config.switches or "")
-        seen[point.variant] = {
+        row = {
             "variant": point.variant,
             "reason": _reason(experiment, point),
             "settings": "" if point.variant == MAIN else json.dumps(values, sort_keys=True),
@@ -199,6 +153,7 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
             "switches": json.dumps(switches) if switches and not point.is_variation else "",
             **point.axes,
         }
+        seen.setdefault(point.variant, row)
     columns = ["variant", "reason", "settings", "is_variation", "reference", "switches", *paths]
     table = pd.DataFrame(list(seen.values()), columns=columns)
     for path in paths:
@@ -215,10 +170,8 @@ def _text(value: Any) -> str:
 def _reason(experiment: Experiment, point: Point) -> str:
     """The reason that the experiment's file gives for a variation; empty for its set-ups."""
     study = experiment.config.sensitivity
-    if study is None or not point.is_variation:
-        return ""
     changed = set(point.values) - {FRAMES}
-    for variation in study.vary:
+    for variation in study.vary if study is not None and point.is_variation else ():
         if isinstance(variation, LabelledVariation):
             named = variation.label == point.variant
         else:
@@ -228,27 +181,44 @@ def _reason(experiment: Experiment, point: Point) -> str:
     return ""
 
 
+def _walls(experiment: Experiment) -> pd.DataFrame:
+    """The share of each hole's wall that no view sees in light, by number of views of the experiment's own set-ups
+    (columns: `harness.evaluation.profile`); empty where it has no views."""
+    set_ups = [point.config for point in experiment.points if not point.is_variation]
+    mappings = [config.mapping for config in set_ups if config.mapping is not None]
+    if not mappings:
+        return pd.DataFrame()
+    source = next(config.source for config in set_ups if config.mapping is not None)
+    assert isinstance(source, SimulatedSource)
+    assert source.views is not None
+    target, emitter_m = source.target.declare(), camera_of(source.camera).optics.emitter_m
+    boards = [invert(pose.T_camera_board) for pose in poses_of(source.views, target.pose)]
+    counts = sorted({mapping.views or len(boards) for mapping in mappings})
+    lenses = np.array([T_board_camera[:3, 3] for T_board_camera in boards])
+    emitters = np.array([transform_points(T_board_camera, emitter_m) for T_board_camera in boards])
+    rows = []
+    for damage in truth_of(target, invert(boards[0])):
+        if damage.kind != "dent":
+            mouth = (damage.centre_board_m, damage.diameter_m, damage.depth_m)
+            shares = shadowed_shares(lenses, emitters, *mouth, counts)
+            rows += [{"hole": str(damage.id), **row} for row in shares]
+    return pd.DataFrame(rows)
+
+
 # ---------------------------------------------------------------- files
 
 
-def origin_of(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what stands in the schema of every Parquet file."""
+def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance: Mapping[str, Any]) -> None:
+    """Write tables, with what names the run in the schema of every Parquet file."""
     keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")
-    return {key: provenance[key] for key in keys}
-
-
-def write_tables(folder: Path, tables: ResultTables, provenance: Mapping[str, Any]) -> None:
-    """Write the tables of trials."""
-    for table, frame in tables.stored().items():
-        write_table(folder, table, frame, origin_of(provenance))
+    for table, frame in tables.items():
+        write_table(folder, table, frame, {key: provenance[key] for key in keys})
 
 
 def summaries(tables: ResultTables, examples: Sequence[Any] = ()) -> dict[Table, pd.DataFrame]:
     """Return the summaries of an experiment that is no study: all that its page shows. ``examples``: pictures that
     claims are scored with."""
-    from harness.thesis.cameras import claim_c11
-    from harness.thesis.claims import score_claims
-    from harness.thesis.verdicts import claims_table
+    from harness.thesis.claims import claim_c11, claims_table, score_claims
     from harness.thesis.views import score_views
 
     paths, variants = list(tables.axes["path"]), set_ups_of(tables)

@@ -1,33 +1,314 @@
 """One trial: frames of one set-up, their averages, the maps made of them, every detector that asked for them, measured
-against the truth."""
+against the truth.
+
+Averages are drawn at once where that is equal in distribution (plain means of at least `FEWEST_FRAMES` frames, where
+the camera's model can), from single frames otherwise. Frames that jump as a whole are left out as `detectors.average`
+leaves them out: its verdict hangs on how far each frame is displaced, which is known exactly here. Where a verdict
+might go either way, by the pixels' noise, the frames are drawn one by one.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
 from itertools import islice
-from typing import Any, Literal
+from operator import add
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
+from scipy import special
 
-from detectors.average import AverageConfig
+from detectors.average import CORRELATED_PIXELS, REFERENCE_FRAMES, SAMPLED_PIXELS, AverageConfig, prefix_averages
+from detectors.mapping.merge import Merged, merge, prepare
 from detectors.mapping.settings import MappingConfig
-from harness.engine.averages import averages_of
-from harness.engine.judge import STUDY_TABLES, PointRows, judge, study_rows
-from harness.engine.maps import MapMaker
-from harness.engine.setup import KnownCloud, SetUp, SetUpRef, face_errors_m, known_view, load_set_up
-from harness.vocabulary.capture import Cloud
+from detectors.registration.register import register
+from detectors.registration.registered import Registration, predicted_error_m
+from detectors.registration.settings import PAIRWISE
+from detectors.views import PreparedView, View
+from harness.engine.judge import STUDY_TABLES, Rows, judge, study_rows
+from harness.engine.setup import KnownCloud, SetUp, SetUpRef, face_errors_m, known_map, known_view, load_set_up
+from harness.vocabulary.geometry import MM, Cloud, LeftOut, invert, transform_points
 from harness.vocabulary.seeds import canonical_json
-from harness.vocabulary.units import MM
-from scenes.perspectives import AnyViews
+from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
+from scenes.sensor.amcw.at_once import AtOnce
 from scenes.sensor.source import SimulatedCapture
+from scenes.sensor.unit import FrameTotals
+
+FEWEST_FRAMES = 20
+"""Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
+and 25 of one with holes before a far wall. By number only, so that no result hangs on what was sorted before."""
+SURE = 5.0
+"""Standard errors by which a frame's displacement keeps from a limit of the judge, so that noise cannot decide; fewer
+than `AverageConfig.jump_sigmas`, or no frame of a noisy camera would."""
+MOST_DISTURBED = 0.5
+"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb. A frame's own share scatters about
+the mean by a thousandth, and the judge allows 1.5 times what it finds usual on top."""
+
+
+def averages_of(
+    capture: SimulatedCapture, counts: Sequence[int], config: AverageConfig, exact: bool
+) -> dict[int, Cloud]:
+    """Return averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
+    `detectors.average.prefix_averages`, which is used (and raises) where ``exact`` or nothing else will do. Averages
+    drawn at once nest, and so do those drawn frame by frame; the two kinds have noise of their own."""
+    many = sorted({n for n in counts if n >= FEWEST_FRAMES})
+    clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
+    rest = [n for n in counts if n not in clouds]
+    return clouds | (prefix_averages(capture, rest, config) if rest or not counts else {})
+
+
+def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
+    """The averages that can be drawn at once."""
+    summer = capture.unit.at_once
+    if summer is None or counts[-1] > capture.n_frames:
+        return {}
+    # one frame's noise as the judge finds it: with its rounding
+    noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
+    verdicts = {n: _verdict(capture, summer, n, config, noise_m) for n in counts}
+    judged = {n: verdict for n, verdict in verdicts.items() if verdict is not None}
+    # frames that every average takes or leaves together, as the first of their numbers and their sums
+    most = max(judged, default=0)
+    used = np.array([[number < n and bool(kept[number]) for n, (kept, _) in judged.items()] for number in range(most)])
+    parts = []
+    for pattern in np.unique(used, axis=0) if most else ():
+        frames = np.flatnonzero((used == pattern).all(axis=1))
+        totals = capture.totals(frames) if pattern.any() else None
+        if pattern.any() and totals is None:
+            return {}
+        if totals is not None:
+            parts.append((frames[0], totals))
+    clouds: dict[int, Cloud] = {}
+    for n, (kept, left_out) in judged.items():
+        together = [totals for first, totals in parts if first < n and kept[first]]
+        cloud = _cloud(capture, reduce(add, together), left_out) if together else None
+        if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
+            clouds[n] = cloud
+    return clouds
+
+
+def _verdict(
+    capture: SimulatedCapture, summer: AtOnce, n: int, config: AverageConfig, noise_m: float
+) -> tuple[np.ndarray, tuple[LeftOut, ...]] | None:
+    """The judgement of `detectors.average` on the first n frames: (n,) bool, those that are used, and those left out;
+    None where the pixels' noise might decide."""
+    shift_m = summer.z_by_error * capture.errors_m[:n]
+    if not config.judge_frames:
+        return np.ones(n, bool), ()
+    if summer.sure_pixels == 0:
+        return None
+    sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
+    error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
+    limit_m, slack_m = max(config.jump_sigmas * error_m, config.jump_mm * MM), SURE * error_m
+    # displacement of the reference that the first frames make
+    first_m = shift_m[:REFERENCE_FRAMES]
+    apart = np.abs(first_m[:, None] - first_m)
+    middle = np.sort(apart, axis=1)[:, len(first_m) // 2]
+    nearest = int(np.argmin(middle))
+    # two frames are each as far from the other, and the first is taken; of more, the middle one must have company
+    if (np.abs(apart - limit_m) < slack_m).any() or (len(first_m) > 2 and middle[nearest] > limit_m):
+        return None
+    agreeing = first_m[apart[nearest] <= limit_m]
+    reference_m = float(np.median(agreeing)) if len(agreeing) > 2 else float(first_m[nearest])
+    off_m = np.abs(shift_m - reference_m)
+    if (np.abs(off_m - limit_m) < slack_m).any():
+        return None
+    against = f"the first {min(n, REFERENCE_FRAMES)} frames" if n > 2 else "the first frame"
+    left_out = tuple(
+        LeftOut(
+            f"frame {number}",
+            f"the whole range jumps by {(shift_m[number] - reference_m) / MM:+.1f} mm against {against}"
+            f" (allowed {limit_m / MM:.1f} mm)",
+        )
+        for number in np.flatnonzero(off_m > limit_m)
+    )
+    return off_m <= limit_m, left_out
+
+
+def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
+    """Return whether frames may be left out because many of their pixels lose their range or change."""
+    judged = 2 * cloud.count > cloud.n_frames
+    if not judged.any():
+        return True
+    change_m = max(config.changed_sigmas * noise_m, config.changed_mm * MM)
+    lost = 1 - cloud.count[judged].mean() / cloud.n_frames
+    # below a quarter of the change, 6 in 100,000 do
+    loud = judged & (cloud.variance_m2 > (change_m / 4) ** 2)
+    changed = special.erfc(change_m / np.sqrt(2 * cloud.variance_m2[loud])).sum() / judged.sum()
+    return bool(lost + changed > MOST_DISTURBED * config.disturbed_fraction)
+
+
+def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]) -> Cloud | None:
+    """The average that the sums make, as `detectors.average` makes it; None where no pixel has a range."""
+    count = totals.count
+    if not count.any():
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = totals.total / count
+        z_m = (totals.base + mean) * totals.step_m
+        variance = (totals.squares - totals.total * mean) / (count - 1)
+        amplitude = totals.amplitude / count
+    return Cloud(
+        points_m=np.concatenate([capture.slopes * z_m[..., None], z_m[..., None]], axis=-1),
+        reason=np.where(count == 0, np.argmax(totals.reasons, axis=0), 0).astype(np.uint8),
+        count=count,
+        variance_m2=np.where(count > 1, np.maximum(variance, 0.0) * totals.step_m**2, np.nan),
+        region=capture.region,
+        z_step_m=capture.z_step_m,
+        n_frames=totals.frames,
+        organised=capture.organised,
+        lens=capture.lens,
+        rgb=capture.unit.rgb,
+        amplitude=amplitude,
+        left_out=left_out,
+    )
+
+
+# ---------------------------------------------------------------- maps
+
+
+Made = TypeVar("Made")
+BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
+
+
+class MapMaker:
+    """Maps of one trial: ``clouds`` by view, then by number of frames. ``poses``: the views' declaration; ``labels`` of
+    this trial's random errors of the poses. ``truth`` and ``guesses``: T_reference_view."""
+
+    def __init__(
+        self,
+        set_ups: Sequence[SetUp],
+        clouds: Sequence[Mapping[int, Cloud]],
+        poses: AnyViews,
+        labels: Sequence[str | int],
+    ) -> None:
+        self._set_ups, self._clouds = set_ups, clouds
+        self._made: dict[str, Any] = {}
+        self._told: set[str] = set()
+        stands, numbers = tuple(set_up.target.pose for set_up in set_ups), range(len(set_ups))
+        self.truth = tuple(T_reference_view_of(stands, number) for number in numbers)
+        self.guesses = tuple(guessed_T_reference_view(poses, stands, number, *labels) for number in numbers)
+
+    def count(self, mapping: MappingConfig) -> int:
+        """Return the number of views that a mapping uses."""
+        return mapping.views or len(self._set_ups)
+
+    def key(self, mapping: MappingConfig, frames: int) -> str:
+        """Return a text that is equal for mappings that make the same map."""
+        return canonical_json([self._registration_key(mapping, frames), mapping.merge.to_data()])
+
+    def known(self, mapping: MappingConfig, frames: int, *, hole_free: bool) -> KnownCloud:
+        """Return the map with the truth on it."""
+        merged = self.merged(mapping, frames)
+        return known_map(self._set_ups[0], merged.cloud, merged.T_reference_cloud, hole_free=hole_free)
+
+    def merged(self, mapping: MappingConfig, frames: int) -> Merged:
+        """Return the map."""
+
+        def make() -> Merged:
+            return merge(self.prepared(mapping, frames), self.registrations(mapping, frames), mapping.merge)
+
+        return self._once(make, "merged", self.key(mapping, frames))
+
+    def prepared(self, mapping: MappingConfig, frames: int, count: int | None = None) -> tuple[PreparedView, ...]:
+        """Return the views with their targets cut out and their marks found."""
+
+        def make() -> PreparedView:
+            return prepare(View(f"view {number}", self._clouds[number][frames], self.guesses[number]), mapping)
+
+        key, found = (frames, mapping.crop.to_data(), mapping.marks.to_data()), []
+        for number in range(self.count(mapping) if count is None else count):
+            found.append(self._once(make, "prepared", number, *key))
+        return tuple(found)
+
+    def registrations(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
+        """Return a registration for each view."""
+        count, key = self.count(mapping), self._registration_key(mapping, frames)
+        if mapping.registration.method in PAIRWISE:
+            most = sum(frames in clouds for clouds in self._clouds)
+            parts = [frames, mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
+            key, count = canonical_json(parts), max(most, count)
+        views = self.prepared(mapping, frames, count)
+        return self._once(lambda: register(views, mapping.registration), "registered", key)[: self.count(mapping)]
+
+    def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
+        """Return a row for each view but the first, once for each registration (columns: `REGISTRATIONS`)."""
+        key = self._registration_key(mapping, frames)
+        if key in self._told or self.count(mapping) == 1:
+            return []
+        self._told.add(key)
+        found = zip(self.prepared(mapping, frames), self.registrations(mapping, frames), strict=True)
+        return [self._row(number, view, registration) for number, (view, registration) in enumerate(found) if number]
+
+    def seconds(self, mapping: MappingConfig, frames: int) -> float:
+        """Return the seconds that registering and merging took, whether for this point or for one that shares it."""
+        spent = sum(registration.seconds for registration in self.registrations(mapping, frames))
+        return float(spent + self.merged(mapping, frames).seconds)
+
+    def _registration_key(self, mapping: MappingConfig, frames: int) -> str:
+        count = self.count(mapping)
+        registration = mapping.registration.to_data() if count > 1 else None
+        return canonical_json([count, frames, mapping.crop.to_data(), mapping.marks.to_data(), registration])
+
+    def _once(self, make: Callable[[], Made], *key: Any) -> Made:
+        name = canonical_json(key)
+        if name not in self._made:
+            self._made[name] = make()
+        return cast("Made", self._made[name])
+
+    def _row(self, number: int, view: PreparedView, registration: Registration) -> dict[str, Any]:
+        first = self._set_ups[0]
+        board, T_camera_board = first.target.board, first.T_camera_board
+        x, y = (np.linspace(-0.5, 0.5, BOARD_STEPS) * side * MM for side in (board.width_mm, board.height_mm))
+        grid = np.stack([*np.meshgrid(x, y), np.zeros((BOARD_STEPS, BOARD_STEPS))], axis=-1).reshape(-1, 3)
+        places_m, normal = transform_points(T_camera_board, grid), T_camera_board[:3, 2]
+        (in_plane, across), guessed = (
+            registration_error_m(T, self.truth[number], places_m, normal)
+            for T in (registration.T_reference_view, self.guesses[number])
+        )
+        predicted = predicted_error_m(registration, places_m, normal)
+        return {
+            "view": number,
+            "method": registration.method,
+            "tre_mm": float(np.hypot(in_plane, across)) / MM,
+            "tre_in_plane_mm": in_plane / MM,
+            "tre_across_mm": across / MM,
+            "predicted_in_plane_mm": predicted[0] / MM,
+            "predicted_across_mm": predicted[1] / MM,
+            "guess_tre_mm": float(np.hypot(*guessed)) / MM,
+            "residual_mm": registration.residual_m / MM,
+            "overlap": registration.overlap,
+            "pairs": registration.pairs,
+            "marks": len(view.marks.trusted),
+            "iterations": registration.iterations,
+            "converged": registration.converged,
+            "seconds": registration.seconds,
+            "failure": registration.failure,
+        }
+
+
+def registration_error_m(
+    T_reference_view: np.ndarray, true_T_reference_view: np.ndarray, points_m: np.ndarray, normal: np.ndarray
+) -> tuple[float, float]:
+    """Return the root mean square target registration error against the true poses over points (n, 3) of the reference
+    frame, metres: in the plane across ``normal`` (3,), and along it (Fitzpatrick, West and Maurer 1998). An error that
+    a whole view shares counts: of a camera that ranges d too far, under an angle a, d sin(a) in the plane."""
+    moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
+    across = moved @ normal
+    in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
+    return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
+
+
+# ---------------------------------------------------------------- trials
+
 
 Role = Literal["calibration", "hole_free", "damaged"]
 """The purpose of a trial's target. Only in a study do boards that set a threshold ("calibration") differ from those on
 which false calls are counted at it ("hole_free")."""
-Record = dict[str, list[dict[str, Any]]]
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
+LAGS = (1, 2, 3)  # distances in pixels at which the noise's correlation is taken
+FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its standard error would exceed 0.14
 
 
 @dataclass(frozen=True)
@@ -59,131 +340,122 @@ class TrialTask:
     poses: AnyViews | None = None
     board: int | None = None
 
+    @property
+    def hole_free(self) -> bool:
+        """Return whether the target is shown without damage."""
+        return self.role != "damaged"
 
-def run_trial(task: TrialTask) -> Record:
+    @property
+    def labels(self) -> tuple[str | int, ...]:
+        """Labels that separate the random streams of trials, and of a study's boards."""
+        return (self.role, self.repeat) if self.board is None else (self.role, self.repeat, "board", self.board)
+
+
+def run_trial(task: TrialTask) -> Rows:
     """Run one trial; rows for the tables of `TABLES` (columns: `harness.engine.tables`)."""
     set_ups = [load_set_up(ref) for ref in task.set_ups]
-    record: Record = {name: [] for name in TABLES}
-    for config, points in _by_average(task.points):
+    record: Rows = {name: [] for name in TABLES}
+    by_average: dict[str, list[PointTask]] = {}
+    for point in task.points:
+        by_average.setdefault(canonical_json([point.average.to_data(), point.exact]), []).append(point)
+    for points in by_average.values():
         began = time.perf_counter()
-        clouds = [_clouds(set_up, number, task, points, config) for number, set_up in enumerate(set_ups)]
-        seconds_frames = (time.perf_counter() - began) / len(points)
+        clouds = [_clouds(set_up, number, task, points) for number, set_up in enumerate(set_ups)]
+        seconds = {"seconds_frames": (time.perf_counter() - began) / len(points)}
         if task.role == "hole_free" and task.poses is None and task.board is None:
-            variants = {(point.variant, point.frames) for point in points}
-            record["probes"] += list(_probe_rows(set_ups[0], clouds[0], task.repeat, variants))
-            pair = capture_of(set_ups[0], 0, task, 2)
-            record["noise"] += list(board_noise_rows(set_ups[0], clouds[0], pair, task.repeat, variants))
-        judged = _PointJudge(task, set_ups, clouds)
+            for name, rows in _board_rows(task, set_ups[0], clouds[0], points).items():
+                record[name] += rows
+        maps = None if task.poses is None else MapMaker(set_ups, clouds, task.poses, task.labels)
+        done: dict[str, Rows] = {}
         for point in points:
-            for name, rows in judged.rows(point, seconds_frames).items():
+            for name, rows in _point_rows(task, set_ups[0], clouds[0], maps, point, done, seconds).items():
                 record[name] += rows
     return record
 
 
-def _clouds(
-    set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointTask], config: AverageConfig
-) -> dict[int, Cloud]:
+def _clouds(set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointTask]) -> dict[int, Cloud]:
     """One view's averages, of as many frames as the points that use this view ask for."""
-    views = [point.mapping.views if point.mapping is not None else None for point in points]
+    views = [None if point.mapping is None else point.mapping.views for point in points]
     counts = sorted({point.frames for point, n in zip(points, views, strict=True) if n is None or number < n})
     if not counts:
         return {}
-    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, config, exact=points[0].exact)
+    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, points[0].average, exact=points[0].exact)
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
-    """The frames of one view in one trial. The first view's are those of an experiment that has no other."""
-    view = () if number == 0 else ("view", number)
-    return set_up.unit.capture(frames, task.seed, task.role, task.repeat, *board_labels(task), *view)
+    """Return the frames of one view in one trial. The first view's are those of an experiment that has no other."""
+    return set_up.unit.capture(frames, task.seed, *task.labels, *(("view", number) if number else ()))
 
 
-def board_labels(task: TrialTask) -> tuple[str | int, ...]:
-    """Labels that separate the random streams of a study's boards."""
-    return () if task.board is None else ("board", task.board)
+def _point_rows(
+    task: TrialTask,
+    first: SetUp,
+    views: dict[int, Cloud],
+    maps: MapMaker | None,
+    point: PointTask,
+    done: dict[str, Rows],
+    seconds: dict[str, float],
+) -> Rows:
+    """The rows of one point, by table. ``done``: rows of points that came to the same."""
+    common: dict[str, Any] = {"variant": point.variant, "frames": point.frames, "repeat": task.repeat}
+    if task.board is not None:
+        common["board"] = task.board
+    named, role = {"point": point.digest, **common}, {"role": task.role}
+    mapping = point.mapping
+    source: Any = point.frames
+    of_map: dict[str, float] = {}
+    registrations: list[dict[str, Any]] = []
+    probes: list[dict[str, Any]] = []
+    if maps is not None and mapping is not None:
+        merged, registrations = maps.merged(mapping, point.frames), maps.registration_rows(mapping, point.frames)
+        used = len(merged.views_used)
+        of_map = {"views_used": used, "views_left_out": maps.count(mapping) - used}
+        of_map["seconds_map"] = maps.seconds(mapping, point.frames)
+        source = maps.key(mapping, point.frames)
+    began = time.perf_counter()
+    asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
+    key = canonical_json([source, *asked])
+    if key not in done:
+        if maps is None or mapping is None:
+            known = known_view(first, views[point.frames], hole_free=task.hole_free)
+        else:
+            known = maps.known(mapping, point.frames, hole_free=task.hole_free)
+            if task.hole_free and task.board is None:
+                errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
+                probes = [{"error_tenth_um": _tenth_um(errors_m)}]
+        judged = judge(known, *asked, hole_free=task.hole_free)
+        if task.board is None:
+            done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}
+        else:
+            done[key] = study_rows(known, judged, point.radius_m, hole_free=task.hole_free)
+    seconds = {**of_map, **seconds, "seconds_detect": time.perf_counter() - began}
+    before = {"runs": named | role, "holes": named, "probes": common}
+    after = {"runs": seconds}
+    rows = {
+        name: [{**before.get(name, common | role), **row, **after.get(name, {})} for row in found]
+        for name, found in done[key].items()
+    }
+    return rows | {"registrations": [{**common, **role, **row} for row in registrations]}
 
 
-class _PointJudge:
-    """The rows of a trial's points, from its clouds; points that come to the same share the work."""
-
-    def __init__(self, task: TrialTask, set_ups: Sequence[SetUp], clouds: Sequence[dict[int, Cloud]]) -> None:
-        self._task = task
-        self._hole_free = task.role != "damaged"
-        self._set_ups = set_ups
-        self._clouds = clouds
-        self._done: dict[str, PointRows] = {}
-        self._maps = None
-        if task.poses is not None:
-            labels = (task.role, task.repeat, *board_labels(task))
-            self._maps = MapMaker(set_ups, clouds, task.poses, labels, hole_free=self._hole_free)
-
-    def rows(self, point: PointTask, seconds_frames: float) -> Record:
-        """The rows of one point, by table."""
-        common = {"variant": point.variant, "frames": point.frames, "repeat": self._task.repeat}
-        if self._task.board is not None:
-            common["board"] = self._task.board
-        extra: dict[str, Any] = {}
-        registrations: list[dict[str, Any]] = []
-        if self._maps is not None and point.mapping is not None:
-            merged = self._maps.merged(point.mapping, point.frames)
-            used = len(merged.views_used)
-            extra = {
-                "views_used": used,
-                "views_left_out": self._maps.count(point.mapping) - used,
-                "seconds_map": self._maps.seconds(point.mapping, point.frames),
-            }
-            registrations = list(self._maps.registration_rows(point.mapping, point.frames))
-        began = time.perf_counter()
-        judged = self._judged(point)
-        run = {**judged.run, **extra, "seconds_frames": seconds_frames, "seconds_detect": time.perf_counter() - began}
-        role = {"role": self._task.role}
-        named = {"point": point.digest, **common}
-        rows = {name: [{**common, **role, **row} for row in rows] for name, rows in judged.of_study.items()}
-        return rows | {
-            "runs": [{**named, **role, **run}],
-            "holes": [{**named, **hole} for hole in judged.holes],
-            "registrations": [{**common, **role, **row} for row in registrations],
-            "probes": [] if judged.errors is None else [{**common, "error_tenth_um": judged.errors}],
-        }
-
-    def _judged(self, point: PointTask) -> PointRows:
-        if self._maps is None or point.mapping is None:
-            known = known_view(self._set_ups[0], self._clouds[0][point.frames], hole_free=self._hole_free)
-            return self._judge(known, point)
-        asked = [point.detector, point.settings_json, point.threshold, point.radius_m]
-        key = canonical_json([self._maps.key(point.mapping, point.frames), *asked])
-        if key not in self._done:
-            known = self._maps.known(point.mapping, point.frames)
-            errors = self._map_errors(known) if self._hole_free and self._task.board is None else None
-            self._done[key] = replace(self._judge(known, point), errors=errors)
-        return self._done[key]
-
-    def _judge(self, known: KnownCloud, point: PointTask) -> PointRows:
-        settings, limit = point.settings_json, point.threshold
-        judged_cloud = judge(known, point.detector, settings, limit, point.radius_m, hole_free=self._hole_free)
-        if self._task.board is None:
-            return PointRows(judged_cloud.run, judged_cloud.holes)
-        return study_rows(known, judged_cloud, point.radius_m, hole_free=self._hole_free)
-
-    def _map_errors(self, known: KnownCloud) -> list[int | None]:
-        first = self._set_ups[0]
-        return _tenth_um(face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes]))
+# ---------------------------------------------------------------- what one camera makes of an undamaged board
 
 
-def _by_average(points: Sequence[PointTask]) -> Iterator[tuple[AverageConfig, list[PointTask]]]:
-    groups: dict[str, list[PointTask]] = {}
-    for point in points:
-        groups.setdefault(canonical_json([point.average.to_data(), point.exact]), []).append(point)
-    for group in groups.values():
-        yield group[0].average, group
-
-
-def _probe_rows(
-    set_up: SetUp, clouds: dict[int, Cloud], repeat: int, variants: set[tuple[str, int]]
-) -> Iterator[dict[str, Any]]:
-    """Errors of z on the probes, for each variant and number of frames: one row with a list."""
-    for variant, frames in sorted(variants):
-        error_m = clouds[frames].points_m[..., 2].ravel()[set_up.probes] - set_up.seen_z_m.ravel()[set_up.probes]
-        yield {"variant": variant, "frames": frames, "repeat": repeat, "error_tenth_um": _tenth_um(error_m)}
+def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]) -> Rows:
+    """Rows for each variant and number of frames: "probes", a list of errors of z; "noise", as in
+    `harness.tables.trials.NOISE`."""
+    pair = [frame.z_m for frame in islice(capture_of(set_up, 0, task, 2).frames(), 2)]
+    noise = pair_noise(pair[0], pair[-1], set_up.bare)
+    rows: Rows = {"probes": [], "noise": []}
+    for variant, frames in sorted({(point.variant, point.frames) for point in points}):
+        common = {"variant": variant, "frames": frames, "repeat": task.repeat}
+        cloud = clouds[frames]
+        errors_m = cloud.points_m[..., 2].ravel()[set_up.probes] - set_up.seen_z_m.ravel()[set_up.probes]
+        rows["probes"].append({**common, "error_tenth_um": _tenth_um(errors_m)})
+        share = float(cloud.valid[set_up.on_board].mean())
+        pitch = dict(zip(("pitch_u_mm", "pitch_v_mm"), set_up.pitch_mm, strict=True))
+        rows["noise"].append({**common, "valid_share": share, **pitch, **noise})
+    return rows
 
 
 def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
@@ -191,46 +463,10 @@ def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
     return [round(float(error) * 1e7) if np.isfinite(error) else None for error in errors_m]
 
 
-LAGS = (1, 2, 3)
-"""Distances in pixels at which the noise's correlation is taken."""
-FEWEST_PAIRS = 50
-"""Pairs of pixels below which a correlation is not told: its standard error would exceed 0.14."""
-
-
-def board_noise_rows(
-    set_up: SetUp, clouds: Mapping[int, Cloud], capture: SimulatedCapture, repeat: int, variants: set[tuple[str, int]]
-) -> Iterator[dict[str, Any]]:
-    """Rows, one for each (variant, number of frames), of what one camera makes of an undamaged board: pitch of its
-    pixels, share that is valid, temporal noise and its grain.
-
-    Temporal noise comes from the difference of a capture's first two frames, from which everything that frames share
-    is gone: scene, multipath, fixed pattern, rounding that does not change. A displacement of a whole frame is taken
-    out with the difference's median.
-
-    ``valid_share``: of the board's pixels, after averaging so many frames. ``single_frame_mm``: standard deviation over
-    pixels of one frame's temporal noise of z. ``correlation_u<k>``, ``correlation_v<k>``: of that noise with itself k
-    columns or rows on. ``pitch_u_mm``, ``pitch_v_mm``: median distance on the board between neighbouring pixels.
-    """
-    pair = [frame.z_m for frame in islice(capture.frames(), 2)]
-    noise = pair_noise(pair[0], pair[1], set_up.bare) if len(pair) == 2 else pair_noise(pair[0], pair[0], set_up.bare)
-    pitch = set_up.pitch_mm
-    for variant, frames in sorted(variants):
-        yield {
-            "variant": variant,
-            "frames": frames,
-            "repeat": repeat,
-            "valid_share": float(clouds[frames].valid[set_up.on_board].mean()),
-            "pitch_u_mm": pitch[0],
-            "pitch_v_mm": pitch[1],
-            **noise,
-        }
-
-
 def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray) -> dict[str, float]:
-    """Standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w), metres.
-
-    Pixels count that are in ``where`` (h, w) and valid in both frames; NaN where there are too few.
-    """
+    """Return the standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w),
+    metres. A displacement of a whole frame is taken out with the difference's median. Pixels count that are in
+    ``where`` (h, w) and valid in both; NaN where there are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
     there = where & np.isfinite(difference)
     if there.sum() < FEWEST_PAIRS:
@@ -238,13 +474,10 @@ def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray)
     noise = np.where(there, difference - np.median(difference[there]), 0.0)
     found = {"single_frame_mm": float(np.sqrt((noise[there] ** 2).mean())) / MM}
     for way, turned, mask in (("u", noise, there), ("v", noise.T, there.T)):
-        found |= {f"correlation_{way}{lag}": _correlation(turned, mask, lag) for lag in LAGS}
+        for lag in LAGS:
+            both = mask[:, :-lag] & mask[:, lag:]
+            a, b = turned[:, :-lag][both], turned[:, lag:][both]
+            power = np.sqrt((a @ a) * (b @ b))
+            enough = len(a) >= FEWEST_PAIRS and power > 0
+            found[f"correlation_{way}{lag}"] = float(a @ b / power) if enough else float("nan")
     return found
-
-
-def _correlation(noise: np.ndarray, there: np.ndarray, lag: int) -> float:
-    """Correlation of pixels with those ``lag`` columns on, over pairs that are both there."""
-    both = there[:, :-lag] & there[:, lag:]
-    a, b = noise[:, :-lag][both], noise[:, lag:][both]
-    power = np.sqrt((a @ a) * (b @ b))
-    return float(a @ b / power) if len(a) >= FEWEST_PAIRS and power > 0 else float("nan")

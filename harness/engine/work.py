@@ -1,4 +1,5 @@
-"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended.
+"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended; one part of
+a sweep (`--shard 3/10`), with no other process to talk to; and the options of every program that runs an experiment.
 
 An engine runs jobs somewhere: in this process, in processes of this machine, on a cluster. It never decides what is
 to be done, and it loses nothing: a job that raises, kills its process, hangs or eats the memory comes back as such, and
@@ -7,30 +8,34 @@ takes no other with it.
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import json
+import os
+import re
+import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, get_args
 
 from harness.vocabulary.errors import DiskFull, UserError
+from harness.vocabulary.files import lock, opened_lock
 
 if TYPE_CHECKING:
-    from harness.report.examples import ExampleCloud, MappedExample
+    from harness.report.clouds import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
 """The ways in which a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by
 the time limit; skipped: it was never begun, because what it needs is not there."""
 STATES: tuple[State, ...] = get_args(State)
-Stage = Literal["renders", "trials"]
-"""Renders load Mitsuba and some 2 GB; everything else runs where trials run."""
-
+Stage = Literal["renders", "trials"]  # renders load Mitsuba and some 2 GB; everything else runs where trials run
 Code = tuple[tuple[str, ...], tuple[str, ...]]
 """Modules and packages that decide the numbers of a stage: the arguments of `source_digest`."""
-
 TRACEBACK_CHARACTERS = 4000
-"""The end of a traceback that is kept."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a job. ``why``: of a user's mistake its message, of a bug (``is_bug``) the end of its traceback.
-    ``seconds``: of the work itself; ``peak_mb``: resident memory at most, 0 where unknown; ``worker``: who did it.
-    ``ends_all``: the disk is full, so that no other job can end better."""
+    """The end of a job. ``value``: its result, of a trial the text of its record. ``why``: a user's mistake, or the end
+    of a bug's traceback. ``peak_mb``: resident memory at most, 0 where unknown. ``ends_all``: the disk is full."""
 
     state: State
     value: Any = None
@@ -60,41 +64,38 @@ class Ended:
     worker: str = ""
     ends_all: bool = False
 
+    @cached_property
+    def record(self) -> dict[str, Any] | None:
+        """Rows by table of a trial that is done."""
+        return None if self.value is None else json.loads(self.value)
+
     def result(self) -> Any:
-        """The value; where there is none, the mistake or the bug as an exception here."""
+        """Return the value; where there is none, raise the mistake or the bug here."""
         if self.state == "done":
             return self.value
-        raise RuntimeError(f"{self.state}: {self.why}") if self.is_bug else UserError(f"{self.state}: {self.why}")
+        raise (RuntimeError if self.is_bug else UserError)(f"{self.state}: {self.why}")
 
 
 class JobEngine(Protocol):
     """An engine that runs jobs. Used as a context: left by an exception it drops its jobs within two seconds."""
 
-    def __enter__(self) -> JobEngine:
-        """Start."""
-        ...
+    def __enter__(self) -> JobEngine: ...
 
-    def __exit__(self, *error: object) -> None:
-        """End; jobs under way are dropped."""
-        ...
+    def __exit__(self, *error: object) -> None: ...
 
     def room(self, stage: Stage) -> int:
         """Number of further jobs of a stage that it can use now: its queue stays short, whatever the plan's size."""
-        ...
 
     def submit(self, job: Job) -> None:
         """Take a job."""
-        ...
 
     def ended(self) -> list[tuple[Job, Ended]]:
         """Wait for jobs to end; at least one. Raises UserError where the engine itself is gone."""
-        ...
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A trial, a render or a threshold that did not end well. ``state`` as in `State`; ``why``: a message, or of a bug
-    the end of its traceback."""
+    """A trial, a render or a threshold that did not end well; fields as of `Ended`."""
 
     what: str
     why: str
@@ -110,8 +111,7 @@ class Failure:
 
 @dataclass
 class StageCounts:
-    """Counts of renders or trials: ``done`` in this run, ``found`` finished before it, ``failed`` in any way (also
-    in an earlier run), of ``total`` wanted. ``seconds``: work of all workers on those done now."""
+    """Counts of renders or trials: ``done`` in this run, ``found`` finished before it, ``failed``, of ``total``."""
 
     done: int = 0
     found: int = 0
@@ -136,15 +136,6 @@ class Outcome:
     renders: StageCounts = field(default_factory=StageCounts)
     trials: StageCounts = field(default_factory=StageCounts)
     peak_mb: float = 0.0
-    seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Progress:
-    """A snapshot of how far a run is."""
-
-    renders: StageCounts
-    trials: StageCounts
 
 
 @dataclass(frozen=True)
@@ -157,7 +148,8 @@ class Limits:
 
 def attempt(job: Job, worker: str) -> Ended:
     """Run a job here; whatever it raises is how it ended. What ends the process is the engine's to notice."""
-    _reset_peak()
+    with contextlib.suppress(OSError):  # count the peak of memory anew (Linux)
+        Path("/proc/self/clear_refs").write_text("5")
     began = time.monotonic()
     state: State = "failed"
     value, why, is_bug, ends_all = None, "", False, False
@@ -171,23 +163,186 @@ def attempt(job: Job, worker: str) -> Ended:
         why = f"out of memory ({str(error) or 'no more'}), of what its process may have (--memory-limit)\n{where}"
     except Exception as error:
         why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
-    return Ended(state, value, why, is_bug, time.monotonic() - began, _peak_mb(), worker, ends_all)
+    seconds, peak_mb = time.monotonic() - began, 0.0
+    with contextlib.suppress(OSError, ValueError):
+        (high,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+        peak_mb = round(int(high.split()[1]) * 1024 / 1e6, 1)
+    return Ended(state, value, why, is_bug, seconds, peak_mb, worker, ends_all)
 
 
-def _reset_peak() -> None:
-    """Let the system count the peak of memory anew (Linux); elsewhere the peak is the process' so far."""
+# ---------------------------------------------------------------- shards
+
+
+T = TypeVar("T")
+MOST = 100_000
+LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``number`` of ``count``, from 1: a contiguous part of a plan's judged trials, and the hole-free trials that
+    set its thresholds, beginning at a place of its own, so that shards with a common folder share them."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """Parse text such as ``3/10``. Raises UserError."""
+        found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        shard = cls(int(found[1]), int(found[2])) if found else None
+        if shard is None or not 1 <= shard.number <= shard.count <= MOST:
+            raise UserError(f"--shard {text!r}: is no part of a whole", legal=f"1/10 to 10/10, for up to {MOST} parts")
+        return shard
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether there is no other part."""
+        return self.count == 1
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def part(self, total: int) -> range:
+        """Return this shard's part of ``total`` things in a row; the parts of all shards are all, each once."""
+        return range((self.number - 1) * total // self.count, self.number * total // self.count)
+
+    def rotated(self, things: Sequence[T]) -> list[T]:
+        """Return all things, beginning at this shard's own place."""
+        start = self.part(len(things)).start
+        return [*things[start:], *things[:start]]
+
+
+WHOLE = Shard()
+
+
+@contextlib.contextmanager
+def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
+    """Hold a folder that exists: a whole sweep alone, shards together, but each part is run once at a time. Raises
+    UserError where another process holds it; systems without locks hold nothing, and a line on stderr says so."""
+    with _held(folder / LOCK, shared=not shard.is_whole):
+        if shard.is_whole:
+            yield
+        else:
+            with _held(folder / f"{LOCK}-{shard.number}-of-{shard.count}", shared=False):
+                yield
+
+
+@contextlib.contextmanager
+def _held(path: Path, *, shared: bool) -> Iterator[None]:
+    with opened_lock(path) as file:
+        answer = lock(file, shared=shared, wait=False)
+        if answer == "busy":
+            file.seek(0)
+            said = file.read(20).strip()
+            who = f" (process {said})" if said.isdigit() else ""
+            fix = "wait for it, or name another folder with --out"
+            raise UserError(f"{path.parent}: another sweep is at work in this folder{who}", fix=fix)
+        if answer == "no locks":
+            print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
+        file.truncate(0)
+        if not shared:
+            file.write(f"{os.getpid()}\n")
+            file.flush()
+        yield
+        file.truncate(0)
+
+
+# ---------------------------------------------------------------- options
+
+
+DEFAULT_TIME_LIMIT_S = 900.0  # a trial takes seconds at most; a hang should not take a night
+DEFAULT_MEMORY_GB = 4.0  # a trial takes some 300 MB, maps of many views up to 2 GB
+DEFAULT_CACHE_GB = 20.0
+DEFAULT_LIMITS = Limits(DEFAULT_TIME_LIMIT_S, round(1000 * DEFAULT_MEMORY_GB))
+LEAST_MEMORY_GB = 0.5  # a process that has loaded what trials need holds 0.2 GB
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """``jobs``: processes, or workers that a cluster is asked for. ``scheduler``: address of one, or jobqueue:slurm and
+    the like; None: this machine. ``serial``: in this process."""
+
+    jobs: int = 2
+    limits: Limits = DEFAULT_LIMITS
+    scheduler: str | None = None
+    serial: bool = False
+    shard: Shard = WHOLE
+    retry_failed: bool = False
+    cache_limit_gb: float | None = None
+
+
+def engine_of(options: EngineOptions, detectors: Iterable[str] = ()) -> JobEngine:
+    """Return the engine, not yet begun, for trials of these ``detectors``. Raises UserError where it is not
+    installed or does not answer."""
+    from harness.engine.processes import LocalEngine, SerialEngine
+
+    if options.serial:
+        return SerialEngine()
+    if options.scheduler is None:
+        return LocalEngine(options.jobs, options.limits, code_of(detectors))
+    from harness.engine.cluster import ClusterEngine
+
+    return ClusterEngine(options.scheduler, options.limits, options.jobs, code_of(detectors))
+
+
+def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
+    """Return the code that decides the numbers of each stage, for trials of these ``detectors``."""
+    from harness.engine.plan import PACKAGES, trial_code
+    from scenes.render import cache
+
+    modules = {module for detector in detectors for module in trial_code(detector)}
+    return {"trials": (tuple(sorted(modules)), PACKAGES), "renders": (cache.CODE, cache.PACKAGES)}
+
+
+def add_engine_options(parser: argparse.ArgumentParser) -> None:
+    """Add them, in a group of their own."""
+    add = parser.add_argument_group("how it is run").add_argument
+    add("--jobs", type=_whole_number, default=2, metavar="N", help="processes, or workers of a cluster (default: 2)")
+    add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
+    help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
+    add("--scheduler", metavar="ADDRESS", help=help)
+    add("--shard", metavar="K/N", help="run the k-th of n parts only, such as 3/10; python -m harness.merge joins them")
+    add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
+    for name, unit, default, meaning in (
+        ("--time-limit", "SECONDS", DEFAULT_TIME_LIMIT_S, "that one trial or render may take"),
+        ("--memory-limit", "GB", DEFAULT_MEMORY_GB, "that a trial's process may take, on a cluster too"),
+        ("--cache-limit", "GB", DEFAULT_CACHE_GB, "of stored renders; the longest unused go first"),
+    ):
+        add(name, type=_positive, default=default, metavar=unit, help=f"{meaning} (default: {default:g})")
+
+
+def engine_options(options: argparse.Namespace) -> EngineOptions:
+    """Return the options that were given. Raises UserError where they make no sense."""
+    if options.serial and options.scheduler is not None:
+        raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
+    if options.memory_limit < LEAST_MEMORY_GB:
+        raise UserError(
+            f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with",
+            legal=f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials",
+        )
+    return EngineOptions(
+        jobs=options.jobs,
+        limits=Limits(options.time_limit, round(1000 * options.memory_limit)),
+        scheduler=options.scheduler,
+        serial=options.serial,
+        shard=WHOLE if options.shard is None else Shard.of(options.shard),
+        retry_failed=options.retry_failed,
+        cache_limit_gb=options.cache_limit,
+    )
+
+
+def _whole_number(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 4096:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
+    return int(text)
+
+
+def _positive(text: str) -> float:
     try:
-        with open("/proc/self/clear_refs", "w") as counter:
-            counter.write("5")
-    except OSError:
-        pass
-
-
-def _peak_mb() -> float:
-    """Resident memory at most since the last reset, MB."""
-    try:
-        with open("/proc/self/status") as lines:
-            (high,) = (line for line in lines if line.startswith("VmHWM"))
-        return round(int(high.split()[1]) * 1024 / 1e6, 1)
-    except (OSError, ValueError):
-        return 0.0
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

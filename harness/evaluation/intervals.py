@@ -1,9 +1,7 @@
-"""Intervals: what stands beside every estimate. All are two-sided at `CONFIDENCE` unless told otherwise.
+"""Intervals, two-sided at `CONFIDENCE` unless told otherwise; false calls per area, and the threshold for a rate.
 
 Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student and Welch (means),
-Efron and Tibshirani 1993 (percentile bootstrap).
-Not covered: repeats of one set-up are repeats of the noise. No interval here speaks of other boards, places or cameras.
-"""
+Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one set-up are repeats of the noise."""
 
 from __future__ import annotations
 
@@ -12,9 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
+
+from harness.vocabulary.errors import UserError
 
 CONFIDENCE = 0.95
 """Two-sided confidence of every interval in tables and reports."""
+UPPER = 0.5 + CONFIDENCE / 2
 RESAMPLES = 2000
 """Bootstrap resamples: the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width."""
 
@@ -47,34 +49,28 @@ class Interval:
 UNKNOWN = Interval(np.nan, np.nan)
 
 
-def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[np.ndarray, np.ndarray]:
-    """Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0.
-
-    Coverage is near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider.
-    """
+def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Coverage is
+    near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
     from scipy.stats import norm
 
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    z2 = norm.ppf(0.5 + confidence / 2) ** 2
+    z2 = norm.ppf(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
     # Rounding would leave 1e-17 where the end is exactly 0 or 1.
-    low = np.where(k == 0, 0.0, centre - half)
-    high = np.where(k == n, 1.0, centre + half)
+    low, high = np.where(k == 0, 0.0, centre - half), np.where(k == n, 1.0, centre + half)
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
-def clopper_pearson(
-    successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE
-) -> tuple[np.ndarray, np.ndarray]:
+def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
     from scipy.stats import beta
 
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    tail = (1 - confidence) / 2
-    low = np.where(k == 0, 0.0, beta.ppf(tail, k, n - k + 1))
-    high = np.where(k == n, 1.0, beta.ppf(1 - tail, k + 1, n - k))
+    low = np.where(k == 0, 0.0, beta.ppf(1 - UPPER, k, n - k + 1))
+    high = np.where(k == n, 1.0, beta.ppf(UPPER, k + 1, n - k))
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
@@ -92,41 +88,32 @@ def poisson_rate(
         return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
 
 
-def mean_t(
-    mean: ArrayLike, std: ArrayLike, n: ArrayLike, confidence: float = CONFIDENCE
-) -> tuple[np.ndarray, np.ndarray]:
+def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
     from scipy.stats import t
 
     m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
-    enough = k >= 2
-    freedom = np.where(enough, k - 1, 1.0)
-    half = t.ppf(0.5 + confidence / 2, freedom) * s / np.sqrt(np.where(enough, k, 1.0))
-    return np.where(enough, m - half, np.nan), np.where(enough, m + half, np.nan)
+    size = np.where(k >= 2, k, np.nan)
+    half = t.ppf(UPPER, size - 1) * s / np.sqrt(size)
+    return m - half, m + half
 
 
-def mean_difference(first: ArrayLike, second: ArrayLike, confidence: float = CONFIDENCE) -> Interval:
+def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     """Welch's interval of mean(first) - mean(second); a point where neither varies, unknown below two values each."""
-    from scipy.stats import t
+    from scipy.stats import ttest_ind
 
     a, b = np.asarray(first, float), np.asarray(second, float)
-    if len(a) < 2 or len(b) < 2:
+    if min(len(a), len(b)) < 2:
         return UNKNOWN
-    va, vb = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
-    difference = float(a.mean() - b.mean())
-    if va + vb == 0:
-        return Interval(difference, difference)
-    freedom = (va + vb) ** 2 / (va**2 / (len(a) - 1) + vb**2 / (len(b) - 1))
-    half = float(t.ppf(0.5 + confidence / 2, freedom) * np.sqrt(va + vb))
-    return Interval(difference - half, difference + half)
+    if np.ptp(a) == np.ptp(b) == 0:
+        return Interval(float(a[0] - b[0]), float(a[0] - b[0]))
+    ends = ttest_ind(a, b, equal_var=False).confidence_interval(CONFIDENCE)
+    return Interval(float(ends.low), float(ends.high))
 
 
-def standardised_bias(bias: float, std: float, n: int, confidence: float = CONFIDENCE) -> Interval:
-    """Interval of bias / standard deviation (an effect size) from ``n`` normal values.
-
-    Large-sample variance 1/n + d^2/(2n) (Hedges and Olkin 1985, one sample). Where the values do not vary the ratio is
-    0 or infinite and known exactly; unknown below two values.
-    """
+def standardised_bias(bias: float, std: float, n: int) -> Interval:
+    """Interval of bias / standard deviation (an effect size) from ``n`` normal values, by the large-sample variance
+    1/n + d^2/(2n) (Hedges and Olkin 1985). Exact (0 or infinite) where they do not vary; unknown below two values."""
     from scipy.stats import norm
 
     if n < 2 or not (np.isfinite(bias) and np.isfinite(std)):
@@ -135,27 +122,19 @@ def standardised_bias(bias: float, std: float, n: int, confidence: float = CONFI
         ratio = 0.0 if bias == 0 else float(np.copysign(np.inf, bias))
         return Interval(ratio, ratio)
     ratio = bias / std
-    half = float(norm.ppf(0.5 + confidence / 2)) * float(np.sqrt(1 / n + ratio**2 / (2 * n)))
+    half = float(norm.ppf(UPPER) * np.sqrt(1 / n + ratio**2 / (2 * n)))
     return Interval(ratio - half, ratio + half)
 
 
 def bootstrap(
-    statistic: Callable[[np.ndarray], np.ndarray],
-    n: int,
-    *,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES, seed: int = 0
 ) -> Interval:
-    """Percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels).
-
-    ``statistic`` maps indices (resamples, n) to values (resamples,). Resamples whose value is NaN are left out; unknown
-    below two units, or where more than half of the values are NaN. The fixed ``seed`` makes reports repeatable.
-    """
+    """Percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels); the fixed ``seed`` repeats it.
+    ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out, as in `percentiles`."""
     if n < 2:
         return UNKNOWN
     indices = np.random.default_rng(seed).integers(0, n, size=(resamples, n))
-    return percentiles(np.asarray(statistic(indices), float), confidence)
+    return percentiles(np.asarray(statistic(indices), float))
 
 
 def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
@@ -166,3 +145,67 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
         return UNKNOWN
     low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
     return Interval(float(low), float(high))
+
+
+SITES_PER_TARGET = 3
+"""MIL-HDBK-1823A: unflawed sites for each flawed one, at least."""
+
+
+@dataclass(frozen=True)
+class FalseCallRate:
+    """False calls per square metre: estimate, Garwood's two-sided ``interval`` and one-sided ``upper`` bound."""
+
+    rate_per_m2: float
+    interval_per_m2: Interval
+    upper_per_m2: float
+    confidence: float
+    calls: int
+    area_m2: float
+
+
+def false_call_rate(calls: int, area_m2: float, confidence: float = 0.95) -> FalseCallRate:
+    """State the rate of ``calls`` false calls on ``area_m2`` of unflawed surface as a Poisson count; limits exact."""
+    if calls < 0 or not area_m2 > 0:
+        raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="no fewer than 0 calls, an area above 0")
+    low, high = poisson_rate(calls, area_m2, confidence)
+    upper = poisson_rate(calls, area_m2, 2 * confidence - 1)[1]
+    return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), float(upper), confidence, calls, area_m2)
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A score's threshold: findings *above* ``value`` are calls (-inf: every finding is). ``rate_per_m2``: false calls
+    to expect on new runs; ``upper_per_m2``: bound of the true rate at one-sided ``confidence``."""
+
+    value: float
+    rate_per_m2: float
+    upper_per_m2: float
+    confidence: float
+    runs: int
+    calling_runs: int
+
+
+def threshold_for_rate(
+    highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
+) -> Threshold:
+    """Choose the lowest observed score whose false-call rate is at most the one wanted, from hole-free runs of
+    ``area_m2`` each. ``highest_scores_per_run`` (runs,), -inf without finding. Calls are a Poisson process; a new run's
+    score lies above the (k + 1)-th highest of n with probability (k + 1) / (n + 1), the true one is Beta(k + 1, n - k)
+    distributed (Wilks 1941). Judge on other runs. UserError where the runs are too few."""
+    scores = np.asarray(highest_scores_per_run, float).ravel()
+    if not (area_m2 > 0 and rate_per_m2 > 0):
+        raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")
+    if np.any(np.isnan(scores)) or np.any(np.isposinf(scores)):
+        raise UserError("highest scores that are no numbers", legal="a finite score, or -inf for a run without finding")
+    n, wanted = len(scores), -float(np.expm1(-rate_per_m2 * area_m2))
+    # The margin is for rounding where (n + 1) * wanted is a whole number.
+    k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
+    if k < 0:
+        said = f"{n} hole-free runs of {area_m2:.4g} m2 are too few for {rate_per_m2:g} false calls per m2"
+        fix = "simulate more hole-free boards, or ask for a higher rate"
+        raise UserError(said, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
+    value = float(np.sort(scores)[n - 1 - k])
+    above = int(np.sum(scores > value))
+    bound = float(stats.beta.ppf(confidence, above + 1, n - above))
+    rate, upper = -np.log1p(-np.array([(above + 1) / (n + 1), bound])) / area_m2
+    return Threshold(value, float(rate), float(upper), confidence, n, above)

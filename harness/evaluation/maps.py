@@ -1,20 +1,20 @@
-"""Maps of several views: the set-ups that make them, and each map beside a single view on the same repeats.
+"""Maps of several views beside a single view on the same repeats, and the errors of registrations.
 
-The same frames feed both maps of a comparison, so that differences are paired. Intervals are over repeats, which vary
-the noise and the error of the nominal poses. Thresholds were calibrated once for each set-up, and the draw of that
-calibration is in no interval.
-"""
+The same frames feed both maps of a comparison, so that differences are paired; intervals are over repeats, which vary
+noise and pose. Errors of registrations are target registration errors (Fitzpatrick, West and Maurer 1998) of places on
+the board, against the truth and against what the method itself predicts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t
-from harness.evaluation.set_ups import compare_set_ups, isotonic
+from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t, wilson
+from harness.evaluation.set_ups import compare_set_ups
 from harness.evaluation.summary import HoleState, Measure, found_holes, with_columns
 from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import value_text
@@ -31,9 +31,6 @@ LARGE_MM = 25.4 * 3 / 8
 """Diameter from which on two views are said to size better than one."""
 FEWEST_BOTH = 2
 """Repeats in which a hole must be measured in both maps to be compared."""
-
-
-# set-ups
 
 
 @dataclass(frozen=True)
@@ -54,32 +51,25 @@ class MapSetUp:
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
     """List all set-ups and variations in the table's order. For "all views" the runs tell their number."""
     others = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
-    runs, seen = tables.runs, dict[str, int]()
+    runs, seen = tables.runs, dict[Any, Any]()
     if not runs.empty and "views_used" in runs:
-        there = (runs["views_used"] + runs["views_left_out"]).groupby(runs["variant"]).max().dropna()
-        seen = {str(variant): int(count) for variant, count in there.items()}
+        seen = (runs["views_used"] + runs["views_left_out"]).groupby(runs["variant"]).max().dropna().to_dict()
 
-    def views(value: Any, seen: int) -> int:
+    def views(row: pd.Series) -> int:
         try:
-            return int(float(value))
+            return int(float(row.get(VIEWS)))  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
-            return seen
+            return int(seen.get(row["variant"], 0))
 
     def word(value: Any) -> str:
         return value if isinstance(value, str) and value != "null" else ""
 
-    return [
-        MapSetUp(
-            variant=str(row["variant"]),
-            views=views(row.get(VIEWS), seen.get(str(row["variant"]), 0)),
-            registration=word(row.get(REGISTRATION)),
-            merge=word(row.get(MERGE)),
-            place=", ".join(value_text(path, row[path]) for path in others),
-            is_variation=bool(row["is_variation"]),
-            reference=str(row["reference"]),
-        )
-        for _, row in tables.variants.iterrows()
-    ]
+    def one(row: pd.Series) -> MapSetUp:
+        place = ", ".join(value_text(path, row[path]) for path in others)
+        told = (str(row["variant"]), views(row), word(row.get(REGISTRATION)), word(row.get(MERGE)), place)
+        return MapSetUp(*told, is_variation=bool(row["is_variation"]), reference=str(row["reference"]))
+
+    return [one(row) for _, row in tables.variants.iterrows()]
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
@@ -92,21 +82,11 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
     if compared.empty:
         return compared
-    runs = tables.runs[tables.runs["role"] == "damaged"].groupby(["variant", "frames"], as_index=False)
-    means = runs.agg(
-        views_left_out=("views_left_out", "mean"),
-        seconds_map=("seconds_map", "median"),
-        surface_std_mm=("surface_noise_mm", "std"),
-    )
+    told = {"views_left_out": ("views_left_out", "mean"), "seconds_map": ("seconds_map", "median")}
+    told |= {"surface_std_mm": ("surface_noise_mm", "std")}
+    damaged = tables.runs[tables.runs["role"] == "damaged"]
+    means = damaged.groupby(["variant", "frames"], as_index=False).agg(**told)
     return compared.merge(maps, "left", "variant").merge(means, "left", ["variant", "frames"])
-
-
-def label_of(registration: str, merge: str, place: str = "") -> str:
-    """Name a way to make a map: ``cpd, grid``."""
-    return ", ".join(part for part in (registration, merge, place) if part) or "as declared"
-
-
-# paired differences
 
 
 @dataclass(frozen=True)
@@ -128,122 +108,64 @@ class Change:
         return True if self.interval.below(0) else False if self.interval.low >= 0 else None
 
 
+def change_of(differences: np.ndarray) -> Change:
+    """Average differences, one for each repeat, NaN left out, with Student's interval; unknown below two."""
+    known = differences[np.isfinite(differences)]
+    if len(known) < 2:
+        return Change(np.nan, UNKNOWN, 0)
+    mean, std = float(known.mean()), float(known.std(ddof=1))
+    return Change(mean, Interval(*map(float, mean_t(mean, std, len(known)))), len(known))
+
+
 @dataclass(frozen=True)
 class SizeErrors:
-    """|measured - true diameter| in mm of holes measured in both of two maps, repeat by repeat.
-
-    ``holes`` (h,) names and ``diameters_mm`` (h,), ascending; ``first_mm`` and ``second_mm`` (repeats, h), NaN where
-    either map lacks the hole.
-    """
+    """Change (second less first) of |measured - true diameter| in mm of holes that both of two maps measure. ``holes``
+    (h,) names and ``diameters_mm`` (h,), ascending; ``differences_mm`` (repeats, h), NaN where one lacks it."""
 
     holes: tuple[str, ...]
     diameters_mm: np.ndarray
-    first_mm: np.ndarray
-    second_mm: np.ndarray
-
-    @property
-    def differences_mm(self) -> np.ndarray:
-        """(repeats, h) second less first."""
-        return np.asarray(self.second_mm - self.first_mm)
+    differences_mm: np.ndarray
 
     def change(self, of: np.ndarray | None = None) -> Change:
         """Average over the holes ``of`` (h,) bool: the mean over repeats of each repeat's mean difference."""
-        chosen = self.differences_mm[:, of] if of is not None else self.differences_mm
+        chosen = self.differences_mm if of is None else self.differences_mm[:, of]
         there = np.isfinite(chosen)
-        usable = there.any(axis=1)
-        return change_of(np.where(there, chosen, 0.0).sum(axis=1)[usable] / there.sum(axis=1)[usable])
+        with np.errstate(invalid="ignore"):
+            return change_of(np.where(there, chosen, 0.0).sum(axis=1) / there.sum(axis=1))
 
     def by_hole(self) -> list[Change]:
         """Average for each hole alone."""
-        return [change_of(column[np.isfinite(column)]) for column in self.differences_mm.T]
-
-    @property
-    def crossing_mm(self) -> float:
-        """The diameter above which the second map sizes better, see `crossing_of`."""
-        return float(self._crossings(np.arange(len(self.first_mm))[None])[0])
-
-    @property
-    def crossing_interval(self) -> Interval:
-        """Its 95 % interval by bootstrap over repeats; unknown where most draws have no crossing."""
-        return bootstrap(self._crossings, len(self.first_mm))
-
-    def _crossings(self, chosen: np.ndarray) -> np.ndarray:
-        drawn = self.differences_mm[chosen]
-        there = np.isfinite(drawn)
-        with np.errstate(invalid="ignore"):  # a hole that a draw lacks leaves that draw without an answer
-            means = np.where(there, drawn, 0.0).sum(axis=1) / there.sum(axis=1)
-        return crossing_of(self.diameters_mm, means)
-
-
-def change_of(differences: np.ndarray) -> Change:
-    """Average one difference for each repeat, with Student's interval; unknown below two."""
-    n = len(differences)
-    if n < 2:
-        return Change(np.nan, UNKNOWN, 0)
-    mean, std = float(differences.mean()), float(differences.std(ddof=1))
-    low, high = mean_t(mean, std, n)
-    return Change(mean, Interval(float(low), float(high)), n)
-
-
-def crossing_of(diameters_mm: np.ndarray, changes_mm: np.ndarray) -> np.ndarray:
-    """Find (n,) where changes (n, h) of the error against ascending diameters (h,) turn from above zero to below.
-
-    The changes are made falling by isotonic regression and interpolated linearly; NaN where they do not cross zero.
-    """
-    if changes_mm.shape[1] < 2:
-        return np.full(len(changes_mm), np.nan)
-    bad = ~np.isfinite(changes_mm).all(axis=1)
-    falling = -isotonic(-np.where(bad[:, None], 0.0, changes_mm))
-    after = np.argmax(falling < 0, axis=1)
-    crosses = (falling[:, 0] > 0) & (falling[:, -1] < 0) & ~bad
-    rows, before = np.arange(len(falling)), np.maximum(after - 1, 0)
-    high, low = falling[rows, before], falling[rows, after]
-    share = np.where(crosses, high / np.where(high > low, high - low, 1.0), 0.0)
-    found = diameters_mm[before] + share * (diameters_mm[after] - diameters_mm[before])
-    return np.where(crosses, found, np.nan)
+        return [change_of(column) for column in self.differences_mm.T]
 
 
 def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "extent") -> SizeErrors:
-    """Pair the table of holes' rows of two maps, each of one set-up and one number of frames; holes that both measure
-    in `FEWEST_BOTH` repeats at least."""
-    tables = [
-        rows.assign(error=(rows[f"{measure}_diameter_mm"] - rows["true_diameter_mm"]).abs()).pivot(
-            index="repeat", columns="hole", values="error"
-        )
-        for rows in (first, second)
-    ]
-    diameters = first.groupby("hole")["true_diameter_mm"].first()
-    holes = [hole for hole in tables[0].columns if hole in tables[1].columns]
-    holes.sort(key=lambda hole: float(diameters[hole]))
-    repeats = tables[0].index.intersection(tables[1].index)
-    one, two = (table.loc[repeats, holes].to_numpy(float) for table in tables)
-    both = np.isfinite(one) & np.isfinite(two)
-    kept = both.sum(axis=0) >= FEWEST_BOTH
-    names = [hole for hole, enough in zip(holes, kept, strict=True) if enough]
-    sizes = np.array([float(diameters[hole]) for hole in names])
-    one, two = (np.where(both, errors, np.nan)[:, kept] for errors in (one, two))
-    return SizeErrors(tuple(str(name) for name in names), sizes, one, two)
+    """Pair the table of holes' rows of two maps, each of one set-up and one number of frames; see `FEWEST_BOTH`."""
+
+    def errors(rows: pd.DataFrame) -> pd.DataFrame:
+        error = (rows[f"{measure}_diameter_mm"] - rows["true_diameter_mm"]).abs()
+        return rows.assign(error=error).pivot(index="repeat", columns="hole", values="error")
+
+    change = (errors(second) - errors(first)).dropna(axis="columns", thresh=FEWEST_BOTH)
+    diameters = first.groupby("hole")["true_diameter_mm"].first().astype(float)
+    holes = sorted(change.columns, key=lambda hole: diameters[hole])
+    sizes, differences = np.array([diameters[hole] for hole in holes]), np.asarray(change[holes], float)
+    return SizeErrors(tuple(map(str, holes)), sizes, differences)
 
 
 def run_change(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
     """Paired change of a column of the table of runs on the damaged board; ``threshold_mm`` is k times the scale."""
-    one, two = (_by_repeat(rows, column) for rows in (first, second))
-    return change_of((two - one).dropna().to_numpy(float))
+    return change_of((_by_repeat(second, column) - _by_repeat(first, column)).to_numpy(float))
 
 
 def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
     """Paired change of the natural logarithm of such a column: ``exp`` of it is a ratio."""
-    one, two = (np.log(_by_repeat(rows, column)) for rows in (first, second))
-    return change_of((two - one).dropna().to_numpy(float))
+    return change_of(np.log((_by_repeat(second, column) / _by_repeat(first, column)).to_numpy(float)))
 
 
 def _by_repeat(runs: pd.DataFrame, column: str) -> pd.Series:
     damaged = runs[runs["role"] == "damaged"]
     values = damaged["threshold"] * damaged["scale_mm"] if column == "threshold_mm" else damaged[column]
     return values.set_axis(damaged["repeat"])
-
-
-# one view beside several
 
 
 @dataclass(frozen=True)
@@ -257,10 +179,8 @@ class Map:
 
 @dataclass(frozen=True)
 class MapCase:
-    """The maps of one place: those of one value of every axis but views, registration and merging.
-
-    ``summary``: of `harness.evaluation.summary.summarise_holes`.
-    """
+    """The maps of one place: those of one value of every axis but views, registration and merging. ``summary``: of
+    `harness.evaluation.summary.summarise_holes`."""
 
     tables: ResultTables
     summary: pd.DataFrame
@@ -299,8 +219,7 @@ class MapCase:
         return Map(variant, chosen, views)
 
     def single(self, frames: int | None = None) -> Map | None:
-        """Find one view alone, by the thesis' merging where that was tried, which leaves a single cloud nearly as it
-        is."""
+        """Find one view alone, by the thesis' merging where that was tried."""
         merges = [THESIS_MERGE, *(one.merge for one in self.set_ups)]
         singles = (self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges))
         return next((one for one in singles if one is not None), None)
@@ -327,17 +246,20 @@ def _rows(table: pd.DataFrame, one: Map) -> pd.DataFrame:
     return table[(table["variant"] == one.variant) & (table["frames"] == one.frames)]
 
 
+def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
+    """Make one case for each place, in the order of the set-ups."""
+    maps = maps_of(tables)
+    places = dict.fromkeys(one.place for one in maps if not one.is_variation)
+    return [MapCase(tables, summary, [one for one in maps if one.place == place], place) for place in places]
+
+
 @dataclass(frozen=True)
 class AgainstOne:
-    """Several merged views against the first of them alone, merged in the same way, on the same repeats.
+    """Several merged views against the first of them alone on the same repeats. ``large``, ``small``: change of |size
+    error| in mm over the holes from `LARGE_MM` on and below; ``threshold``: of the calibrated one in mm; ``noise``: of
+    the logarithm of the surface noise. ``lost``, ``gained``: holes found by the one, by the several views alone."""
 
-    ``large`` and ``small``: change of |size error| in mm over the holes from `LARGE_MM` on and below; ``threshold``: of
-    the calibrated threshold in mm; ``noise``: of the logarithm of the noise of the fitted surface. ``lost`` and
-    ``gained``: holes found by the one view alone, by the several views alone.
-    """
-
-    one: Map
-    several: Map
+    frames: int
     sizes: SizeErrors
     large: Change
     small: Change
@@ -347,46 +269,27 @@ class AgainstOne:
     gained: tuple[str, ...]
 
 
-def against_one(
-    case: MapCase, registration: str, merge: str, views: int = 2, measure: Measure = "extent", frames: int | None = None
-) -> AgainstOne | None:
-    """Compare with the most frames that both have (`MapCase.common_frames`), or with ``frames``; None where either map
-    is missing."""
-    variants = case.variant(1, registration, merge), case.variant(views, registration, merge)
-    chosen = case.common_frames(*variants) if frames is None else frames
-    if chosen is None:
+def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | None:
+    """Compare two views with the most frames that both have (`MapCase.common_frames`); None where a map is missing."""
+    frames = case.common_frames(*(case.variant(views, registration, merge) for views in (1, 2)))
+    if frames is None:
         return None
-    one, several = (case.named(n, registration, merge, chosen) for n in (1, views))
-    if one is None or several is None:
-        return None
-    sizes = size_errors(case.holes(one), case.holes(several), measure)
+    one, several = (case.named(n, registration, merge, frames) for n in (1, 2))
+    assert one is not None and several is not None
+    sizes = size_errors(case.holes(one), case.holes(several))
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
     states, runs = (case.status(one), case.status(several)), (case.runs(one), case.runs(several))
     lost, gained = (
         tuple(hole for hole, state in here.items() if state == "found" and there.get(hole) == "missed")
         for here, there in (states, states[::-1])
     )
-    return AgainstOne(
-        one,
-        several,
-        sizes,
-        large=sizes.change(large),
-        small=sizes.change(~large),
-        threshold=run_change(*runs, "threshold_mm"),
-        noise=run_ratio(*runs, "surface_noise_mm"),
-        lost=lost,
-        gained=gained,
-    )
+    threshold, noise = run_change(*runs, "threshold_mm"), run_ratio(*runs, "surface_noise_mm")
+    return AgainstOne(frames, sizes, sizes.change(large), sizes.change(~large), threshold, noise, lost, gained)
 
 
-def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
-    """Make one case for each place, in the order of the set-ups."""
-    maps = maps_of(tables)
-    places = dict.fromkeys(one.place for one in maps if not one.is_variation)
-    return [MapCase(tables, summary, [one for one in maps if one.place == place], place) for place in places]
-
-
-# numbers as text
+def label_of(registration: str, merge: str, place: str = "") -> str:
+    """Name a way to make a map: ``cpd, grid``."""
+    return ", ".join(part for part in (registration, merge, place) if part) or "as declared"
 
 
 def frames_text(frames: int) -> str:
@@ -404,9 +307,8 @@ def span(interval: Interval, digits: int = 2) -> str:
 
 def change_text(change: Change, unit: str = " mm") -> str:
     """Write ``+0.12 mm (0.05 to 0.19)``."""
-    if not np.isfinite(change.mean):
-        return "not compared"
-    return f"{round(change.mean, 2) + 0.0:+.2f}{unit} ({span(change.interval)})"
+    known = np.isfinite(change.mean)
+    return f"{round(change.mean, 2) + 0.0:+.2f}{unit} ({span(change.interval)})" if known else "not compared"
 
 
 def ratio_text(change: Change) -> str:
@@ -414,3 +316,111 @@ def ratio_text(change: Change) -> str:
     if not np.isfinite(change.mean):
         return "not compared"
     return f"× {np.exp(change.mean):.2f} ({span(Interval(*np.exp([change.interval.low, change.interval.high])))})"
+
+
+PARTS = ("in_plane", "across")
+UNIT = ["frames", "repeat", "role"]
+"""One draw of noise and of nominal poses: what intervals resample."""
+MOST_REASONS = 3
+MEDIANS = ("seconds", "iterations", "overlap", "pairs", "marks")
+
+
+def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
+    """Select the registrations that a map of so many views rests on: those of exactly ``views`` first, else of the
+    nearest, since a method that registers each view by itself gives the same for any number of views."""
+    import pandas as pd
+
+    rows = registrations[(registrations["method"] == method) & (registrations["view"] < views)]
+    if VIEWS not in rows:
+        return rows
+    # "all views" counts as more than any number.
+    apart = pd.to_numeric(rows[VIEWS], errors="coerce").fillna(np.inf).sub(views).abs()
+    order = rows.assign(_apart=apart).sort_values("_apart", kind="stable")
+    return order.drop_duplicates([*UNIT, "view"]).drop(columns="_apart").sort_index()
+
+
+def summarise_registrations(registrations: pd.DataFrame, by: Sequence[str] = ("method", "frames")) -> pd.DataFrame:
+    """Make one row per group, in order of appearance: numbers, failures, and the errors of those that did not fail. For
+    both `PARTS` median, 90 %, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
+    predicted (1: honest, above 1: too sure) with a bootstrap over repeats; ``guess_mm``: of the starting guess."""
+    import pandas as pd
+
+    if registrations.empty:
+        return pd.DataFrame(columns=[*by, "n", "failed"])
+    groups = registrations.groupby(list(by), sort=False)
+    return pd.DataFrame([dict(zip(by, key, strict=True)) | _summary(part) for key, part in groups])
+
+
+def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
+    """Summarise registrations by method and frames for each number of views, which the column ``views`` tells."""
+    import pandas as pd
+
+    parts = []
+    for method in dict.fromkeys(registrations["method"]):
+        for views in counts:
+            rows = of_map(registrations, method, views)
+            if len(rows):
+                parts.append(summarise_registrations(rows).assign(views=views))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["method", "frames", "views"])
+
+
+def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
+    """Select those that did not fail."""
+    return registrations[registrations["failure"] == ""]
+
+
+def per_unit(registrations: pd.DataFrame, column: str) -> pd.Series:
+    """Root mean square over the views of each repeat and role of one column, of the registrations that did not fail."""
+    rows = trusted(registrations)
+    squares = (rows[column] ** 2).groupby([rows[key] for key in UNIT]).mean()
+    return squares.pow(0.5)
+
+
+def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
+    """Geometric mean over repeats of second / first of one column's `per_unit`, with its Student interval of the
+    logarithm, and how many pairs there were; NaN below two."""
+    both = per_unit(first, column).to_frame("first").join(per_unit(second, column).rename("second"), how="inner")
+    both = both[(both > 0).all(axis=1)]
+    if len(both) < 2:
+        return np.nan, np.nan, np.nan, len(both)
+    logs = np.log((both["second"] / both["first"]).to_numpy(float))
+    low, high = mean_t(logs.mean(), logs.std(ddof=1), len(logs))
+    return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high)), len(logs)
+
+
+def _summary(part: pd.DataFrame) -> dict[str, Any]:
+    good, failures = trusted(part), part.loc[part["failure"] != "", "failure"]
+    low, high = wilson(len(failures), len(part))
+    order = sorted(failures.value_counts(sort=False).items(), key=lambda item: (-int(item[1]), str(item[0])))
+    row: dict[str, Any] = {
+        **{"n": len(part), "failed": len(failures), "failed_share": len(failures) / len(part)},
+        **{"failed_low": float(low), "failed_high": float(high)},
+        "reasons": [f"{reason} ({count})" for reason, count in order[:MOST_REASONS]],
+        "converged_share": float(part["converged"].astype(float).mean()),
+        "guess_mm": float(part["guess_tre_mm"].median()),
+    }
+    row |= {name: float(part[name].astype(float).median()) for name in MEDIANS}
+    for name in PARTS:
+        errors = good[[f"tre_{name}_mm", f"predicted_{name}_mm"]].astype(float)
+        errors = errors.where(np.isfinite(errors)).set_axis(["actual", "predicted"], axis="columns")
+        actual, known = errors["actual"], errors.notna().all(axis=1)
+        rms = np.sqrt((errors[known] ** 2).mean())
+        # units resampled
+        sums = np.asarray((errors[known] ** 2).groupby([good.loc[known, key] for key in UNIT]).sum(), float)
+        ratio = _ratio(sums, np.arange(len(sums))[None]).item() if rms["predicted"] > 0 else np.nan
+        ends = bootstrap(partial(_ratio, sums), len(sums)) if rms["predicted"] > 0 else UNKNOWN
+        row |= {
+            f"{name}_median_mm": float(actual.median()),
+            f"{name}_q90_mm": float(actual.quantile(0.9)),
+            f"{name}_rms_mm": float(np.sqrt((actual**2).mean())),
+            **{f"{name}_predicted_mm": float(rms["predicted"]), f"{name}_ratio": ratio},
+            **{f"{name}_ratio_low": ends.low, f"{name}_ratio_high": ends.high},
+        }
+    return row
+
+
+def _ratio(sums: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Ratios (draws,) of actual to predicted root mean square; ``sums`` (n, 2) of squares in each unit of `UNIT`."""
+    total = sums[chosen].sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(total[:, 0] / total[:, 1]))

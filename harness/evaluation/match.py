@@ -6,11 +6,8 @@ import numpy as np
 
 
 def match(truth_m: np.ndarray, found_m: np.ndarray, radius_m: float) -> dict[int, int]:
-    """Pairs {index of truth: index of finding}, closest pairs first, none farther apart than ``radius_m``.
-
-    ``truth_m`` (n, d) and ``found_m`` (m, d) are centres in one frame; findings with NaN match nothing. Ties go to the
-    lower index of truth, then of finding.
-    """
+    """Pairs {index of truth: index of finding}, closest pairs first, none farther apart than ``radius_m``. ``truth_m``
+    (n, d) and ``found_m`` (m, d) are centres in one frame; findings with NaN match nothing. Ties: lower index first."""
     if len(truth_m) == 0 or len(found_m) == 0:
         return {}
     distance = np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1)

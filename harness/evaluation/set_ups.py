@@ -1,15 +1,11 @@
 """Set-ups of one experiment side by side: each one's smallest hole and measures, its camera, and each switch's cost.
-
-The smallest hole that a set-up finds is told twice: as a step on its ladder of sizes, and as the size found in half of
-the trials. The second is a point on a curve drawn through the rates, monotone and otherwise free. It is no probability
-of detection in the handbooks' sense: that needs a model, its goodness of fit and a bound for the 90 % point over many
-targets.
-"""
+The smallest hole that a set-up finds is told as a step on its ladder of sizes, and as the size found in half of the
+trials: a point on a monotone curve through the rates, and no probability of detection in the handbooks' sense."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.intervals import Interval, percentiles
-from harness.evaluation.noise import noise_against_frames
-from harness.evaluation.summary import false_calls
+from harness.evaluation.summary import false_calls, noise_against_frames
 from harness.tables.trials import ResultTables
 
 if TYPE_CHECKING:
@@ -37,60 +32,49 @@ LIMIT_RULE = (
 )
 
 
-# the smallest hole
-
-
 @dataclass(frozen=True)
 class Ladder:
-    """Detections of one set-up at one number of frames.
-
-    ``diameters_mm`` (h,) of the holes, ascending; ``detected`` (repeats, h) bool.
-    """
+    """Detections of one set-up at one number of frames. ``diameters_mm`` (h,) of the holes, ascending; ``detected``
+    (repeats, h) bool."""
 
     diameters_mm: np.ndarray
     detected: np.ndarray
 
     @cached_property
-    def sizes_mm(self) -> np.ndarray:
-        """(s,) the distinct diameters, ascending."""
-        return np.unique(self.diameters_mm)
-
-    @cached_property
     def half_mm(self) -> float:
         """The 50 % size; the ladder's least size where that is found more often than not, infinity where none is."""
         repeats, holes = self.detected.shape
-        return float(half_size(self.sizes_mm, self._rates(np.ones((1, repeats)), np.ones((1, holes))))[0])
+        return float(self._half_sizes(np.ones((1, repeats)), np.ones((1, holes)))[0])
 
     @property
     def at_the_end(self) -> bool:
         """Return whether the 50 % size lies off the ladder, so that only a bound is known."""
-        return not self.sizes_mm[0] < self.half_mm < np.inf
+        return not self.diameters_mm[0] < self.half_mm < np.inf
 
     @cached_property
     def half_draws_mm(self) -> np.ndarray:
-        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap.
-
-        Ladders of the same holes and repeats are resampled alike, so that differences of draws are paired.
-        """
+        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap. Ladders of the same holes and repeats are resampled
+        alike, so that differences of draws are paired."""
         rng = np.random.default_rng(0)
         repeats, holes = self.detected.shape
         of_repeats = rng.multinomial(repeats, np.full(repeats, 1 / repeats), RESAMPLES)
         of_holes = np.empty((RESAMPLES, holes))
-        for size in self.sizes_mm:
+        for size in np.unique(self.diameters_mm):
             alike = self.diameters_mm == size
             of_holes[:, alike] = rng.multinomial(alike.sum(), np.full(alike.sum(), 1 / alike.sum()), RESAMPLES)
-        return half_size(self.sizes_mm, self._rates(of_repeats, of_holes))
+        return self._half_sizes(of_repeats, of_holes)
 
     @property
     def half_interval(self) -> Interval:
         """95 % percentile interval of the 50 % size."""
         return percentiles(self.half_draws_mm)
 
-    def _rates(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
-        """(n, s) detection rate of each size, repeats (n, repeats) and holes (n, h) weighted by how often drawn."""
+    def _half_sizes(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
+        """(n,) 50 % sizes, repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
         by_hole = of_repeats @ self.detected / of_repeats.sum(axis=1, keepdims=True) * of_holes
-        starts = np.searchsorted(self.diameters_mm, self.sizes_mm)
-        return np.asarray(np.add.reduceat(by_hole, starts, axis=1) / np.add.reduceat(of_holes, starts, axis=1))
+        sizes, starts = np.unique(self.diameters_mm, return_index=True)
+        hits, drawn = (np.add.reduceat(of, starts, axis=1) for of in (by_hole, of_holes))
+        return half_size(sizes, hits / drawn)
 
 
 def ladder_of(holes: pd.DataFrame) -> Ladder:
@@ -104,20 +88,16 @@ def ladder_of(holes: pd.DataFrame) -> Ladder:
 def found_limit_mm(summary: pd.DataFrame) -> float:
     """Find the detection limit by `LIMIT_RULE` in summary rows of one set-up and one number of frames; NaN where even
     the largest hole is not found."""
-    limit = float("nan")
-    for diameter in sorted(summary["true_diameter_mm"].unique(), reverse=True):
-        if not (summary["status"][summary["true_diameter_mm"] == diameter] == "found").all():
-            break
-        limit = float(diameter)
-    return limit
+    missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN where there is none
+    return float(summary["true_diameter_mm"][~(summary["true_diameter_mm"] <= missed)].min())
 
 
 def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Find (n,) where rates (n, s), made monotone, first reach one half: by linear interpolation between sizes, in mm.
+    The least size where its rate does already, infinity where none does."""
+    from scipy.optimize import isotonic_regression
 
-    The least size where its rate does already, infinity where none does.
-    """
-    monotone = isotonic(np.asarray(rates, float))
+    monotone = np.array([isotonic_regression(row).x for row in np.asarray(rates, float)])
     reached = monotone >= HALF - 1e-12
     last = np.argmax(reached, axis=1)
     before, rows = np.maximum(last - 1, 0), np.arange(len(monotone))
@@ -125,23 +105,6 @@ def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
     share = np.where(last > 0, (HALF - low) / np.where(high > low, high - low, 1.0), 0.0)
     found = sizes_mm[before] + share * (sizes_mm[last] - sizes_mm[before])
     return np.where(reached.any(axis=1), found, np.inf)
-
-
-def isotonic(rates: np.ndarray) -> np.ndarray:
-    """Isotonic regression with equal weights of each row of (n, s), all rows at once.
-
-    By the max-min formula (Robertson, Wright and Dykstra 1988): at i the largest over a <= i of the least over b >= i
-    of the mean from a to b.
-    """
-    n, s = rates.shape
-    sums = np.concatenate([np.zeros((n, 1)), np.cumsum(rates, axis=1)], axis=1)
-    a, b = np.indices((s, s))
-    means = np.where(b >= a, (sums[:, None, 1:] - sums[:, :-1, None]) / np.maximum(b - a + 1, 1), np.inf)
-    least = np.minimum.accumulate(means[..., ::-1], axis=2)[..., ::-1]
-    return np.asarray(np.where(a <= b, least, -np.inf).max(axis=1))
-
-
-# side by side
 
 
 def set_ups_of(tables: ResultTables) -> list[str]:
@@ -153,15 +116,9 @@ def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
     """Make one row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
-
-    ``holes``; ``found`` and ``undecided`` (lists of names); ``limit_mm`` and ``half_mm`` with ``half_low_mm``,
-    ``half_high_mm`` (without ``half_sizes`` left out, which saves a bootstrap); for each measure ``<measure>_bias_mm``,
-    ``_std_mm``, ``_n`` of all single diameters of found holes against the truth, and ``<measure>_place_*`` likewise of
-    the distances from the largest hole (none where several are the largest); ``threshold``, ``threshold_mm``,
-    ``false_calls``, ``runs``; ``temporal_mm``, ``offset_mm``, ``pattern_mm`` of the averaged z on probe pixels;
-    ``surface_mm``: robust deviation from the fitted surface on undamaged face; and means over hole-free runs of the
-    columns of ``tables.noise``, where it has any.
-    """
+    ``half_*`` need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single diameters of found holes
+    against the truth, ``<measure>_place_*`` of distances from the largest hole (none where several are); noise of the
+    averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
     import pandas as pd
 
     summary = summary[summary["variant"].isin(variants)]
@@ -215,15 +172,10 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
     return row
 
 
-# the costs of switches
-
-
 @dataclass(frozen=True)
 class SwitchCost:
-    """Change of the 50 % size in mm when a switch goes on (positive: only larger holes are found then).
-
-    ``certain``: whether both sizes lie on the ladder, so that the number is no mere bound.
-    """
+    """Change of the 50 % size in mm when a switch goes on (positive: only larger holes are found then). ``certain``:
+    whether both sizes lie on the ladder, so that the number is no mere bound."""
 
     mm: float
     interval: Interval
@@ -232,10 +184,7 @@ class SwitchCost:
 
 @dataclass(frozen=True)
 class EffectCost:
-    """One switch: ``alone`` against nothing on, ``last`` against all others on.
-
-    The two differ where effects add as squares or mask each other.
-    """
+    """One switch: ``alone`` against nothing on, ``last`` against all others on."""
 
     effect: str
     alone: SwitchCost
@@ -254,41 +203,30 @@ class EffectCosts:
 
 
 def effect_costs(tables: ResultTables) -> list[EffectCosts]:
-    """State the costs of every switch, for each place on the other axes and each number of frames; [] without
-    switches."""
+    """State the costs of every switch, for each place on the other axes and number of frames, if any."""
     set_ups = tables.variants[tables.variants["switches"] != ""]
     if set_ups.empty:
         return []
     names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
-    others = list(tables.axes["path"])[1:]
-    groups = set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]
-    found = []
-    for values, part in groups:
+    others, found = list(tables.axes["path"])[1:], []
+    for values, part in set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]:
         place = ", ".join(f"{names[path]}={value}" for path, value in zip(others, values, strict=True))
         switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
-        on = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
-        found += list(_costs(place, on, list(switches[on[max(on, key=len)]]), tables))
+        by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
+        everything = max(by_switches, key=len)
+        holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
+        for frames, rows in holes.groupby("frames"):
+            there = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
+            ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
+            together, effects = _cost(ladders, frozenset(), everything), []
+            for name in switches[by_switches[everything]]:
+                alone = _cost(ladders, frozenset(), frozenset([name]))
+                last = _cost(ladders, everything - {name}, everything)
+                if alone and last:
+                    effects.append(EffectCost(name.replace("_", " "), alone, last))
+            if together is not None:
+                found.append(EffectCosts(place, int(str(frames)), tuple(effects), together))
     return found
-
-
-def _costs(
-    place: str, by_switches: Mapping[frozenset[str], str], names: list[str], tables: ResultTables
-) -> Iterator[EffectCosts]:
-    """Costs at one place; ``by_switches``: the set-up for each set of switches that are on."""
-    everything = max(by_switches, key=len)
-    holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
-    for frames in sorted(int(n) for n in holes["frames"].unique()):
-        there = {str(name): ladder_of(rows) for name, rows in holes[holes["frames"] == frames].groupby("variant")}
-        ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
-        found = [
-            EffectCost(name.replace("_", " "), alone, last)
-            for name in names
-            if (alone := _cost(ladders, frozenset(), frozenset([name])))
-            and (last := _cost(ladders, everything - {name}, everything))
-        ]
-        together = _cost(ladders, frozenset(), everything)
-        if together is not None:
-            yield EffectCosts(place, frames, tuple(found), together)
 
 
 def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> SwitchCost | None:

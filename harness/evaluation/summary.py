@@ -1,11 +1,16 @@
-"""Rates, means and intervals of rows per trial: the numbers of summary.csv, the report and the final table."""
+"""Rates, means and intervals of rows per trial, and the error of an averaged range against the number of frames."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from harness.evaluation import intervals
+from harness.evaluation.intervals import Interval, bootstrap
 from harness.tables.trials import TRIALS, TRUTH
 
 if TYPE_CHECKING:
@@ -26,7 +31,6 @@ FEWEST_TRIALS = 4
 """4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain."""
 GROUP = ["variant", "frames", "hole"]
 TRUTH_COLUMNS = [column.name for column in TRUTH]
-FITTED = ["model_diameter_se_mm", "model_depth_mm", "model_depth_se_mm"]
 
 
 def by_hole(names: pd.Series) -> pd.Series:
@@ -35,20 +39,11 @@ def by_hole(names: pd.Series) -> pd.Series:
 
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """One row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval.
-
-    ``axes``: columns that are the same for all rows of a variant, to be carried along.
-
-    Columns beside the group and the truth: ``n`` trials, ``detected`` of them, ``rate`` with Wilson's interval
-    ``rate_low``/``rate_high`` and ``status`` by `FOUND_RULE`; for the thesis' measure (``extent_``) and the model's
-    (``model_``): ``measured`` trials with a finite diameter, ``diameter_mean_mm``, ``diameter_std_mm`` (n - 1),
-    ``bias_mm`` with Student's interval, ``offset_mean_mm``, ``offset_std_mm``, ``offset_bias_mm``, ``error_mean_mm``;
-    ``model_diameter_se_mean_mm`` and ``model_depth_*`` of the model fit: means, scatter, stated standard errors and the
-    bias against ``seen_depth_mm`` (``true_depth_mm`` is the removed material; behind a through-hole one sees farther),
-    and ``model_diameter_covered``, the share of fits whose diameter lies within 1.96 of its own standard errors of the
-    truth; and ``share_*``, the share of trials in each of `STATES`. Means are over the detected trials only, so they
-    are conditional on detection: a hole detected in few trials shows the sizes of its lucky trials.
-    """
+    """Make one row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval. ``axes``:
+    columns to be carried along. ``status`` is by `FOUND_RULE`; ``extent_`` is the thesis' measure, ``model_`` the
+    fit's, whose depth bias is against ``seen_depth_mm`` (behind a through-hole one sees farther);
+    ``model_diameter_covered``: share of fits within 1.96 standard errors; ``share_*`` of trials in each of `STATES`.
+    Means are over the detected trials only: a hole detected in few trials shows the sizes of its lucky trials."""
     import pandas as pd
 
     holes = with_columns(holes)
@@ -96,19 +91,13 @@ def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, H
 
 def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     """One row per (variant, frames, role): runs, false calls, their rate per run with Garwood's Poisson interval.
-
     Counts only runs that were judged at a threshold: hole-free runs that set it (their threshold is NaN) are told by
-    ``quiet_runs`` and ``quiet_highest``, the highest of their quiet thresholds, instead.
-    """
+    ``quiet_runs`` and ``quiet_highest``, the highest of their quiet thresholds, instead."""
     keys = ["variant", "frames"]
     judged = runs[runs["threshold"].notna()].assign(threshold_mm=lambda r: r["threshold"] * r["scale_mm"])
-    out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(
-        runs=("repeat", "size"),
-        false_calls=("false_calls", "sum"),
-        threshold=("threshold", "mean"),
-        threshold_mm=("threshold_mm", "mean"),
-        surface_noise_mm=("surface_noise_mm", "mean"),
-    )
+    counts, means = {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")}, ("threshold", "threshold_mm")
+    counts |= {name: (name, "mean") for name in (*means, "surface_noise_mm")}
+    out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(**counts)
     quiet = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
     out = out.merge(quiet.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max")), "left", keys)
     out["false_calls"] = out["false_calls"].astype(int)
@@ -119,37 +108,27 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
     """Means, standard deviations and biases of one measure's diameters and offsets."""
-    import pandas as pd
-
     diameter, offset = groups[f"{measure}_diameter_mm"], groups[f"{measure}_offset_mm"]
-    out = pd.DataFrame(index=truth.index)
-    out["measured"] = diameter.count()
-    out["diameter_mean_mm"], out["diameter_std_mm"] = diameter.mean(), diameter.std()
+    out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
     out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(out["bias_mm"], out["diameter_std_mm"], out["measured"])
-    out["offset_mean_mm"], out["offset_std_mm"] = offset.mean(), offset.std()
+    out = out.join(offset.agg(offset_mean_mm="mean", offset_std_mm="std", offset_measured="count"))
     out["offset_bias_mm"] = out["offset_mean_mm"] - truth["true_offset_mm"]
-    out["offset_measured"] = offset.count()
     out["error_mean_mm"] = groups[f"{measure}_error_mm"].mean()
     return out.add_prefix(f"{measure}_")
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
-    import pandas as pd
-
-    fits = holes[[*GROUP, "true_diameter_mm", "model_diameter_mm", *FITTED]].copy()
-    miss = (fits["model_diameter_mm"] - fits["true_diameter_mm"]).abs() / fits["model_diameter_se_mm"]
-    fits["covered"] = (miss <= 1.96).astype(float).where(miss.notna())
-    groups = fits.groupby(GROUP, sort=False)
-    out = pd.DataFrame(index=truth.index)
-    out["model_diameter_se_mean_mm"] = groups["model_diameter_se_mm"].mean()
-    out["model_diameter_covered"] = groups["covered"].mean()
-    out["model_depth_mean_mm"], out["model_depth_std_mm"] = (
-        groups["model_depth_mm"].mean(),
-        groups["model_depth_mm"].std(),
-    )
-    out["model_depth_se_mean_mm"] = groups["model_depth_se_mm"].mean()
+    miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes["model_diameter_se_mm"]
+    covered = (miss <= 1.96).astype(float).where(miss.notna())
+    told = {
+        "model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean"),
+        "model_diameter_covered": ("covered", "mean"),
+    }
+    told |= {f"model_depth_{how}_mm": ("model_depth_mm", how) for how in ("mean", "std")}
+    told |= {"model_depth_se_mean_mm": ("model_depth_se_mm", "mean")}
+    out = holes.assign(covered=covered).groupby(GROUP, sort=False).agg(**told)
     out["model_depth_bias_mm"] = out["model_depth_mean_mm"] - truth["seen_depth_mm"]
     return out
 
@@ -166,13 +145,133 @@ def _order(column: pd.Series) -> pd.Series:
 
 def hole_list(names: Iterable[str]) -> str:
     """Hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
-    numbered = sorted(int(name) for name in names if str(name).isdecimal())
-    others = [str(name) for name in names if not str(name).isdecimal()]
-    runs: list[list[int]] = []
-    for number in numbered:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
+    all_names = [str(name) for name in names]
+    numbered = sorted(int(name) for name in all_names if name.isdecimal())
+    runs = [[number for _, number in run] for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])]
     parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    return ", ".join(parts + others) or "none"
+    return ", ".join([*parts, *(name for name in all_names if not name.isdecimal())]) or "none"
+
+
+BLOCKS = 40
+"""Blocks of neighbouring probe pixels that the bootstrap resamples: a camera's filter correlates neighbours, so pixels
+are not exchangeable; contiguous blocks far larger than the filter nearly are. 40 of them carry a quantile."""
+COLUMNS = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
+COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
+
+
+@dataclass(frozen=True)
+class FloorFit:
+    """``total^2 = white^2 / N + floor^2``: one frame's white noise and what no averaging removes, in mm."""
+
+    white_mm: float
+    floor_mm: float
+
+    def at(self, frames: np.ndarray) -> np.ndarray:
+        """The fitted total error in mm for numbers of frames."""
+        return np.sqrt(self.white_mm**2 / np.asarray(frames, float) + self.floor_mm**2)
+
+
+@dataclass(frozen=True)
+class NoiseLaw:
+    """Effect of averaging on each part of the error. ``slope``: exponent of the temporal noise against the number of
+    frames (white noise: -0.5), with its interval. ``systematic_ratio``: systematic error (offset and pattern) of the
+    longest over the shortest average, interval."""
+
+    slope: float
+    slope_interval: Interval
+    systematic_ratio: float
+    systematic_ratio_interval: Interval
+    few_frames: int
+    many_frames: int
+    pixels: int
+
+
+def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
+    """Make one row per (variant, frames): root mean squares over the probe pixels, in mm. ``temporal``: deviation over
+    repeats. ``offset``: mean error. ``pattern``: deviation over pixels of the mean error, less what few repeats leave
+    in it. ``systematic``: both together. ``displacement``: deviation over repeats of the whole cloud, in no other
+    column. ``guide``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value are out."""
+    import pandas as pd
+
+    rows = []
+    for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
+        moments = _moments(part)
+        if len(moments):
+            variance, offset, *_ = mean = moments.mean(axis=0)
+            pattern2, repeats = float(_pattern_variance(mean, len(moments))), int(part["repeats"].median())
+            parts = [variance, offset**2 + pattern2, variance + offset**2 + pattern2]
+            temporal, systematic, total = np.sqrt(parts)
+            displacement, start = float(part["displacement_std_mm"].median()), (variant, frames, len(moments), repeats)
+            rows.append((*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total))
+    table = pd.DataFrame(rows, columns=COLUMNS)
+    table = table.sort_values("frames", kind="stable").sort_values("variant", kind="stable", ignore_index=True)
+    first = table.groupby("variant")[["frames", "temporal_rms_mm"]].transform("first")
+    table["guide_mm"] = first["temporal_rms_mm"] * np.sqrt(first["frames"] / table["frames"])
+    return table
+
+
+def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> FloorFit | None:
+    """Fit least squares of total^2 on 1/N with both parts non-negative, weighted to equal relative error. None below
+    two different numbers of frames (the two parts cannot be told apart)."""
+    from scipy.optimize import nnls
+
+    n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
+    usable = np.isfinite(total2) & (total2 > 0)
+    if len(np.unique(n[usable])) < 2:
+        return None
+    n, total2 = n[usable], total2[usable]
+    design = np.column_stack([1 / n, np.ones_like(n)]) / total2[:, None]
+    (white2, floor2), _ = nnls(design, np.ones_like(n))
+    return FloorFit(float(np.sqrt(white2)), float(np.sqrt(floor2)))
+
+
+def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
+    """Fit the exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals, of
+    pixels that have a value at every number of frames. None below two of either, or without temporal noise."""
+    rows = probes[probes["variant"] == variant]
+    frames = np.array(sorted(rows["frames"].unique()), float)
+    if len(frames) < 2:
+        return None
+    usable = rows[np.isfinite(rows["mean_error_mm"]) & np.isfinite(rows["temporal_std_mm"])]
+    present = usable.groupby("pixel")["frames"].nunique()
+    common = present.index[present == len(frames)].sort_values()
+    parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
+    stacked = np.stack([_moments(part) for part in parts], axis=1)  # (pixels, frames, 4), pixels that have all
+    pixels = len(stacked)
+    if pixels < 2 or not (stacked[..., 0].mean(axis=0) > 0).all():
+        return None
+    blocks = min(BLOCKS, pixels)
+    edges = np.linspace(0, pixels, blocks + 1).astype(int)
+    sums, counts = np.add.reduceat(stacked, edges[:-1], axis=0), np.diff(edges)
+    x = np.log(frames) - np.log(frames).mean()
+
+    def means(indices: np.ndarray) -> np.ndarray:
+        return sums[indices].sum(axis=1) / counts[indices].sum(axis=1)[:, None, None]
+
+    def slope(indices: np.ndarray) -> np.ndarray:
+        return (0.5 * np.log(means(indices)[..., 0]) @ x) / (x @ x)
+
+    def ratio(indices: np.ndarray) -> np.ndarray:
+        """Systematic error of the longest over the shortest average; NaN where the latter is 0."""
+        mean = means(indices)
+        systematic = np.sqrt(mean[..., 1] ** 2 + _pattern_variance(mean, pixels))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(systematic[:, 0] > 0, systematic[:, -1] / systematic[:, 0], np.nan)
+
+    whole = np.arange(blocks)[None]
+    exponent, change = float(slope(whole)[0]), float(ratio(whole)[0])
+    intervals = bootstrap(slope, blocks), bootstrap(ratio, blocks)
+    return NoiseLaw(exponent, intervals[0], change, intervals[1], int(frames[0]), int(frames[-1]), pixels)
+
+
+def _moments(part: pd.DataFrame) -> np.ndarray:
+    """(pixels, 4): temporal variance, mean error, its square, temporal variance left in the mean error."""
+    error, variance = part["mean_error_mm"].to_numpy(float), part["temporal_std_mm"].to_numpy(float) ** 2
+    moments = np.stack([variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1)
+    return moments[np.isfinite(moments).all(axis=1)]
+
+
+def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:
+    """Variance over pixels of the mean error, less the leftover temporal variance, from means of `_moments`."""
+    unbiased = (mean[..., 2] - mean[..., 1] ** 2) * (pixels / max(pixels - 1, 1))
+    return np.maximum(unbiased - mean[..., 3], 0.0)

@@ -12,16 +12,20 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from harness.experiment.points import recording_of
-from harness.experiment.schema import DETECTOR_NAME, CaptureSource, ExperimentConfig, SimulatedSource
+from harness.experiment.schema import (
+    DETECTOR_NAME,
+    CaptureSource,
+    ExperimentConfig,
+    SimulatedSource,
+    recording_of,
+    splices_of,
+)
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import nearest, wrong_choice
-from harness.vocabulary.declaration.problems import Place, Problem
-from harness.vocabulary.declaration.yaml_source import Source
+from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
+from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.units import MM
-from scenes.field_of_view import check_in_view
-from scenes.perspectives import poses_of, view_count
+from harness.vocabulary.geometry import MM
+from scenes.perspectives import check_in_view, poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
@@ -29,48 +33,44 @@ from scenes.target.drawn import DrawnTargetConfig
 
 CAMERA_NAME = ("source", "camera", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
+TARGET = ("source", "target")
 
 
-def name_problems(source: Source) -> Iterator[Problem]:
-    """Names of cameras and detectors that do not exist; from plain data, so that it works beside other problems."""
+def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
+    """Validate an experiment's data; returns its declaration (None where it is not valid) and all problems."""
+    config, problems = validated(ExperimentConfig, source, splices_of(source.data))
     for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
         name = shape.get(source.data, path)
         if isinstance(name, str) and name not in legal:
-            yield wrong_choice(path, name, legal, source.place_of(path))
-
-
-def joint_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """Everything that a valid declaration can still get wrong."""
-    if config.capture.average.frames is not None:
-        place = source.key_place_of(("capture", "average", "frames"))
-        yield Problem("an experiment counts its frames by `capture.frames`", place, fix="remove this key")
-    if isinstance(config.source, SimulatedSource):
-        yield from _target_problems(config, config.source, source)
-        yield from _mapping_problems(config, config.source, source)
-    else:
-        yield from _capture_problems(config, config.source, source)
-    yield from _study_problems(config, source)
-
-
-def _problem_of(mistake: UserError, place: Place, where: str = "") -> Problem:
-    return Problem(where + mistake.message, place, legal=mistake.legal, fix=mistake.fix)
+            problems.append(wrong_choice(path, name, legal, source.place_of(path)))
+    if config is not None and not problems:
+        if config.capture.average.frames is not None:
+            place = source.key_place_of(("capture", "average", "frames"))
+            message = "an experiment counts its frames by `capture.frames`"
+            problems.append(Problem(message, place, fix="remove this key"))
+        if isinstance(config.source, SimulatedSource):
+            problems += [*_target_problems(config, config.source, source)]
+            problems += [*_mapping_problems(config, config.source, source)]
+        else:
+            problems += _capture_problems(config, config.source, source)
+        problems += _study_problems(config, source)
+    return config, problems
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """A study, a family of boards and a threshold set on boards belong together."""
+    """Find what does not fit between a study, a family of boards and a threshold set on boards."""
     target = config.source.target if isinstance(config.source, SimulatedSource) else None
-    calibrate = config.threshold.calibrate
-    if config.study is None:
-        if isinstance(target, DrawnTargetConfig):
-            fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
-            yield Problem("a family of boards is for a study", source.place_of(("source", "target")), fix=fix)
-        elif calibrate is not None and calibrate.boards is not None:
-            place = source.place_of(("threshold", "calibrate", "boards"))
-            yield Problem("only a study has boards to draw", place, fix="write `repeats` in its place")
-        return
-    if not isinstance(target, DrawnTargetConfig):
+    drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
+    boards_at = source.place_of(("threshold", "calibrate", "boards"))
+    if config.study is None and drawn:
+        fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
+        yield Problem("a family of boards is for a study", source.place_of(TARGET), fix=fix)
+    elif config.study is None and calibrate is not None and calibrate.boards is not None:
+        yield Problem("only a study has boards to draw", boards_at, fix="write `repeats` in its place")
+    elif config.study is not None and not isinstance(target, DrawnTargetConfig):
         fix = "write source.target: {name: drawn}"
-        yield Problem("a study needs a family of boards", source.place_of(("source", "target")), fix=fix)
+        yield Problem("a study needs a family of boards", source.place_of(TARGET), fix=fix)
+    if config.study is None or not isinstance(target, DrawnTargetConfig):
         return
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
@@ -94,40 +94,33 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             boards = f"{calibrate.boards} hole-free boards of {area_m2:.3g} m2"
             message = f"{boards} cannot show {rate_per_m2:g} false calls per m2"
             fix = "simulate more boards or larger ones, or ask for a higher false_calls_per_m2"
-            place = source.place_of(("threshold", "calibrate", "boards"))
-            yield Problem(message, place, f"at least {needed}", fix=fix)
+            yield Problem(message, boards_at, f"at least {needed}", fix=fix)
 
 
 def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
     drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
-    target: TargetConfig | None = None
     try:
         target = simulated.target.declare()
-        mistake = _target_mistake(target)
-    except UserError as error:  # a family of boards that are too full for their damage
-        mistake = error
-    if target is None or mistake is not None:
-        yield _problem_of(mistake or UserError("the target cannot be built"), source.place_of(("source", "target")))
-    elif drawn is None:
+        _checked(target)
+    except UserError as error:  # that includes a family of boards that are too full for their damage
+        yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
+        return
+    if drawn is None:
         yield from _pose_problems(simulated, target, source)
-    else:
-        # the first pose that the camera does not see whole stands for all
-        alone = simulated.model_copy(update={"views": None})
-        for pose in drawn.extreme_poses():
-            posed = target.model_copy(update={"pose": pose})
-            problems = [*_pose_problems(alone, posed, source)]
-            problems += _pose_problems(simulated, posed, source) if simulated.views else ()
-            if problems:
-                where = (
-                    f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm "
-                    f"off the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by "
-                    f"{pose.roll_deg:.3g}°: "
-                )
-                of_camera = problems[0].place in [source.place_of(CAMERA_NAME), source.place_of(CAMERA_NUMBERS)]
-                yield problems[0] if of_camera else replace(problems[0], message=where + problems[0].message)
-                break
-    damages = [*target.holes, *target.dents] if target is not None else []
-    apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(damages, 2)]
+    # the first pose that the camera does not see whole stands for all
+    for pose in drawn.extreme_poses() if drawn else ():
+        posed = target.model_copy(update={"pose": pose})
+        problems = [*_pose_problems(simulated.model_copy(update={"views": None}), posed, source)]
+        problems += _pose_problems(simulated, posed, source) if simulated.views else ()
+        if problems:
+            where = (
+                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
+                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
+            )
+            of_camera = problems[0].place in [source.place_of(CAMERA_NAME), source.place_of(CAMERA_NUMBERS)]
+            yield problems[0] if of_camera else replace(problems[0], message=f"{where}: {problems[0].message}")
+            break
+    apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
         yield Problem(
@@ -139,15 +132,15 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
 
 
 def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Source) -> Iterator[Problem]:
-    """The first pose (of several views the first view) from which the camera does not see the whole face within its
-    range, or finds no albedo at its wavelength; or that the camera cannot be made."""
-    place, views = source.place_of(("source", "views")), simulated.views
+    """Find the first pose (of several views the first view) from which the camera does not see the whole face within
+    its range, or finds no albedo at its wavelength; or that the camera cannot be made."""
+    views, place = simulated.views, source.place_of(("source", "views"))
     try:
-        poses = [target.pose] if views is None else poses_of(views, target.pose)
+        poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
         first = error.errors()[0]
         key, value = str(first["loc"][-1]), first["input"]
-        legal = shape.legal_at(shape.schema_of(type(target.pose))["properties"].get(key))
+        legal = shape.legal_at(shape.Declared(type(target.pose), {}, {}).at((key,)))
         message = f"a view's pose is not legal: {key} would be {value:g}"
         yield Problem(message, place, legal, fix="lower the spread or the sway")
         return
@@ -155,11 +148,11 @@ def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Sou
         found = _camera_mistake(simulated.camera, target.model_copy(update={"pose": pose}))
         if found:
             path, mistake = found
-            if views is None or path != ("source", "target"):
-                yield _problem_of(mistake, source.place_of(path))
-            else:
+            message, at = mistake.message, source.place_of(path)
+            if views is not None and path == TARGET:
                 tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
-                yield _problem_of(mistake, place, f"view {number} of {len(poses)} ({tilts}): ")
+                message, at = f"view {number} of {len(poses)} ({tilts}): {message}", place
+            yield Problem(message, at, legal=mistake.legal, fix=mistake.fix)
             return
 
 
@@ -179,52 +172,43 @@ def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, sour
 
 
 @lru_cache(maxsize=10_000)
-def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[tuple[str, ...], UserError] | None:
+def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
+    path: KeyPath = CAMERA_NUMBERS if config.numbers else CAMERA_NAME
     try:
         optics = camera_of(config).optics
-    except UserError as error:
-        return (CAMERA_NUMBERS if config.numbers else CAMERA_NAME), error
-    try:
+        path = TARGET
         target.at_wavelength(optics.wavelength_nm)
         check_in_view(target, optics)
     except UserError as error:
-        return ("source", "target"), error
+        return path, error
     return None
 
 
-@lru_cache(maxsize=10_000)
-def _target_mistake(target: TargetConfig) -> UserError | None:
-    try:
-        check_target(target)
-    except UserError as error:
-        return error
-    return None
+_checked = lru_cache(maxsize=10_000)(check_target)
 
 
-def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
-    missing = False
+def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> list[Problem]:
+    problems = []
     for index, name in enumerate(capture.paths):
         if not Path(name).exists():
-            missing = True
             near = nearest(Path(name).name, [file.name for file in Path(name).parent.glob("*")])
             place = source.place_of(("source", "paths", index))
-            yield Problem(f"{name}: there is no such file or folder", place, nearest=near)
+            problems.append(Problem(f"{name}: there is no such file or folder", place, nearest=near))
     lens = capture.intrinsics
     if lens and lens not in camera_names() and not Path(lens).is_file():
-        missing = True
-        legal = f"a file, or one of {', '.join(camera_names())}"
-        yield Problem(f"{lens}: neither a file nor a camera", source.place_of(("source", "intrinsics")), legal)
-    if config.mapping is not None:
-        place = source.place_of(("mapping",))
-        yield Problem("a mapping needs the views of a simulated source", place, fix="use harness.detect --register")
-    if not missing:
+        legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
+        problems.append(Problem(f"{lens}: neither a file nor a camera", place, legal))
+    if not problems:
         try:
             recording_of(capture)
         except UserError as error:
-            yield _problem_of(error, source.place_of(("source", "paths")))
+            place = source.place_of(("source", "paths"))
+            problems.append(Problem(error.message, place, legal=error.legal, fix=error.fix))
+    if config.mapping is not None:
+        place, fix = source.place_of(("mapping",)), "use harness.detect --register"
+        problems.append(Problem("a mapping needs the views of a simulated source", place, fix=fix))
     if config.threshold.calibrate is not None:
-        yield Problem(
-            "a threshold can be calibrated only on hole-free repeats, which a capture does not have",
-            source.place_of(("threshold", "calibrate")),
-            legal="a given threshold, such as `k: 3.5`",
-        )
+        message = "a threshold can be calibrated only on hole-free repeats, which a capture does not have"
+        place = source.place_of(("threshold", "calibrate"))
+        problems.append(Problem(message, place, legal="a given threshold, such as `k: 3.5`"))
+    return problems

@@ -8,33 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.dotted import OPTION, overridden, set_path
-from harness.experiment.points import Experiment, recording_of
-from harness.experiment.schema import DETECTOR_SETTINGS, ExperimentConfig, ValuesVariation, declared_of, splices_of
-from harness.experiment.unfold import unfolded
+from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of, recording_of
+from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import validated
-from harness.vocabulary.declaration.problems import DeclarationError, Problem
-from harness.vocabulary.declaration.yaml_source import KeyPath, Source, read_yaml, to_yaml
+from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.versions import check_version, stamp_of, stamped
+from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig, camera_names, load_camera
 
 EXPERIMENT_VERSION = 1
 """Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
 STAMP_KIND = "experiment"
-RESERVED = frozenset(
-    {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
-)
+RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
 """Devices on Windows: no folder of results can be called so there."""
 LENS_NUMBERS = {"lens.fx_px": "fx", "lens.fy_px": "fy", "lens.cx_px": "cx", "lens.cy_px": "cy"}
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
     """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
-
-    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`).
-    """
+    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`)."""
     recording_of.cache_clear()
     written = read_yaml(Path(path))
     # a file that a result folder holds states its version; a file that is written by hand states none
@@ -46,51 +38,38 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     source = _with_absolute_paths(source, Path(path).resolve().parent)
     if calibration is not None:
         source = _with_calibration(source, calibration)
-    config, invalid = validated(ExperimentConfig, source, splices_of(source.data))
-    problems += invalid
-    problems += checks.name_problems(source)
     name = source.data.get("name")
     if isinstance(name, str) and name.lower() in RESERVED:
         message = f"`name` is {name}, which is a device's name on Windows"
         problems.append(Problem(message, source.place_of(("name",)), fix="choose another name"))
-    if config is not None and not problems:
-        problems += checks.joint_problems(config, source)
+    config, invalid = checks.resolved(source)
+    problems += invalid
     points, unfolding = unfolded(source, None if problems else config)
     if problems or unfolding or config is None:
         raise DeclarationError(str(path), [*problems, *unfolding])
-    return Experiment(config, points, _resolved_data(config, source), source)
-
-
-def resolved_yaml(experiment: Experiment) -> str:
-    """The experiment with every default written out, under its version; loading it again gives the same points."""
-    return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
-
-
-def _resolved_data(config: ExperimentConfig, source: Source) -> dict[str, Any]:
-    """Every default written out; but where keys of the detector are varied its settings stay as they are written.
-
-    A detector may fill some settings from others (a preset); written out they would count beside a varied preset.
-    """
-    data = config.to_data()
-    study = config.sensitivity
+    data, study = config.to_data(), config.sensitivity
     varied = [*config.sweep]
     for variation in study.vary if study else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
-    if any(path.startswith("detector") for path in varied):
+    if any(each.startswith("detector") for each in varied):
+        # a detector may fill some settings from others (a preset): written out they would count beside a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
-    return data
+    return Experiment(config, points, data, source)
+
+
+def resolved_yaml(experiment: Experiment) -> str:
+    """Return the experiment with every default written out, under its version; loading it gives the same points."""
+    return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
 
 
 def _with_absolute_paths(source: Source, folder: Path) -> Source:
-    """Paths of a real capture, made absolute: they count from the YAML's folder, in ``--set`` from the current one."""
+    """Make paths of a real capture absolute: they count from the YAML's folder, in ``--set`` from the current one."""
     data = source.data
-    if shape.get(data, ("source", "kind")) != "capture":
-        return source
     listed, lens = (shape.get(data, ("source", key)) for key in ("paths", "intrinsics"))
     places: list[KeyPath] = [("source", "paths", k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     if isinstance(lens, str) and lens not in camera_names():
         places.append(("source", "intrinsics"))
-    for at in places:
+    for at in places if shape.get(data, ("source", "kind")) == "capture" else ():
         name = shape.get(data, at)
         if isinstance(name, str) and name:
             start = Path.cwd() if source.place_of(at).origin == OPTION else folder
@@ -99,7 +78,7 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 
 
 def _with_calibration(source: Source, recording: Path) -> Source:
-    """The recording's lens among the camera's replaced numbers; it counts before what the file says of the lens."""
+    """Put the recording's lens among the camera's replaced numbers; it counts before what the file says of the lens."""
     if shape.get(source.data, ("source", "kind")) != "simulated":
         raise UserError("a real capture brings its own lens", fix="leave out --calibration, or use source.intrinsics")
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
@@ -111,10 +90,8 @@ def _with_calibration(source: Source, recording: Path) -> Source:
 
 
 def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
-    """The ``source.camera.numbers`` with which the cameras look through a recording's own lens.
-
-    Raises UserError where the recording cannot be read, names no lens, or is of another size than a camera's sensor.
-    """
+    """Return the ``source.camera.numbers`` with which the cameras look through a recording's own lens. Raises UserError
+    where the recording cannot be read, names no lens, or is of another size than a camera's sensor."""
     from detectors.recordings import open_capture  # brings the readers of every format
 
     lens = None

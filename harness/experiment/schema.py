@@ -1,20 +1,36 @@
-"""The keys of an experiment's YAML. Ranges of single fields are here; what concerns several together is in `checks`."""
+"""The keys of an experiment's YAML, and its points: all that decides their numbers, and the digests that name them.
+
+Ranges of single fields are here; what concerns several together is in `checks`. A digest covers content that can change
+a number and nothing else: not the name, the number of repeats, or what the other points are. So adding a value to an
+axis leaves every other point, its seeds and its finished trials as they were."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from detectors import detector_names, detector_type
+from detectors import DETECTORS, detector_names, detector_type
 from detectors.average import AverageConfig
 from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.yaml_source import Source
+from harness.vocabulary.files import inside
+from harness.vocabulary.seeds import digest
+from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
-from scenes.render.settings import RenderConfig
-from scenes.sensor.camera import CameraConfig
-from scenes.target.declaration import AnyTargetConfig
+from scenes.sensor.camera import CameraConfig, camera_digest, camera_of, lens_named, lens_names, load_camera
+from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.thesis import AnyTargetConfig
+
+if TYPE_CHECKING:
+    from detectors.recordings import Recording
 
 MAX_FRAMES = 10_000
 MAX_REPEATS = 100_000
@@ -49,8 +65,8 @@ class CaptureSource(Config):
     """Frames come from a real capture; see `detectors.recordings.open_capture`. Paths count from the YAML's folder."""
 
     kind: Literal["capture"]
-    paths: Annotated[tuple[FileName, ...], Field(min_length=1, max_length=100_000)] = Field(
-        description="files or one folder of depth frames"
+    paths: tuple[FileName, ...] = Field(
+        min_length=1, max_length=100_000, description="files or a folder of depth frames"
     )
     unit: str | None = Field(None, description="of stored depth, where the files do not say")
     intrinsics: FileName | None = Field(None, description="a file with the lens, or a camera's name")
@@ -63,8 +79,7 @@ class CaptureConfig(Config):
     average: AverageConfig = AverageConfig()
     exact: bool = Field(
         False,
-        description="whether each simulated frame is drawn; false: a mean is drawn at once where that is equal in "
-        "distribution, in a fraction of the time",
+        description="draw each simulated frame; false: a mean is drawn at once where that is equal in distribution",
     )
 
 
@@ -78,7 +93,7 @@ class DetectorConfig(Config):
 class CalibrateConfig(Config):
     """A threshold from hole-free runs: the lowest k that gives no false cluster in so many ``repeats`` of the same
     set-up; or, in a study, the lowest whose rate of false calls on so many ``boards`` of their own is the one wanted
-    (`harness.evaluation.pod.false_calls.threshold_for_rate`)."""
+    (`harness.evaluation.intervals.threshold_for_rate`)."""
 
     repeats: Repeats | None = None
     boards: Boards | None = Field(None, description="of a study: boards of their own, never judged")
@@ -89,9 +104,8 @@ class CalibrateConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _default_rate(cls, data: Any) -> Any:
-        if not isinstance(data, dict) or data.get("boards") is None or data.get("false_calls_per_m2") is not None:
-            return data
-        return {**data, "false_calls_per_m2": DEFAULT_RATE_PER_M2}
+        needs = isinstance(data, dict) and data.get("boards") is not None and data.get("false_calls_per_m2") is None
+        return {**data, "false_calls_per_m2": DEFAULT_RATE_PER_M2} if needs else data
 
     @model_validator(mode="after")
     def _one_of_the_two(self) -> Self:
@@ -143,19 +157,15 @@ class SensitivityConfig(Config):
     """One-at-a-time variations of the experiment, each run at a few numbers of frames with fewer repeats."""
 
     repeats: Repeats
-    calibration_repeats: Repeats | None = Field(
-        None, description="hole-free repeats of a variation; null: as threshold"
-    )
+    calibration_repeats: Repeats | None = Field(None, description="hole-free ones of a variation; null: as threshold")
     frames: StudyFrames
     vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection: the target is a family of boards, each one drawn at random.
-
-    ``boards`` with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the
-    experiment is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each.
-    """
+    """A study of the probability of detection: the target is a family of boards, each one drawn at random. ``boards``
+    with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the experiment
+    is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each."""
 
     boards: Boards
     hole_free_boards: Boards
@@ -164,9 +174,7 @@ class StudyConfig(Config):
 class ExperimentConfig(Config):
     """One complete experiment, and the axes over which it is swept."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = Field(
-        description="letters, digits, - and _; it names a folder of results"
-    )
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="it names a folder of results")
     title: Annotated[str, Field(max_length=300)] = ""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
@@ -189,14 +197,114 @@ DETECTOR_SETTINGS = ("detector", "settings")
 
 
 def splices_of(data: Any) -> shape.Splices:
-    """The model of the detector's settings where they stand in the data; nothing for a detector that does not exist."""
+    """Return the model of the detector's settings where they stand; nothing for a detector that does not exist."""
     detector = shape.child(data, "detector")
     name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
-    if not isinstance(name, str) or name not in detector_names():
-        return {}
-    return {DETECTOR_SETTINGS: detector_type(name).settings_type}
+    known = isinstance(name, str) and name in detector_names()
+    return {DETECTOR_SETTINGS: detector_type(name).settings_type} if known else {}
 
 
 def declared_of(data: Any) -> shape.Declared:
-    """The declaration that ``data`` is meant to fill, the settings of the detector that it names included."""
+    """Return what ``data`` is meant to fill, the settings of the detector that it names included."""
     return shape.Declared(ExperimentConfig, data, splices_of(data))
+
+
+MAIN = "main"
+"""The only set-up of an experiment whose only axis, if any, is the number of frames."""
+NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "switches", "sensitivity")
+"""Keys that decide which trials are run, not what a trial gives."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
+    ``variant`` is the label of its set-up ("main" where there is one only) or of a variation; ``label`` tells points
+    apart in tables. ``axes``: resolved value of every axis but the number of frames, which is what tells set-ups apart.
+    ``is_variation``: whether it belongs to the sensitivity study; ``reference`` is then the set-up to compare it with,
+    the one with the same ``axes`` (empty where none has them), else the point's own set-up. ``digest`` names the
+    point's numbers, ``frames_key`` those of its frames (source and seed), ``render_key`` those of its render."""
+
+    label: str
+    variant: str
+    values: Mapping[str, Any]
+    config: ExperimentConfig
+    digest: str
+    render_key: str
+    frames_key: str
+    axes: Mapping[str, Any] = field(default_factory=dict)
+    is_variation: bool = False
+    reference: str = MAIN
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A valid experiment, unfolded. ``data`` is the resolved declaration as plain data, ``source`` what was read."""
+
+    config: ExperimentConfig
+    points: tuple[Point, ...]
+    data: Mapping[str, Any]
+    source: Source
+
+    @property
+    def digest(self) -> str:
+        """Names the experiment's results: all points with their repeats, in order."""
+        points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
+        return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
+
+    def folder(self, results: Path) -> Path:
+        """Return ``results/<name>/<digest>``, the folder of the results; UserError where a link leads out of it."""
+        return inside(Path(results), self.config.name, self.digest)
+
+
+def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
+    """Return a point from its resolved declaration."""
+    source = config.source
+    if isinstance(source, CaptureSource):
+        files = [
+            [file.name, _file_digest(file, stat.st_size, stat.st_mtime_ns)]
+            for file in recording_of(source).files
+            for stat in [file.stat()]
+        ]
+        camera_name = lens_names().get(source.intrinsics or "")
+        named = load_camera(camera_name).lens.to_data() if camera_name else None
+        render = frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
+    else:
+        # the full target (of a family of boards what they are drawn from) and the camera's numbers
+        drawn = isinstance(source.target, DrawnTargetConfig)
+        target = source.target.to_data() if drawn else source.target.declare().to_data()
+        camera, work = camera_of(source.camera), source.render.to_data()
+        render = {"target": target, "optics": camera.optics.content(), "render": work}
+        frames = {"kind": source.kind, "target": target, "render": work}
+        frames["camera"] = {**source.camera.to_data(), "facts": camera_digest(camera)}
+        frames |= {} if source.views is None else {"views": source.views.to_data()}
+    numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
+    numbers |= {"source": frames, "detector_version": detector_version(config)}
+    offer = DETECTORS.offer(config.detector.name)
+    numbers |= {} if offer.built_in else {"detector_from": offer.origin}
+    frames_key = digest({"source": frames, "seed": config.seed})
+    return Point(label, variant, values, config, digest(numbers), digest(render), frames_key)
+
+
+def detector_version(config: ExperimentConfig) -> int:
+    """Return the version of the experiment's detector."""
+    kind = detector_type(config.detector.name)
+    return int(kind(kind.settings_type.from_data(config.detector.settings)).version)
+
+
+@lru_cache(maxsize=1000)
+def recording_of(source: CaptureSource) -> Recording:
+    """Open the recording behind a source, its first frame read and checked. Raises UserError for faults of its files.
+    ``intrinsics`` may name a camera, whose nominal lens then counts."""
+    from detectors.recordings import open_capture  # brings the readers of every format
+
+    name = source.intrinsics
+    lens = lens_named(name) if name and name in lens_names() else None
+    file = Path(name) if name and lens is None else None
+    return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)
+
+
+@lru_cache(maxsize=100_000)
+def _file_digest(path: Path, size: int, changed_ns: int) -> str:
+    """Return the digest of a file; size and time of change are arguments so that a changed file is read again."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -1,10 +1,11 @@
-"""Unfolding axes, switches and variations into points: each is validated, problems stand at the value that causes them.
+"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points.
 
-Set-ups of an experiment differ in the axes other than the number of frames, and switches by name.
-"""
+Each point is validated, and problems stand at the value that causes them. Set-ups of an experiment differ in the axes
+other than the number of frames."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +14,119 @@ from math import prod
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.dotted import PathError, get_path, key_path, path_problem, set_path
-from harness.experiment.points import MAIN, Point, point_of
-from harness.experiment.schema import ExperimentConfig, declared_of, splices_of
+from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of, point_of
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import validated
-from harness.vocabulary.declaration.problems import Place, Problem
-from harness.vocabulary.declaration.yaml_source import KeyPath, Source
+from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
+from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Place, Problem, Source, parse_yaml
 from harness.vocabulary.path_names import names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json
+
+OPTION = "--set"
+NOT_VARIED = ("sweep", "sensitivity")
+"""Keys that hold dotted paths themselves."""
+
+
+class PathError(Exception):
+    """A dotted path that leads nowhere in the data."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.message = message
+
+
+def key_path(text: str) -> KeyPath:
+    """Return ``a.b.2.c`` as keys and indices. After ``sweep.`` the rest is one key, as it is in the file."""
+    head, _, rest = text.partition(".")
+    if head == "sweep" and rest:
+        return (head, rest)
+    return tuple(int(part) if part.isascii() and part.isdigit() else part for part in text.split("."))
+
+
+def get_path(data: Any, path: KeyPath) -> Any:
+    """Return the value at a path. Raises PathError where there is none."""
+    for depth, key in enumerate(path):
+        try:
+            data = data[_index(data, key, path[:depth])]
+        except LookupError:
+            raise PathError(f"there is no `{key}`") from None
+    return data
+
+
+def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
+    """Return ``data`` with the value at ``path`` replaced or added; the argument itself stays unchanged. A mapping that
+    is missing on the way is filled with its declared defaults where ``declared`` is given, so that setting one key of
+    it leaves the others at what they would have been. Likewise a key that says which of several kinds a mapping is
+    (``merge.kind``) leaves out what only the former kind has. ``above`` is where ``data`` stands in the declared data.
+    Raises PathError where the way is barred."""
+    if not path:
+        return value
+    key, rest = _index(data, path[0], above), path[1:]
+    here = (*above, key)
+    if isinstance(data, list):
+        if key >= len(data):
+            raise PathError(f"the list has no item {key}; it has {len(data)}, counted from 0")
+        return [*data[:key], set_path(data[key], rest, value, declared, here), *data[key + 1 :]]
+    inner = data.get(key)
+    if key not in data and rest:
+        default = shape.default_at(declared.at(here)) if declared else ()
+        if not default:
+            raise PathError(f"there is no `{key}`")
+        inner = default[0]
+    around = declared.at(above) if declared and not rest else None
+    kinds = shape.kinds_of(around)
+    if kinds and kinds[0] == key:
+        old, new = (shape.model_for(around, kind) for kind in (data, {**data, key: value}))
+        gone = {*(old.model_fields if old else ())} - {*(new.model_fields if new else ())}
+        data = {name: held for name, held in data.items() if name not in gone}
+    return {**data, key: set_path(inner, rest, value, declared, here)}
+
+
+def _index(data: Any, key: str | int, above: KeyPath) -> Any:
+    if isinstance(data, dict):
+        return str(key)
+    if isinstance(data, list) and isinstance(key, int):
+        return key
+    raise PathError(f"`{dotted(above)}` is {shown(data)} here, which has no `{key}`")
+
+
+def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -> Problem | None:
+    """Return the problem of a path that the declaration does not have, with the nearest legal path; else None."""
+    for depth in range(1, len(path) + 1):
+        if declared.at(path[:depth]) is None:
+            known = [dotted(legal) for legal in declared.paths() if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED]
+            found = unknown_key(str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), place)
+            message = f"unknown path `{dotted(path)}`: {found.message}"
+            return Problem(message, place, found.legal, nearest(dotted(path), known))
+    return None
+
+
+def overridden(source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf) -> tuple[Source, list[Problem]]:
+    """Return the source with every legal ``path=value`` applied in order, and what is wrong with the others."""
+    problems: list[Problem] = []
+    parts = [(text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("=")))) for text in overrides]
+    for text, name, written, place in parts:
+        if not name.strip() or not written.strip():
+            fix = "write null for nothing" if "=" in text and name.strip() else None
+            problems.append(Problem("not of the form path=value", place, "capture.frames=10", fix=fix))
+            continue
+        path, declared = key_path(name.strip()), declared_of(source.data)
+        try:
+            value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
+            problem = path_problem(path, declared, place)
+            if problem is None:
+                source = source.with_value(path, set_path(source.data, path, value.data, declared), value)
+            problems += [] if problem is None else [problem]
+        except DeclarationError as error:
+            problems += error.problems
+        except PathError as error:
+            problems.append(Problem(error.message, place))
+    swept = shape.child(source.data, "sweep")
+    for _, name, written, place in parts:
+        if isinstance(swept, dict) and (path_text := name.strip()) in swept:
+            message = f"`{path_text}` is swept, so this value would never be used"
+            problems.append(Problem(message, place, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'"))
+    return source, problems
+
 
 MAX_POINTS = 10_000
 """More than a machine works through in a week; beyond it an axis was mistyped."""
@@ -46,65 +151,51 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """A point before its declaration is resolved. ``frames``: a variation's own numbers of frames."""
+    """A point before its declaration is resolved. ``named_at``: its label in the file where it has one, else its last
+    value; ``frames``: a variation's own numbers of frames."""
 
     label: str
     variant: str
     settings: tuple[Setting, ...]
+    named_at: KeyPath = ()
     is_variation: bool = False
     frames: tuple[Setting, ...] = ()
 
-    @property
-    def named_at(self) -> KeyPath:
-        """Place in the file: its label where it has one, else its last value."""
-        at = self.settings[-1].written_at
-        return (*at[:3], "label") if "set" in at[:4] else at
-
 
 def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
-    """All points of an experiment in order, or all problems of its axes and variations.
-
-    ``config`` is None where the rest of the file is not valid: then axes are checked as far as they can be.
-    """
+    """Return all points of an experiment in order, or all problems of its axes and variations. ``config`` is None where
+    the rest of the file is not valid: then axes are checked as far as they can be."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]
         for path, values in (sweep.items() if isinstance(sweep, dict) else ())
-        if isinstance(values, list)
+        if isinstance(values, list) and values
     ]
     variations = list(_written_variations(source.data))
-    switches = _switches(config, config.switches) if config and config.switches else {}
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
-    problems += _switch_problems(config, switches, source) if config is not None else ()
-    singles = [Draft(_label([setting]), "", (setting,)) for axis in axes for setting in axis]
-    for draft in (*singles, *variations):
-        if not any(True for setting in draft.settings for _ in _path_problems(setting.path, _NOWHERE, source, FIXED)):
-            problems += _value_problems(draft, source, config is not None)
+    switches, mistakes = _switch_axis(config, source) if config is not None and config.switches else ([], [])
+    problems += mistakes
+    for draft in (*(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis), *variations):
+        if not any(True for setting in draft.settings for _ in _path_problems(setting.path, None, source, FIXED)):
+            problems += _resolved(draft, source, config is not None)[1]
     if problems or config is None:
         return (), problems
-    if config.switches:
-        axes = [_switch_axis(config.switches, list(switches)), *axes]
-    points, problems = _points(list(_drafts(axes, variations, config)), config, source)
-    return tuple(_with_references(points, [axis[0].path for axis in axes if len(axis) > 1])), problems
+    axes = [switches, *axes] if switches else axes
+    telling = [axis[0].path for axis in axes if len(axis) > 1 and axis[0].path != FRAMES]
+    return _points([*_drafts(axes, telling, variations, config)], telling, config, source)
 
 
-_NOWHERE = Place("", 0, 1, "")
-
-
-def sameness(value: Any) -> str:
-    """Equal for values that YAML writes in two ways, such as 1 and 1.0; true is not 1."""
+def _sameness(value: Any) -> str:
+    """Return the same text for values that YAML writes in two ways, such as 1 and 1.0; true is not 1."""
     if isinstance(value, Mapping):
-        return canonical_json({key: sameness(inner) for key, inner in value.items()})
+        return canonical_json({key: _sameness(inner) for key, inner in value.items()})
     if isinstance(value, list | tuple):
-        return canonical_json([sameness(inner) for inner in value])
+        return canonical_json([_sameness(inner) for inner in value])
     return repr(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
 
 
-# ---- what is written -------------------------------------------------------------------------------------------------
-
-
 def _written_variations(data: Any) -> Iterator[Draft]:
-    """The variations as they are written, without the study's numbers of frames, as far as they have the right form."""
+    """Yield the variations as they are written, without the study's numbers of frames."""
     vary = shape.get(data, ("sensitivity", "vary"))
     for index, each in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
@@ -113,38 +204,14 @@ def _written_variations(data: Any) -> Iterator[Draft]:
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
                 setting = Setting(path, value, (*at, "values", number))
-                yield Draft(_label([setting]), _label([setting]), (setting,), True, frames)
+                yield Draft(_label([setting]), _label([setting]), (setting,), setting.written_at, True, frames)
         elif isinstance(label, str) and isinstance(together, dict):
             settings = tuple(Setting(key, value, (*at, "set", key)) for key, value in together.items())
-            yield Draft(label, label, settings, True, frames)
+            yield Draft(label, label, settings, (*at, "label"), True, frames)
 
 
 def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
-    """Numbers of frames that are written at a place."""
     return tuple(Setting(FRAMES, n, (*at, k)) for k, n in enumerate(frames if isinstance(frames, list | tuple) else ()))
-
-
-def _switches(config: ExperimentConfig, path: str) -> dict[str, bool]:
-    """The switches at a path, {} where there is anything else."""
-    try:
-        found = get_path(config.to_data(), key_path(path))
-    except PathError:
-        return {}
-    switches = isinstance(found, dict) and all(isinstance(value, bool) for value in found.values())
-    return found if switches else {}
-
-
-def _switch_axis(path: str, names: Sequence[str]) -> list[Setting]:
-    """An axis over a mapping of switches: none on, each alone, all but each, all."""
-    on: dict[str, set[str]] = {"none": set()}
-    on |= {f"{name} alone": {name} for name in names}
-    on |= {f"all but {name}": {*names} - {name} for name in names}
-    on |= {"all": {*names}}
-    distinct = {frozenset(chosen): label for label, chosen in reversed(on.items())}
-    return [
-        Setting(path, {name: name in chosen for name in names}, (SWITCHES,), label.replace("_", " "))
-        for chosen, label in reversed(distinct.items())
-    ]
 
 
 def _label(settings: Iterable[Setting]) -> str:
@@ -152,19 +219,8 @@ def _label(settings: Iterable[Setting]) -> str:
     return ", ".join(said) or "the experiment as it stands"
 
 
-def _set_up_label(settings: Sequence[Setting]) -> str:
-    """The name of one of several set-ups: ``camera=kinect_v2, distance=0.75 m``."""
-    names = names_of(setting.path for setting in settings)
-    return ", ".join(
-        setting.name or f"{names[setting.path]}={value_text(setting.path, setting.value)}" for setting in settings
-    )
-
-
-# ---- what is wrong with it -------------------------------------------------------------------------------------------
-
-
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
-    paths = [axis[0].path for axis in axes if axis]
+    paths = [axis[0].path for axis in axes]
     for path in paths:
         at = source.key_place_of(("sweep", path))
         yield from _path_problems(path, at, source, FIXED)
@@ -172,57 +228,55 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
         if outer:
             message = f"the axes `{outer}` and `{path}` set the same key"
             yield Problem(message, at, fix=f"sweep `{outer}` alone, or only keys within it")
-    for axis in axes:
-        yield from _repeated_values(axis, source)
     count = prod(len(axis) for axis in axes)
     if count > MAX_POINTS:
         yield Problem(f"the axes make {count} points", source.key_place_of(("sweep",)), legal=f"at most {MAX_POINTS}")
 
 
-def _switch_problems(config: ExperimentConfig, switches: Mapping[str, bool], source: Source) -> Iterator[Problem]:
-    """``switches`` must name a mapping of at least two switches, and no axis may set what it sets."""
-    path = config.switches
-    if path is None:
-        return
-    place = source.place_of((SWITCHES,))
-    if len(switches) < 2:
+def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting], list[Problem]]:
+    """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, all."""
+    path, place, problems = config.switches or "", source.place_of((SWITCHES,)), []
+    try:
+        found = get_path(config.to_data(), key_path(path))
+    except PathError:
+        found = None
+    names = [*found] if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values()) else []
+    if len(names) < 2:
         legal = "a mapping of at least two keys that are true or false, such as source.camera.effects"
-        yield Problem(f"`{path}` does not hold switches", place, legal=legal)
+        problems.append(Problem(f"`{path}` does not hold switches", place, legal=legal))
     for axis in config.sweep:
         if f"{axis}.".startswith(f"{path}.") or f"{path}.".startswith(f"{axis}."):
             message = f"the switches `{path}` and the axis `{axis}` set the same key"
-            yield Problem(message, place, fix="sweep other keys, or leave the switches out")
+            problems.append(Problem(message, place, fix="sweep other keys, or leave the switches out"))
+    on = {frozenset[str](): "none", **{frozenset({name}): f"{name} alone" for name in names}}
+    for label, chosen in [(f"all but {name}", frozenset(names) - {name}) for name in names] + [
+        ("all", frozenset(names))
+    ]:
+        on.setdefault(chosen, label)
+    settings = ({name: name in chosen for name in names} for chosen in on)
+    labels = (label.replace("_", " ") for label in on.values())
+    return [Setting(path, each, (SWITCHES,), label) for each, label in zip(settings, labels, strict=True)], problems
 
 
 def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
-    first: dict[str, Draft] = {}
     for draft in variations:
-        yield from _repeated_values(draft.frames, source)
         for setting in draft.settings:
-            is_list = "values" in setting.written_at
-            path_at = source.place_of((*setting.written_at[:3], "path"))
-            at = path_at if is_list else source.key_place_of(setting.written_at)
+            listed = source.place_of((*setting.written_at[:3], "path"))
+            at = listed if "values" in setting.written_at else source.key_place_of(setting.written_at)
             yield from _path_problems(setting.path, at, source, (*FIXED, FRAMES))
-        twin = first.setdefault(draft.label, draft)
-        if twin is not draft:
-            here, there = (source.place_of(each.named_at) for each in (draft, twin))
-            message, fix = f"two variations are called `{draft.label}`", "give each its own label or value"
-            yield Problem(message, here, other=there, other_says="the first is at", fix=fix)
     # variations at a number of frames that the main experiment does not have could be compared with nothing
-    swept = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
-    main = swept or [shape.get(source.data, ("capture", "frames"))]
+    main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
+    main = main or [shape.get(source.data, ("capture", "frames"))]
     written = _frame_settings(shape.get(source.data, ("sensitivity", "frames")), ("sensitivity", "frames"))
-    yield from _repeated_values(written, source)
     for setting in written:
         if setting.value not in main:
-            legal = "of " + ", ".join(dict.fromkeys(str(n) for n in main if isinstance(n, int)))
             message = (
                 f"{setting.value} frames are not run in the main experiment, so that there is nothing to compare with"
             )
-            yield Problem(message, source.place_of(setting.written_at), legal)
+            yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))
 
 
-def _path_problems(path: str, place: Place, source: Source, fixed: Iterable[str]) -> Iterator[Problem]:
+def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterable[str]) -> Iterator[Problem]:
     if any(path == key or path.startswith(key + ".") for key in fixed):
         reason = "set by `sensitivity.frames`" if path == FRAMES else "the same for all points"
         yield Problem(f"`{path}` cannot be varied here: it is {reason}", place)
@@ -230,126 +284,88 @@ def _path_problems(path: str, place: Place, source: Source, fixed: Iterable[str]
         yield problem
 
 
-def _repeated_values(axis: Iterable[Setting], source: Source) -> Iterator[Problem]:
-    first: dict[str, Setting] = {}
-    for setting in axis:
-        twin = first.setdefault(sameness(setting.value), setting)
-        if twin is not setting:
-            here, there = (source.place_of(each.written_at) for each in (setting, twin))
-            message = f"{on_one_line(setting.value)} is in this list twice"
-            yield Problem(message, here, other=there, other_says="first at", fix="keep one")
-
-
-def _value_problems(draft: Draft, source: Source, base_is_valid: bool) -> Iterator[Problem]:
-    """Problems that one value (or one labelled set) makes by itself; the rest of the file reports its own."""
+def _resolved(draft: Draft, source: Source, all_told: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
+    """Return the declaration of one point, its values set and no axes left, or what is wrong with it: at the value that
+    is itself wrong, else (``all_told``) under the point's name."""
     place = source.place_of(draft.named_at)
+    located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
     try:
-        located = _located(draft, source)
+        for setting in draft.settings:
+            path = key_path(setting.path)
+            changed = set_path(located.data, path, setting.value, declared_of(located.data))
+            located = located.with_value(path, changed, source, setting.written_at)
     except PathError as error:
-        yield Problem(error.message, place)
-        return
+        return None, [Problem(error.message, place)]
+    config, found = checks.resolved(located)
     starts = [setting.written_at for setting in draft.settings]
-    own = {
-        written
-        for places in (source.values, source.keys)
-        for at, written in places.items()
-        if any(at[: len(start)] == start for start in starts)
-    }
-    for problem in _resolved(located)[1]:
-        if problem.place in own:
-            yield problem
-        elif base_is_valid:
-            yield replace(problem, message=f"with {draft.label}: {problem.message}", place=place)
+    written = (item for places in (source.values, source.keys) for item in places.items()) if found else ()
+    own = {here for at, here in written if any(at[: len(start)] == start for start in starts)}
+    elsewhere = f"with {draft.label}: " if draft.settings else ""
+    return config, [
+        each if each.place in own else replace(each, message=elsewhere + each.message, place=place)
+        for each in found
+        if each.place in own or all_told
+    ]
 
 
-# ---- points ----------------------------------------------------------------------------------------------------------
-
-
-def _drafts(axes: list[list[Setting]], variations: list[Draft], config: ExperimentConfig) -> Iterator[Draft]:
-    """The product of the axes, the last one fastest; then every variation at every number of frames of the study."""
-    telling = {axis[0].path for axis in axes if len(axis) > 1} - {FRAMES}
+def _drafts(
+    axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
+) -> Iterator[Draft]:
+    """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
+    names = names_of(telling)
     for settings in product(*axes):
-        named = [setting for setting in settings if setting.path in telling]
-        yield Draft(_label(settings), _set_up_label(named) if telling else MAIN, settings)
-    if config.sensitivity is None:
-        return
-    common = _frame_settings(config.sensitivity.frames, ("sensitivity", "frames"))
+        # a set-up is called like ``camera=kinect_v2, distance=0.75 m``
+        said = [s.name or f"{names[s.path]}={value_text(s.path, s.value)}" for s in settings if s.path in telling]
+        yield Draft(_label(settings), ", ".join(said) or MAIN, settings, settings[-1].written_at if settings else ())
+    common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
     for variation in variations:
         for frames in variation.frames or common:
-            label = f"{variation.label}, {FRAMES}={frames.value}"
-            yield Draft(label, variation.label, (frames, *variation.settings), True)
+            label, settings = f"{variation.label}, {FRAMES}={frames.value}", (frames, *variation.settings)
+            yield replace(variation, label=label, variant=variation.label, settings=settings)
 
 
-def _points(drafts: list[Draft], experiment: ExperimentConfig, source: Source) -> tuple[list[Point], list[Problem]]:
+def _points(
+    drafts: list[Draft], axes: list[str], experiment: ExperimentConfig, source: Source
+) -> tuple[tuple[Point, ...], list[Problem]]:
     points: list[Point] = []
     problems: list[Problem] = []
-    first: dict[str, Draft] = {}
+    called: dict[str, list[str]] = {}
+    known: dict[tuple[str, str], Draft] = {}
+    set_ups: dict[str, str] = {}
     for draft in drafts:
         # a set-up and a variation, or two set-ups whose long values are shortened alike, could not be told apart
-        twin = first.setdefault(draft.variant, draft)
-        others = ([sameness(s.value) for s in each.settings if s.path != FRAMES] for each in (draft, twin))
-        if next(others) != next(others):
-            place = source.place_of(draft.named_at)
+        values = [_sameness(setting.value) for setting in draft.settings if setting.path != FRAMES]
+        if called.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
-            problems.append(Problem(message, place, fix="give one another label"))
-            break
-    known: dict[str, Draft] = {}
+            return (), [Problem(message, source.place_of(draft.named_at), fix="give one another label")]
     for draft in drafts:
-        config, found = _resolved(_located(draft, source))
+        config, found = _resolved(draft, source, True)
+        problems += found
+        if len(problems) >= MAX_SHOWN:
+            break
         if config is None or found:
-            problems += [replace(each, message=f"with {draft.label}: {each.message}") for each in found]
-            if len(problems) >= MAX_SHOWN:
-                break
             continue
-        values = {setting.path: setting.value for setting in draft.settings}
-        if draft.is_variation and experiment.sensitivity is not None:
-            study, calibrate = experiment.sensitivity, config.threshold.calibrate
+        study, calibrate = experiment.sensitivity, config.threshold.calibrate
+        if draft.is_variation and study is not None:
             if calibrate is not None and calibrate.repeats is not None and study.calibration_repeats is not None:
                 calibrate = calibrate.model_copy(update={"repeats": study.calibration_repeats})
             threshold = config.threshold.model_copy(update={"calibrate": calibrate})
             config = config.model_copy(update={"repeats": study.repeats, "threshold": threshold})
-        point = replace(point_of(draft.label, draft.variant, values, config), is_variation=draft.is_variation)
-        twin = draft if draft.is_variation else known.setdefault(point.digest, draft)
+        # the resolved values of the axes tell set-ups apart, and which of them a variation is to be compared with
+        data, placed = json.loads(json.dumps(config.to_data())) if axes else {}, dict[str, Any]()
+        for path in axes:
+            with contextlib.suppress(PathError):
+                placed[path] = None
+                placed[path] = get_path(data, key_path(path))
+        point = point_of(draft.label, draft.variant, {s.path: s.value for s in draft.settings}, config)
+        reference = draft.variant
+        if draft.is_variation:
+            reference = set_ups.get(_sameness(placed), "")
+        else:
+            set_ups.setdefault(_sameness(placed), draft.variant)
+        twin = known.setdefault((point.digest, draft.variant if draft.is_variation else ""), draft)
         if twin is not draft:
-            place = source.place_of(draft.named_at)
-            problems.append(Problem(f"the points {draft.label} and {twin.label} are the same experiment", place))
-        points.append(point)
-    return points, problems
-
-
-def _located(draft: Draft, source: Source) -> Source:
-    """The source of one point: its values set, with the places where they are written; no axes left."""
-    data = {key: value for key, value in source.data.items() if key not in ("sweep", "sensitivity")}
-    located = replace(source, data=data)
-    for setting in draft.settings:
-        path = key_path(setting.path)
-        changed = set_path(located.data, path, setting.value, declared_of(located.data))
-        located = located.with_value(path, changed, source, setting.written_at)
-    return located
-
-
-def _resolved(located: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
-    config, problems = validated(ExperimentConfig, located, splices_of(located.data))
-    problems += checks.name_problems(located)
-    if config is not None and not problems:
-        problems += checks.joint_problems(config, located)
-    return config, problems
-
-
-def _with_references(points: Sequence[Point], axes: Iterable[str]) -> list[Point]:
-    """The points with the values of ``axes`` from their resolved declarations, and with what to compare them with."""
-    paths = [path for path in axes if path != FRAMES]
-    placed = []
-    for point in points:
-        data, values = json.loads(json.dumps(point.config.to_data())), {}
-        for path in paths:
-            try:
-                values[path] = get_path(data, key_path(path))
-            except PathError:
-                values[path] = None
-        placed.append(replace(point, axes=values))
-    set_ups = {sameness(point.axes): point.variant for point in placed if not point.is_variation}
-    return [
-        replace(point, reference=set_ups.get(sameness(point.axes), "") if point.is_variation else point.variant)
-        for point in placed
-    ]
+            message = f"the points {draft.label} and {twin.label} are the same experiment"
+            problems.append(Problem(message, source.place_of(draft.named_at), fix="keep one"))
+        points.append(replace(point, is_variation=draft.is_variation, axes=placed, reference=reference))
+    return tuple(points), problems

@@ -1,26 +1,30 @@
-"""The arguments of `harness.detect` as settings: a detector, a way from views to one cloud, captures, averages."""
+"""The arguments of `harness.detect` as settings: a detector, a way from views to one cloud, captures, stated poses."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.provenance import RESULTS_VERSION, check_version
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from detectors.interface import Detector
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
-    from harness.vocabulary.capture import Cloud
+    from harness.vocabulary.geometry import Lens
 
 METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
 MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat")
+DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 PREFIX = "mapping."
 """Start of the --set keys that concern the way from views to one cloud; all others are the detector's."""
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop", "variant")
@@ -40,32 +44,22 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             raise UserError(what, legal=several)
         whole = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
         if len(paths) > 1 and whole:
-            raise UserError(
-                f"{len(paths)} PATHs, and {whole[0]} is a capture of its own",
-                legal="one capture: a folder, a file of many frames, or a list of .png, .ply or .pcd",
-                fix=f"run each alone, or, as views of one target, together: {several}",
-            )
+            fix = f"run each alone, or, as views of one target, together: {several}"
+            raise UserError(f"{len(paths)} PATHs, and {whole[0]} is a capture of its own", fix=fix)
         return
     if len(paths) < 2:
-        raise UserError(
-            f"{len(paths)} view to register: there is nothing to register it to",
-            legal="two or more PATHs, each a capture of its own",
-            fix="name the other views, or leave out --register",
-        )
+        fix = "name the other views, or leave out --register"
+        raise UserError(f"{len(paths)} view to register: there is nothing to register it to", fix=fix)
     places = [path.resolve() for path in paths]
-    twice = next((path for path, place in zip(paths, places, strict=True) if places.count(place) > 1), None)
-    if twice is not None:
-        raise UserError(
-            f"{twice}: is named twice; the same noise counted twice would pass for less noise",
-            legal="captures from different places, each named once",
-        )
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            legal = "captures from different places, each named once"
+            raise UserError(f"{path}: is named twice; the same noise counted twice would pass for less", legal=legal)
     if arguments.register == "nominal" and arguments.poses is None:
         raise UserError("--register nominal takes the poses as they are, and there are none", fix="give --poses FILE")
     if arguments.quiet_capture is not None:
-        raise UserError(
-            "--quiet-capture is one cloud, and its noise is not that of a cloud merged from several views",
-            fix="run the undamaged views in the same way, and give the threshold that is silent there as --threshold",
-        )
+        what = "--quiet-capture is one cloud, and its noise is not that of a cloud merged from several views"
+        raise UserError(what, fix="give a threshold that is silent on undamaged views as --threshold")
 
 
 def detector_of(
@@ -111,30 +105,23 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     automatic crop's candidate where one is chosen. Raises UserError on anything else."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        raise UserError(
-            f"--target {target}: chooses among the surfaces that the automatic crop finds, and --crop {text} is"
-            " another crop",
-            legal="--target with --crop auto",
-            fix="leave out one of the two",
-        )
+        what = f"--target {target}: chooses among what --crop auto finds, and --crop {text} is another crop"
+        raise UserError(what, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
     except ValueError as error:
         raise UserError(f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP) from error
+    pairs = [numbers[i : i + 2] for i in range(0, len(numbers), 2)]
     if kind in ("auto", "none") and not numbers:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
-        x, y, z = numbers[0:2], numbers[2:4], numbers[4:6]
-        for axis, (low, high) in zip("xyz", (x, y, z), strict=True):
+        for axis, (low, high) in zip("xyz", pairs, strict=True):
             if not low < high:
-                raise UserError(
-                    f"--crop {text}: {axis}0 = {low:g} is not below {axis}1 = {high:g}",
-                    legal=LEGAL_CROP,
-                    fix="state the smaller bound of each axis first",
-                )
-        return {"kind": "box", "x_mm": x, "y_mm": y, "z_mm": z, "range_max_m": None}
+                what = f"--crop {text}: {axis}0 = {low:g} is not below {axis}1 = {high:g}"
+                raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
+        return {"kind": "box", "x_mm": pairs[0], "y_mm": pairs[1], "z_mm": pairs[2], "range_max_m": None}
     if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
-        return {"kind": "polygon", "vertices_px": [numbers[i : i + 2] for i in range(0, len(numbers), 2)]}
+        return {"kind": "polygon", "vertices_px": pairs}
     raise UserError(f"--crop {text}: no such crop", legal=LEGAL_CROP)
 
 
@@ -155,40 +142,102 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
     settings[leaf] = value
 
 
-def opened(arguments: argparse.Namespace, paths: list[Path]) -> Recording:
-    """Open a capture; --intrinsics may name a camera, whose nominal lens then counts."""
+def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any) -> Recording:
+    """Open a capture; ``intrinsics`` names a file, or a camera, whose nominal lens then counts. ``reading``: the other
+    options of `detectors.recordings.open_capture`."""
     from detectors.recordings import open_capture
 
-    lens, file = None, None
-    if arguments.intrinsics is not None:
+    file = None
+    if intrinsics is not None:
         from scenes.sensor.camera import lens_named, lens_names
 
-        file = Path(arguments.intrinsics)
-        if arguments.intrinsics in lens_names():
-            lens, file = lens_named(arguments.intrinsics), None
-        elif not file.exists():
+        if intrinsics in lens_names():
+            lens = lens_named(intrinsics)
+        elif not (file := Path(intrinsics)).exists():
             legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
-    return open_capture(
-        paths,
-        unit=arguments.unit,
-        intrinsics=file,
-        lens=lens,
-        frames=slice(arguments.max_frames) if arguments.max_frames else None,
-        topic=arguments.topic,
-        array=arguments.array,
-        pitch=arguments.pitch,
-        raw=arguments.raw,
-    )
+    return open_capture(list(paths), intrinsics=file, lens=lens, **reading)
 
 
-def averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
-    """Return the capture's average as --average says."""
-    from itertools import islice
+# ---------------------------------------------------------------- poses
 
-    from detectors.average import AverageConfig, average
-    from detectors.noise import REACH_FRAMES, noise_reach_px
 
-    cloud = average(recording, AverageConfig(method=arguments.average))
-    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
-    return replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
+POSES_KEY = "T_reference_view"  # key of the list in a file of `harness.export`, beside the file's version
+LEGAL_POSES = (
+    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
+    f" under the key {POSES_KEY}; or lines of"
+    " `timestamp tx ty tz qx qy qz qw`, one for each view"
+)
+RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+FARTHEST_M = 100.0
+"""Largest distance of two views of one target: several times any such camera's range. Poses in millimetres lie beyond.
+"""
+
+
+def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame.
+
+    Raises UserError where the file cannot be read, is larger than `limits.TEXT_BYTES` or of a newer version, holds
+    another number of poses, one that is not rigid, or one farther than `FARTHEST_M` from the first.
+    """
+    import numpy as np
+
+    from harness.vocabulary.geometry import invert
+
+    try:
+        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8")
+        poses = _from_json(path, text) if text.lstrip().startswith(("[", "{")) else _from_lines(path, text)
+    except (OSError, ValueError, TypeError, OverflowError) as error:
+        why = f"cannot be read ({error.strerror})" if isinstance(error, OSError) else f"holds no poses ({error})"
+        raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
+    if len(poses) != count:
+        fix = "keep one pose for each PATH, in the same order (of a sequence's groundtruth.txt one line a view)"
+        raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES, fix=fix)
+    from_first = [np.eye(4)]
+    for number, pose in enumerate(poses):
+        turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
+        with np.errstate(over="ignore", invalid="ignore"):
+            is_rigid = np.allclose(turn @ turn.T, np.eye(3), atol=RIGID_WITHIN) and np.linalg.det(turn) > 0
+        if not (is_rigid and np.isfinite(pose).all() and np.array_equal(pose[3], [0, 0, 0, 1])):
+            raise UserError(f"{path}: pose {number} is no rigid 4x4 transform", legal=LEGAL_POSES)
+        if number:
+            with np.errstate(over="ignore", invalid="ignore"):
+                from_first.append(invert(poses[0]) @ pose)
+                distance_m = float(np.linalg.norm(from_first[-1][:3, 3]))
+            if not distance_m <= FARTHEST_M:  # or NaN, where numbers are near the largest
+                what = f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to {FARTHEST_M:g} m)"
+                raise UserError(what, fix="write translations in metres, not millimetres")
+    return tuple(from_first)
+
+
+def _from_json(path: Path, text: str) -> list[np.ndarray]:
+    """Parse a list of matrices: bare, or in an object that `harness.export` wrote, or without version by hand."""
+    import numpy as np
+
+    data = strict_json(text)
+    if isinstance(data, dict):
+        if "results_version" in data:
+            check_version(data["results_version"], RESULTS_VERSION, path, "a file of poses")
+        if POSES_KEY not in data:
+            raise ValueError(f"an object without the key {POSES_KEY}")
+        data = data[POSES_KEY]
+    return [np.array(each, float) for each in data]
+
+
+def _from_lines(path: Path, text: str) -> list[np.ndarray]:
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    poses = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            try:
+                _, *shift, x, y, z, w = map(float, line.split())
+            except ValueError:
+                shift = []
+            if len(shift) != 3 or not abs(np.linalg.norm([x, y, z, w]) - 1) < RIGID_WITHIN:
+                raise UserError(f"{path}:{number}: is no pose", legal=LEGAL_POSES)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), shift
+            poses.append(pose)
+    return poses

@@ -4,34 +4,159 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import math
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.inspection import told
-from harness.inspection.arguments import PREFIX, averaged, detector_of, mapping_of, opened, refuse_misfits
-from harness.inspection.judging import analysed, judged, threshold_of, with_faint_told
-from harness.inspection.poses import read_poses
+from harness.inspection.arguments import (
+    DEFAULT_FALSE_CALLS,
+    PREFIX,
+    detector_of,
+    mapping_of,
+    opened,
+    read_poses,
+    refuse_misfits,
+)
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.units import MM
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.provenance import RESULTS_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from detectors.interface import Detector
+    from detectors.crop import Choice
+    from detectors.interface import Detection, Detector, Evidence, Measurement
     from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
-    from detectors.target import Choice
+    from detectors.registration.registered import Registration
     from detectors.views import PreparedView, View
     from harness.report.findings import Judged
+    from harness.vocabulary.geometry import Cloud
+
+DEFAULT_K = 5.0
+"""Robust standard deviations, where the capture cannot tell better: of a million normal pixels 0.6 lie beyond by
+chance. Real surfaces are not that kind."""
+FAINT_CALLS = 0.05
+"""Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
+FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
+THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
+
+
+def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
+    """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
+    from detectors.measure import measure_extents
+    from detectors.missing import measure_missing, missing_returns, one_damage_once
+    from detectors.null import each_object_once
+    from harness.report.findings import Judged
+
+    missing = missing_returns(cloud, evidence)
+    unseen = () if missing is None else missing.detections
+    searched = detector.find(cloud, evidence, threshold)
+    found = one_damage_once(cloud.valid.shape, each_object_once(cloud, evidence, searched), unseen)
+
+    def measure(each: Detection) -> Measurement:
+        if each.kind == "object":
+            return measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
+        return (measure_missing if each.kind == "no return" else detector.measure)(cloud, evidence, each)
+
+    return Judged(cloud, evidence, found, tuple(map(measure, found)), missing)
+
+
+def analysed(detector: Detector, cloud: Cloud) -> Evidence:
+    """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
+    from detectors.background import misfit
+
+    evidence = detector.analyse(cloud)
+    doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
+    return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
+
+
+def refuse_thresholds(arguments: argparse.Namespace) -> None:
+    """Raise UserError where several arguments set the threshold, or where its value is none."""
+    given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
+    if len(given) > 1:
+        raise UserError(
+            f"{' and '.join(given)} {'both' * (len(given) == 2) or 'all'} set the threshold", fix="give one of them"
+        )
+    for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
+        if value is not None and not 0 < value < float("inf"):
+            raise UserError(f"--{name} {value:g}", legal="a number above 0")
+
+
+def threshold_of(
+    arguments: argparse.Namespace,
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    quiet: Callable[[], tuple[float, str]],
+) -> tuple[float, str, Evidence]:
+    """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
+    (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
+    rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
+    from detectors.null import own_threshold
+
+    if arguments.threshold is not None:
+        return arguments.threshold, "given", evidence
+    if arguments.quiet_capture is not None:
+        return *quiet(), evidence
+    default = getattr(detector, "default_threshold", None)
+    if default is not None and arguments.false_calls is None:
+        return float(default), "the detector's own", evidence
+
+    own = own_threshold(detector, cloud, evidence, arguments.false_calls or DEFAULT_FALSE_CALLS)
+    names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
+    notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
+    told = f"{own.peaks} peaks towards the camera"
+    if own.objects:
+        told += f"; beside objects, tags and edges in the picture ({own.objects} places), where more are to be expected"
+    if not cloud.organised:
+        told += "; objects on the target were not looked for"
+    if own.rim_pixels:
+        told += f"; {own.rim_pixels} pixels along the rim mix in what lies behind it and are not judged"
+    if own.doubts:
+        k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
+        warnings = tuple(f"the capture cannot set its own threshold, {k:.3g} is used: {why}" for why in own.doubts)
+        origin = f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {told}"
+        return k, origin, replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings))
+    expected, low, high = map(_calls, (own.expected, own.low, own.high))
+    calls = f"{expected} false calls expected, 95 % interval {low} to {high}, from {told}"
+    return own.threshold, f"from this capture's own null: {calls}", replace(own.evidence, notes=notes)
+
+
+def with_faint_told(judged: Judged, threshold: float) -> Judged:
+    """Add a warning where noise explains more of the findings than false calls are expected, in a capture that set its
+    own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
+    noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
+    null = judged.evidence.notes.get("own_null", {"threshold": None})
+    if threshold != null["threshold"] or null["peaks"] < FAINT_PEAKS or not FAINT_CALLS < null["high"] < null["peaks"]:
+        return judged
+    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
+    sure = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
+    faint = [str(each.id) for each in judged.findings if each.kind != "no return" and each.score < sure]
+    if len(faint) <= max(null["expected"], 1.0) + 1e-6:
+        return judged
+    warning = (
+        f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)}) are so faint that noise explains them:"
+        f" {_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
+    )
+    evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
+    return replace(judged, evidence=evidence)
+
+
+def _calls(expected: float) -> str:
+    return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
+
+
+# ---------------------------------------------------------------- the program
+
 
 START_FROM_MARKS = ("icp", "cpd")
 """Methods that need a place to start from. `joint` finds its own by marks, `odometry` uses none and goes from view to
@@ -41,22 +166,16 @@ LOOPING = ("marks", "icp", "cpd")
 
 
 @dataclass(frozen=True)
-class Merging:
-    """Several views as one cloud: the settings, the views with their registrations, and checks of these."""
-
-    config: MappingConfig
-    mapped: Mapped
-    checks: told.Checks
-
-
-@dataclass(frozen=True)
 class Inspection:
-    """Everything that a run knows when it is time to tell it. ``merging`` is None for one capture."""
+    """Everything that a run knows when it is time to tell it. ``mapped`` is None for one capture; ``registrations``:
+    data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
     choices: list[Choice | None]
-    merging: Merging | None
+    config: MappingConfig | None
+    mapped: Mapped | None
+    registrations: dict[str, Any]
     detector: Detector
     settings: dict[str, Any]
     result: Judged
@@ -66,8 +185,8 @@ class Inspection:
     @property
     def cell_m(self) -> float | None:
         """The side of a map's cells, None where the cloud is no map."""
-        surface_map = None if self.merging is None else self.merging.mapped.merged.surface_map
-        return None if surface_map is None else surface_map.cell_m
+        surface_map = self.mapped.merged.surface_map if self.mapped else None
+        return surface_map.cell_m if surface_map else None
 
 
 def inspect(arguments: argparse.Namespace) -> int:
@@ -75,80 +194,80 @@ def inspect(arguments: argparse.Namespace) -> int:
 
     Raises UserError for faults of the files, where a view cannot be registered, and where nothing can be judged.
     """
+    from detectors.views import View
+
     config = mapping_of(arguments) if arguments.register is not None else None
-    paths = arguments.paths if config is None else arguments.paths[: config.views]
+    paths = arguments.paths[: config.views] if config else arguments.paths
     refuse_misfits(arguments, paths)
+    refuse_thresholds(arguments)
     own_settings = [each for each in arguments.set if config is None or not each.startswith(PREFIX)]
     detector, settings = detector_of(arguments, "none" if config else arguments.crop, own_settings)
     guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
-    recordings = [opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
-    wants_quiet = arguments.quiet_capture is not None and arguments.threshold is arguments.false_calls is None
-    quiet = opened(arguments, [arguments.quiet_capture]) if wants_quiet else None
+    recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
+    quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
-    merging: Merging | None = None
-    if config is None:
+    # a view's name is its path's last part, or the whole path where these are not distinct
+    names = [path.resolve().name for path in paths] if config else [recordings[0].name]
+    names = names if len(set(names)) == len(names) else list(map(str, paths))
+    views: list[View] = []
+    choices: list[Choice | None] = []
+    for name, recording, guess in zip(names, recordings, guesses, strict=False):
         if arguments.frames_report:
-            told.print_frames(recordings[0])
-        cloud = averaged(arguments, recordings[0])
-        choices = [told.choice_by(getattr(detector, "settings", None), cloud)]
-    else:
-        views = _views(arguments, paths, recordings, guesses)
-        choices = []
-        for view in views:
-            with _mistakes_named(view):
-                choices.append(told.choice_by(config, view.cloud))
-        merging = _merged(arguments, config, recordings, views, choices)
-        cloud = merging.mapped.merged.cloud
-
-    evidence = analysed(detector, cloud)
+            told.print_frames(recording)
+        views.append(View(name, _averaged(arguments, recording), guess))
+    for view in views:
+        with _mistakes_named(view if config else None):
+            choices.append(told.choice_by(config or getattr(detector, "settings", None), view.cloud))
+    mapped, registrations = None, dict[str, Any]()
+    if config:
+        mapped, registrations = _merged(arguments, config, recordings, views, choices)
+    cloud = mapped.merged.cloud if mapped else views[0].cloud
 
     def silent_threshold() -> tuple[float, str]:
-        assert quiet is not None
-        undamaged = averaged(arguments, quiet)
+        undamaged = _averaged(arguments, quiet[0])
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
         return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
 
-    threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
+    threshold, origin, evidence = threshold_of(arguments, detector, cloud, analysed(detector, cloud), silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
-    result = with_faint_told(result, threshold) if merging is None else result
-    inspection = Inspection(arguments, recordings, choices, merging, detector, settings, result, threshold, origin)
-    _print(inspection)
+    result = result if mapped else with_faint_told(result, threshold)
+    run = Inspection(
+        arguments, recordings, choices, config, mapped, registrations, detector, settings, result, threshold, origin
+    )
+    _print(run)
     if arguments.out is not None:
-        _write(inspection, _facts(inspection, [*recordings, *([quiet] if quiet else [])]))
+        _write(run, _facts(run, [*recordings, *quiet]))
     return 0
 
 
-# ---- several views as one cloud --------------------------------------------------------------------------------------
+def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
+    names = ("unit", "topic", "array", "pitch", "raw")
+    frames = slice(arguments.max_frames) if arguments.max_frames else None
+    return opened(paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names})
+
+
+def _averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
+    from detectors.average import AverageConfig, average
+    from detectors.noise import REACH_FRAMES, noise_reach_px
+
+    cloud = average(recording, AverageConfig(method=arguments.average))
+    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
+    return replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
 
 
 @contextmanager
-def _mistakes_named(view: View) -> Iterator[None]:
-    """Name the view in a UserError of one of its steps."""
+def _mistakes_named(view: View | None) -> Iterator[None]:
+    """Name the view, if there are several, in a UserError of one of its steps."""
     try:
         yield
     except UserError as mistake:
+        if view is None:
+            raise
         raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
-def _views(
-    arguments: argparse.Namespace,
-    paths: Sequence[Path],
-    recordings: Sequence[Recording],
-    guesses: Sequence[np.ndarray | None],
-) -> list[View]:
-    """Average each capture, and name it by its path's last part, or by the whole path where these are not distinct."""
-    from detectors.views import View
-
-    names = [path.resolve().name for path in paths]
-    names = names if len(set(names)) == len(names) else list(map(str, paths))
-    views = []
-    for name, recording, guess in zip(names, recordings, guesses, strict=True):
-        if arguments.frames_report:
-            print(f"{name}:")
-            told.print_frames(recording)
-        views.append(View(name, averaged(arguments, recording), guess))
-    return views
+# ---- several views as one cloud --------------------------------------------------------------------------------------
 
 
 def _merged(
@@ -157,16 +276,15 @@ def _merged(
     recordings: Sequence[Recording],
     views: Sequence[View],
     choices: Sequence[Choice | None],
-) -> Merging:
-    """Find targets and marks, which are told at once as they explain later failures, then register and merge.
+) -> tuple[Mapped, dict[str, Any]]:
+    """Find targets and marks, which are told at once as they explain later failures, then register and merge. Returns
+    the data of registrations.json, too.
 
     Raises UserError where a view has no target, or names each view that cannot be placed, and why.
     """
     from detectors.mapping.merge import Mapped, merge, prepare
-    from detectors.registration.by_marks import held_out_error_m, register_by_marks
-    from detectors.registration.register import loop_errors, register
-    from detectors.registration.registered import predicted_error_m
-    from detectors.registration.sampling import plane_through, thinned
+    from detectors.registration.by_marks import register_by_marks
+    from detectors.registration.register import register
 
     pairs = list(zip(recordings, views, choices, strict=True))
     told.print_warnings(f"view {view.name}: {why}" for _, view, choice in pairs if choice for why in choice.warnings)
@@ -178,19 +296,17 @@ def _merged(
         told.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
         told.print_marks(ready)
         prepared.append(ready)
-
-    has_poses = arguments.poses is not None
-    reference = prepared[0]
+    reference, has_poses = prepared[0], arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
         for number, each in enumerate(prepared):
             guess = np.eye(4)
             if number:
                 by_marks = register_by_marks(reference, each)
-                guess = by_marks.T_reference_view if not by_marks.failure else guess
                 if by_marks.failure:
                     print(f"note: {each.view.name} starts from where {reference.view.name} stands: {by_marks.failure}")
+                else:
+                    guess = by_marks.T_reference_view
             prepared[number] = replace(each, view=replace(each.view, T_reference_view_guess=guess))
-        reference = prepared[0]
     registrations = register(tuple(prepared), config.registration)
     failed = [each for each in registrations if each.failure]
     if failed:
@@ -202,50 +318,95 @@ def _merged(
             fix=f"leave such views out, {pose}, or choose another --register or --marks",
         )
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
+    return mapped, _registration_data(config, mapped)
 
-    # checks that need no truth: marks held out, errors predicted over the reference's target, and loops
+
+def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
+    """Return the registrations as plain data (metres in matrices, millimetres elsewhere) with checks that need no
+    truth: marks held out, errors predicted over the reference's target, and loops of three views."""
+    from detectors.registration.by_marks import held_out_error_m
+    from detectors.registration.register import loop_errors
+    from detectors.registration.registered import plane_through, predicted_error_m, thinned
+
+    reference = mapped.views[0]
     points_m = thinned(reference.points_m)
     _, normal = plane_through(points_m)
-    is_looping = config.registration.method in LOOPING and len(prepared) > 2
-    loops = loop_errors(mapped.views, config.registration) if is_looping else ()
-    checks = told.Checks(
-        held_out_m=(None, *(held_out_error_m(reference, each) for each in prepared[1:])),
-        predicted_m=tuple(predicted_error_m(each, points_m, normal) for each in registrations),
-        loops=loops,
-    )
-    return Merging(config, mapped, checks)
+
+    def row(view: PreparedView, each: Registration) -> dict[str, Any]:
+        in_plane_m, across_m = predicted_error_m(each, points_m, normal)
+        held_out_m = None if view is reference else held_out_error_m(reference, view)
+        return {
+            "view": each.view,
+            "method": each.method,
+            "T_reference_view": each.T_reference_view.tolist(),
+            "covariance": each.covariance.tolist(),
+            "covariance_about_mm": (each.centre_m / MM).tolist(),
+            "residual_mm": each.residual_m / MM,
+            "overlap": each.overlap,
+            "predicted_in_plane_mm": in_plane_m / MM,
+            "predicted_across_mm": across_m / MM,
+            "held_out_mark_mm": None if held_out_m is None else held_out_m / MM,
+            "marks": len(view.marks.trusted),
+            "marks_doubtful": len(view.marks.marks) - len(view.marks.trusted),
+            "pairs": each.pairs,
+            "iterations": each.iterations,
+            "converged": each.converged,
+            "seconds": round(each.seconds, 4),
+            "notes": each.notes,
+        }
+
+    is_looping = config.registration.method in LOOPING and len(mapped.views) > 2
+    return {
+        "results_version": RESULTS_VERSION,
+        "reference": reference.view.name,
+        "frames": {
+            "T_reference_view": "from a view's camera to the first view's camera (x right, y down, z away), metres",
+            "T_reference_cloud": "from the merged cloud's frame to the first view's camera, metres",
+            "covariance": "of the error of T_reference_view: turn about covariance_about_mm, rad, then shift, metres,"
+            " both in the first view's frame",
+        },
+        "T_reference_cloud": np.asarray(mapped.merged.T_reference_cloud).tolist(),
+        "merge_seconds": round(mapped.merged.seconds, 4),
+        "views": list(map(row, mapped.views, mapped.registrations)),
+        "loops": [
+            {
+                "views": loop.views,
+                "rotation_deg": loop.rotation_deg,
+                "translation_mm": loop.translation_m / MM,
+                "failure": loop.failure,
+            }
+            for loop in (loop_errors(mapped.views, config.registration) if is_looping else ())
+        ],
+    }
 
 
 # ---- what is told ----------------------------------------------------------------------------------------------------
 
 
 def _print(run: Inspection) -> None:
-    cloud, evidence, crop = run.result.cloud, run.result.evidence, run.arguments.crop
+    cloud, evidence, crop, choice = run.result.cloud, run.result.evidence, run.arguments.crop, run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
     # of several views the doubts about their targets were told before they were registered
-    choice = run.choices[0]
-    doubts = choice.warnings if run.merging is None and choice else ()
+    doubts = choice.warnings if run.mapped is None and choice else ()
     told.print_warnings((*recorded, *doubts, *evidence.warnings))
     kept = np.isfinite(evidence.residual_m)
-    lines = [told.surface_text(cloud, evidence)]
-    blind = [] if run.result.missing is None else [run.result.missing.blind_text]
-    if run.merging is None:
+    if run.mapped is None:
         told.print_choice(choice)
         told.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
         if not cloud.organised and crop == "auto" and (off := cloud.valid.sum() - kept.sum()) > 0:
             print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
-        lines = [*lines, *blind]
     else:
-        told.print_registrations(run.merging.mapped, run.merging.checks)
-        merged = run.merging.mapped.merged
-        for note in merged.notes:
-            print(f"note: {note}")
+        told.print_registrations(run.registrations)
+        merged = run.mapped.merged
+        told.print_notes(merged.notes)
         height, width = cloud.valid.shape
         grid = f", a map of {width} x {height} cells of {told.mm(run.cell_m)}" if run.cell_m is not None else ""
         print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
-        lines = [*blind, *lines]
-    for line in (*lines, told.threshold_text(run.threshold, evidence, run.origin)):
-        print(line)
+    unit = evidence.unit or f"{told.mm(evidence.scale_m)} at the median point"
+    print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}")
+    if run.result.missing is not None:
+        print(run.result.missing.blind_text)
+    print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
     told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
 
 
@@ -254,42 +415,39 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     file that can change a number (those of ``recordings``, and the poses)."""
     from harness.vocabulary.provenance import record
 
-    evidence, merging, arguments = run.result.evidence, run.merging, run.arguments
+    evidence, arguments = run.result.evidence, run.arguments
+    settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
-    if merging is None:
+    if run.mapped is None or run.config is None:
         facts["target"] = told.choice_facts(run.choices[0])
         facts["capture"] = told.capture_facts(run.recordings[0], run.result.cloud)
     else:
-        merged, cell_mm = merging.mapped.merged, None if run.cell_m is None else run.cell_m / MM
+        merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
         facts["frame"] = "of the merged cloud; registrations.json says where it stands to the first view's camera"
         facts["captures"] = [
-            {
-                "view": each.view.name,
-                **told.capture_facts(recording, each.view.cloud),
-                "target": told.choice_facts(choice),
-            }
-            for recording, each, choice in zip(run.recordings, merging.mapped.views, run.choices, strict=True)
+            {"view": ready.view.name, **told.capture_facts(each, ready.view.cloud), "target": told.choice_facts(choice)}
+            for each, ready, choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
         ]
         facts["merged"] = {"views": merged.views_used, "cell_mm": cell_mm, "notes": merged.notes}
-    mm = 1e3 * run.threshold * evidence.scale_m
-    detector = {"name": run.detector.name, "version": run.detector.version, "settings": run.settings}
+        settings["mapping"] = run.config.to_data()
+    settings["detector"] = {"name": run.detector.name, "version": run.detector.version, "settings": run.settings}
     paths = [path for recording in recordings for path in recording.files]
     files = []
-    for path in (*paths, *([arguments.poses] if arguments.poses else [])):
+    for path in (*paths, *filter(None, [arguments.poses])):
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
+    scale_mm = evidence.scale_m / MM
     return {
         **facts,
-        "threshold": {"k": run.threshold, "mm": None if evidence.unit else mm, "from": run.origin},
+        "threshold": {
+            "k": run.threshold,
+            "mm": None if evidence.unit else run.threshold * scale_mm,
+            "from": run.origin,
+        },
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
-        "surface": {"one_unit_of_score_mm": 1e3 * evidence.scale_m, **evidence.notes},
-        "settings": {
-            "average": arguments.average,
-            "unit": arguments.unit,
-            **({} if merging is None else {"mapping": merging.config.to_data()}),
-            "detector": detector,
-        },
+        "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
+        "settings": settings,
         "provenance": {**record("python -m harness.detect " + shlex.join(sys.argv[1:])), "files": files},
     }
 
@@ -297,21 +455,21 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
     from harness.report.findings import plain_json, write_findings
 
-    found = f"{len(run.result.detections)} findings beyond {told.beyond_text(run.threshold, run.result.evidence)}"
-    beside: dict[str, Callable[[Path], object]] = {}
-    if run.merging is None:
-        title, cloud_name = f"{run.recordings[0].name}: {found}", "cloud.ply"
+    mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
+    count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
+    subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
+    title = f"{subject}: {count} findings beyond {limit}"
+    if mapped is None:
         beside |= told.pictures(run.choices[0])
     else:
-        from harness.inspection.scene import scene_of
+        from harness.inspection.told import scene_of
         from harness.report.view3d import write_view3d
 
-        mapped = run.merging.mapped
-        title, cloud_name = f"{len(mapped.merged.views_used)} views: {found}", "merged.ply"
-        rows = {"results_version": RESULTS_VERSION, **told.registration_rows(mapped, run.merging.checks)}
-        beside["registrations.json"] = lambda path: path.write_text(plain_json(rows), encoding="utf-8")
-        beside["view3d.html"] = lambda path: write_view3d(path, scene_of(mapped, run.result), title)
+        scene = scene_of(mapped, run.result)
+        beside["registrations.json"] = lambda path: path.write_text(plain_json(run.registrations), encoding="utf-8")
+        beside["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
             beside |= told.pictures(choice, f"targets-{number}.png")
-    for path in write_findings(run.arguments.out, run.result, facts, title, cloud_name=cloud_name, beside=beside):
+    name = "merged.ply" if mapped else "cloud.ply"
+    for path in write_findings(run.arguments.out, run.result, facts, title, cloud_name=name, beside=beside):
         print(f"wrote {path}")

@@ -1,21 +1,27 @@
-"""The parts of pages: a skeleton with the one stylesheet, and blocks. Plain text is escaped, `Markup` is not.
+"""Parts of pages and figures: a skeleton with the one stylesheet, blocks, figures as SVG or PNG. Only `Markup` is HTML.
 
 page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each stroke is ...")])
 """
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
-from harness.vocabulary.versions import GENERATOR
+from harness.tables.text import Grid, many
+from harness.vocabulary.files import atomic_path
+from harness.vocabulary.provenance import GENERATOR
 
 if TYPE_CHECKING:
     from jinja2 import Template
+    from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
 SHOWN_FIRST = (
@@ -24,13 +30,10 @@ SHOWN_FIRST = (
 )
 """Keys of the provenance that a page names in any case, as not recorded where they are missing."""
 SHOWN_APART = ("command", "seconds", "failures")
-"""Keys of the provenance with a section of their own."""
-ANSWERS = {"borne out": ("✓", "yes"), "not borne out": ("✗", "no"), "undecided": ("?", "open")}
 
 
 def template(name: str, folder: Path | None = None) -> Template:
-    """A template of ``folder``, which may use those of this one, or of this one; a missing name is an error, text is
-    escaped."""
+    """A template of ``folder`` or of this one; a missing name is an error, text is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -71,24 +74,8 @@ def joined(parts: Iterable[str | Markup], between: str = "\n") -> Markup:
     return Markup(between).join(escape(part) for part in parts)
 
 
-def heading(text: str) -> Markup:
-    """A section's heading."""
-    return tag("h2", text)
-
-
-def subheading(text: str) -> Markup:
-    """A heading within a section."""
-    return tag("h3", text)
-
-
-def paragraph(*content: str | Markup) -> Markup:
-    """A paragraph."""
-    return tag("p", *content)
-
-
-def note(*content: str | Markup) -> Markup:
-    """A paragraph in small grey letters."""
-    return tag("p", *content, kind="note")
+heading, subheading, paragraph = (partial(tag, name) for name in ("h2", "h3", "p"))
+note = partial(tag, "p", kind="note")
 
 
 def warning(text: str) -> Markup:
@@ -110,35 +97,17 @@ def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
 
 def fold(summary: str, *content: str | Markup, is_open: bool = False) -> Markup:
     """Content that a click on its summary shows."""
-    start = Markup("<details open>") if is_open else Markup("<details>")
-    return start + tag("summary", summary) + joined(content) + Markup("</details>")
+    return tag("details", tag("summary", summary), joined(content), open="open" if is_open else "")
 
 
 def folded(tables: Sequence[tuple[str, Markup]]) -> list[Markup]:
-    """Titled tables: the first open below its title, the others folded."""
-    return [
-        joined([subheading(title), content]) if not place else fold(title, content)
-        for place, (title, content) in enumerate(tables)
-    ]
+    """Titled tables, the first open."""
+    return [fold(title, content, is_open=not place) for place, (title, content) in enumerate(tables)]
 
 
 def links(targets: Iterable[tuple[str, str]]) -> Markup:
     """Links to (words, file)."""
     return joined((tag("a", words, href=file) for words, file in targets), " ")
-
-
-def badge(answer: str, *, brief: bool = False) -> Markup:
-    """A verdict on a claim as a mark with its words, or in brief as the mark alone."""
-    mark, kind = ANSWERS[answer]
-    if not brief:
-        return tag("span", f"{mark} {answer}", kind=f"badge {kind}")
-    return tag("span", mark, kind=f"badge {kind}", title=answer, role="img", aria_label=answer)
-
-
-def facts(rows: Iterable[tuple[str, str]]) -> Markup:
-    """A table of names and values."""
-    lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in rows)
-    return tag("table", tag("tbody", joined(lines)), kind="prov")
 
 
 def command_of(command: str) -> list[Markup]:
@@ -147,47 +116,27 @@ def command_of(command: str) -> list[Markup]:
 
 
 def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
-    """The sections of every page of a sweep: failures, cost, provenance, the experiment. ``left_out``: a sentence on
-    frames that were left out of averages."""
+    """The sections of every page of a sweep; ``left_out``: a sentence on frames that were left out of averages."""
     failures = [
         f"{each['what']}: {each['why']}" if isinstance(each, Mapping) and set(each) == {"what", "why"} else plain(each)
         for each in provenance.get("failures", ())
     ]
-    several = len(failures) > 1
-    parts = [heading("Failures"), paragraph("No trial failed.")]
-    if failures:
-        parts[1] = paragraph(
-            f"{len(failures)} part{'s' * several} of the experiment failed and {'are' if several else 'is'} missing "
-            "from every number above."
-        )
-        parts += [tag("p", text, kind="fail") for text in failures]
+    missing = f"{many(len(failures), 'part')} of the experiment failed: not in any number above."
+    parts = [heading("Failures"), paragraph(missing if failures else "No trial failed.")]
+    parts += [tag("p", text, kind="fail") for text in failures]
     parts += [paragraph(left_out)] if left_out else []
-    parts += [heading("Cost"), _cost({stage: float(s) for stage, s in dict(provenance.get("seconds", {})).items()})]
-    others = [key for key in provenance if key not in SHOWN_FIRST and key not in SHOWN_APART]
-    rows = [
+    seconds = dict(provenance.get("seconds", {}))
+    rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
+    cost = Grid.of(("stage", "seconds"), rows).html() if rows else paragraph("Not recorded.")
+    others = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
+    recorded = [
         (key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded")))
         for key in (*SHOWN_FIRST, *others)
     ]
-    parts += [heading("Provenance"), facts(rows), *command_of(provenance.get("command", "not recorded"))]
+    lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
+    parts += [heading("Cost"), cost, heading("Provenance"), tag("table", tag("tbody", joined(lines)), kind="prov")]
+    parts += command_of(provenance.get("command", "not recorded"))
     return [*parts, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
-
-
-def _cost(seconds: Mapping[str, float]) -> Markup:
-    """Seconds by stage, with a bar for the share of the longest."""
-    if not seconds:
-        return paragraph("Not recorded.")
-    longest = max(seconds.values()) or 1.0
-    heads = [tag("th", "stage"), tag("th", "seconds", kind="n"), tag("th", "share of the longest", kind="share")]
-    rows = [
-        tag(
-            "tr",
-            tag("td", stage),
-            tag("td", f"{value:.1f}", kind="n"),
-            tag("td", tag("span", kind="bar", style=f"width:{100 * value / longest:.1f}%")),
-        )
-        for stage, value in seconds.items()
-    ]
-    return tag("table", tag("thead", tag("tr", *heads)), tag("tbody", joined(rows)))
 
 
 def plain(value: Any) -> str:
@@ -201,3 +150,60 @@ def plain(value: Any) -> str:
     if value is None:
         return "not recorded"
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+# Okabe and Ito's palette (Color Universal Design, 2008): told apart with any of the common colour blindnesses.
+BLUE, ORANGE, GREEN, RED, SKY, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7"
+INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
+DAMAGE = "#ff00ff"
+"""Magenta: the thesis' colour of damage in its clouds."""
+
+STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.axisbelow", "axes.grid", "svg.image_inline"), True),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), GREY),
+    **dict.fromkeys(("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    "grid.color": PALE,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.6,
+    "svg.fonttype": "path",
+    "image.interpolation": "nearest",
+}
+COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE), "osD^vP"
+
+
+def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figure], None]) -> str:
+    """Draw a figure of ``size_in`` (width, height) inches; the text of an inline ``<svg>`` with ``alt`` as its label.
+    ``name`` seeds the ids inside, so that several figures live on one page; no date, no random number gets in."""
+    buffer = io.StringIO()
+    _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    body = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
+    body = re.sub(r'\bid="', f'id="{name}-', body)
+    body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{name}-", body)
+    for size in ("width", "height"):
+        body = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", body, count=1)
+    return body.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
+
+
+def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:
+    """Draw a figure of ``size_in`` (width, height) inches to a PNG, 160 dots an inch; same bytes for the same data."""
+    with atomic_path(path) as temporary:
+        _save(temporary, size_in, draw, format="png", metadata={"Software": None})
+
+
+def _save(target: Any, size_in: Any, draw: Callable[[Figure], None], name: str = "", **how: Any) -> None:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    style: Any = {**STYLE, "svg.hashsalt": name or None}
+    with rc_context(style):
+        figure = Figure(figsize=size_in, layout="constrained")
+        draw(figure)
+        figure.savefig(target, dpi=160, **how)

@@ -1,52 +1,39 @@
-"""Findings of `harness.detect` as rows and as files: CSV, JSON, and a point cloud with the damage coloured.
+"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with the damage coloured.
 
 All files of one run are written beside their final names first and renamed together at the end.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
-from harness.report.findings_picture import save_blind_map, save_picture
-from harness.tables.outputs import ANNOTATED, BLIND, CLOUD, FINDINGS, FINDINGS_DATA
-from harness.vocabulary.capture import Cloud
+from harness.tables import outputs, trials
+from harness.tables.schema import jsonable
 from harness.vocabulary.files import atomic_path
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Cloud
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
-"""Magenta, as in the thesis' figure 3."""
-COLUMNS = (
-    "id", "kind", "u_px", "v_px", "x_mm", "y_mm", "z_mm", "diameter_mm", "depth_mm", "volume_mm3", "points", "score",
-)  # fmt: skip
-FINDINGS_VERSION = 2
-"""Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
-VERSION_COLUMN = "findings_version"
-BLIND_MAP = BLIND.name
-"""Written of clouds with a pixel grid only."""
-FILES = (FINDINGS.name, FINDINGS_DATA.name, ANNOTATED.name, BLIND_MAP, CLOUD.name)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One row: the best of both measures, camera frame. NaN where nothing could be measured.
-
-    ``kind``: ``hole`` (behind the surface), ``bump`` (before it), or ``no return`` (nothing came back).
-    ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth), ``extent`` (the thesis'
-    extreme points) or ``area`` (of pixels without return). ``depth_from``: likewise, or ``extreme residual`` of the
-    cluster's points; ``none`` of pixels without return. ``score``: the detector's, or of pixels without return that of
-    `detectors.interface.MissingReturns`.
-    """
+    """One row: the best of both measures, camera frame. NaN where nothing could be measured. ``kind``: ``hole``,
+    ``bump`` or ``no return``. ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth),
+    ``extent`` (extreme points) or ``area`` (of pixels without return). ``depth_from``: likewise, ``extreme residual``
+    of the cluster's points, or ``none``."""
 
     id: int
     kind: str
@@ -66,8 +53,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with all that a detector said about it; ``measurements`` and ``detections`` side by side. ``missing``:
-    what the cloud lacks, None where it has no pixel grid."""
+    """A cloud with all that a detector said about it; ``missing``: what it lacks, None without a pixel grid."""
 
     cloud: Cloud
     evidence: Evidence
@@ -86,7 +72,7 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     """The row of one detection: the model's numbers where they exist, else those of the extents."""
     modelled = math.isfinite(measured.model_diameter_m)
     placed = bool(np.isfinite(measured.model_centre_m).all())
-    centre_mm = (measured.model_centre_m if placed else measured.extent_centre_m) / MM
+    x_mm, y_mm, z_mm = (float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m))
     diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
     size_from = "extent" if not modelled else "contour" if math.isnan(measured.model_diameter_se_m) else "model"
     depth_m, depth_from = measured.model_depth_m, size_from
@@ -95,22 +81,10 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     elif math.isnan(depth_m):
         residuals = evidence.residual_m.reshape(-1)[detection.pixels]
         depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
-    return Finding(
-        id=number,
-        kind=detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole",
-        u_px=measured.u_px,
-        v_px=measured.v_px,
-        x_mm=float(centre_mm[0]),
-        y_mm=float(centre_mm[1]),
-        z_mm=float(centre_mm[2]),
-        diameter_mm=diameter_m / MM,
-        depth_mm=depth_m / MM,
-        volume_mm3=measured.volume_m3 / MM**3,
-        points=measured.points,
-        score=measured.score,
-        size_from=size_from,
-        depth_from=depth_from,
-    )
+    kind = detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole"
+    place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
+    sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
+    return Finding(number, kind, *place, *sizes, measured.points, measured.score, size_from, depth_from)
 
 
 def write_findings(
@@ -118,101 +92,69 @@ def write_findings(
     judged: Judged,
     about: Mapping[str, Any],
     title: str,
-    cloud_name: str = CLOUD.name,
+    cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write all files of a run into ``folder`` (made where it is missing); all of them or none.
-
-    ``about``: what the JSON says beside the findings (capture, threshold, settings, provenance): plain data.
-    ``beside``: further files by name, each written by its function to the path that it is given.
-    Raises UserError where the folder cannot be written or the disk is full.
-    """
-    is_new = not folder.exists()
-    further = dict(beside or {})
-    if (missing := judged.missing) is not None:
-        further[BLIND_MAP] = lambda path: save_blind_map(path, judged.cloud, missing, judged.detections)
-    names = (*(name for name in FILES[:-1] if name != BLIND_MAP), cloud_name, *further)
+    """Write all files of a run into ``folder`` (made where it is missing); all of them or none. ``about``: what the
+    JSON says beside the findings (capture, threshold, settings, provenance): plain data. ``beside``: further files by
+    name, each written by its function to the path that it is given. Raises UserError where the folder cannot be written
+    or the disk is full."""
+    is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)
+    writers: dict[str, Callable[[Path], object]] = {
+        outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
+        outputs.FINDINGS_DATA.name: lambda path: path.write_text(json_text(judged, about), encoding="utf-8"),
+        outputs.ANNOTATED.name: lambda path: save_picture(path, cloud, judged.evidence, detections, title),
+        cloud_name: lambda path: path.write_bytes(ply_bytes(cloud, detections)),
+        **(beside or {}),
+    }
+    if missing is not None:
+        writers[outputs.BLIND.name] = lambda path: save_blind_map(path, cloud, missing, detections)
     try:
         with ExitStack() as stack:
-            part = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
-            part[FINDINGS.name].write_text(csv_text(judged.findings), encoding="utf-8")
-            part[FINDINGS_DATA.name].write_text(json_text(judged, about), encoding="utf-8")
-            save_picture(part[ANNOTATED.name], judged.cloud, judged.evidence, judged.detections, title)
-            part[cloud_name].write_bytes(ply_bytes(judged.cloud, judged.detections))
-            for name, write in further.items():
-                write(part[name])
+            parts = {name: stack.enter_context(atomic_path(folder / name)) for name in writers}
+            for name, write in writers.items():
+                write(parts[name])
     except BaseException:
         if is_new and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
         raise
-    return tuple(folder / name for name in names)
+    return tuple(folder / name for name in writers)
 
 
 def csv_text(findings: Sequence[Finding]) -> str:
-    """The table with the columns `COLUMNS` and the version; an empty cell where there is no number."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*COLUMNS, VERSION_COLUMN))
-    for finding in findings:
-        row = asdict(finding)
-        writer.writerow([*(_cell(row[column]) for column in COLUMNS), FINDINGS_VERSION])
-    return text.getvalue()
-
-
-def _cell(value: float | int | str) -> str:
-    if isinstance(value, int | str):
-        return str(value)
-    return f"{value:.4f}" if math.isfinite(value) else ""
+    """The table of findings.csv; an empty cell where there is no number."""
+    frame = trials.FINDINGS_OF_CAPTURE.frame(findings)
+    return str(frame.to_csv(index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"))
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
     """The findings with both measures and their standard errors, then ``about``; null where there is no number."""
-    rows = []
-    for finding, measured in zip(judged.findings, judged.measurements, strict=True):
-        rows.append({**asdict(finding), "extent": _extent(measured), "model": _model(measured)})
-    return plain_json({"findings_version": FINDINGS_VERSION, "findings": rows, **about})
+    rows = [
+        asdict(finding)
+        | {
+            "extent": {"diameter_mm": m.extent_diameter_m / MM, "centre_mm": m.extent_centre_m / MM},
+            "model": {
+                **{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED},
+                "note": m.model_note,
+            },
+        }
+        for finding, m in zip(judged.findings, judged.measurements, strict=True)
+    ]
+    return plain_json({"findings_version": trials.FINDINGS_VERSION, "findings": rows, **about})
 
 
 def plain_json(data: Mapping[str, Any]) -> str:
     """Plain data and NumPy's numbers as JSON; null where there is no number."""
-    return json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
-
-
-def _extent(measured: Measurement) -> dict[str, Any]:
-    return {
-        "diameter_mm": measured.extent_diameter_m / MM,
-        "centre_mm": [float(value) / MM for value in measured.extent_centre_m],
-    }
-
-
-def _model(measured: Measurement) -> dict[str, Any]:
-    return {
-        "diameter_mm": measured.model_diameter_m / MM,
-        "diameter_se_mm": measured.model_diameter_se_m / MM,
-        "depth_mm": measured.model_depth_m / MM,
-        "depth_se_mm": measured.model_depth_se_m / MM,
-        "centre_mm": [float(value) / MM for value in measured.model_centre_m],
-        "centre_se_mm": measured.model_centre_se_m / MM,
-        "note": measured.model_note,
-    }
-
-
-def _without_nan(value: Any) -> Any:
-    """Plain data with null for NaN and infinity, and Python's numbers for NumPy's."""
-    if isinstance(value, Mapping):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, np.generic):
-        return _without_nan(value.item())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(jsonable(data), indent=2, allow_nan=False) + "\n"
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
     """The valid points (camera frame, metres, float32) as a binary PLY: damage magenta, else its colour or grey."""
     import trimesh
 
-    colours = np.full((cloud.valid.size, 3), 160, np.uint8) if cloud.rgb is None else _flat_bytes(cloud.rgb)
+    colours = np.full((cloud.valid.size, 3), 160, np.uint8)
+    if cloud.rgb is not None:
+        colours = np.clip(np.nan_to_num(cloud.rgb), 0, 255).reshape(-1, 3).astype(np.uint8)
     for detection in detections:
         colours[detection.pixels] = DAMAGE_RGB
     valid = cloud.valid.reshape(-1)
@@ -221,5 +163,166 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
     return exported
 
 
-def _flat_bytes(rgb: np.ndarray) -> np.ndarray:
-    return np.clip(np.nan_to_num(rgb), 0, 255).reshape(-1, 3).astype(np.uint8)
+MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
+WIDTH_IN, DPI = 11.0, 150
+SHOWN_SCORES = 8.0
+TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
+"""Colours that stand apart from grey and from one another, also for people who see red and green alike."""
+Box = tuple[float, float, float, float]
+
+
+def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> None:
+    """Write the PNG: colour image (where known) above the residual in mm; without a pixel grid a plan view in mm."""
+    panels = 2 if cloud.organised and cloud.rgb is not None else 1
+    box = _around(cloud, np.isfinite(evidence.residual_m))
+    residual_mm, limit = evidence.residual_m / MM, SHOWN_SCORES * evidence.scale_m / MM
+    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
+        if panels == 2:
+            axes[0].imshow(_bytes(cloud.rgb), extent=_edges(cloud), interpolation="nearest")
+        axes[-1].set_facecolor("0.82")
+        if cloud.organised:
+            shown = axes[-1].imshow(residual_mm, extent=_edges(cloud), interpolation="nearest", **style)
+        else:
+            judged = np.isfinite(residual_mm)
+            x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
+            shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
+        figure.colorbar(shown, ax=list(axes), extend="both").set_label("behind (+) or\nbefore (-) the\nsurface, mm")
+        for one in axes:
+            _frame(one, cloud, box)
+            _circle(one, cloud, enumerate(detections, start=1))
+
+    _save(path, title, panels * _height_in(box), draw)
+
+
+def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
+    """Write the PNG: the share of frames in which each pixel returned nothing, outline and findings without return."""
+    box = _around(cloud, missing.outline)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        style: dict[str, Any] = {"interpolation": "nearest", "cmap": "Greys", "vmin": 0, "vmax": 100}
+        shown = axes.imshow(100 * missing.unseen, extent=_edges(cloud), **style)
+        figure.colorbar(shown, ax=axes, shrink=0.6).set_label("frames without a return, %", fontsize=8)
+        if min(missing.outline.shape) > 1 and not missing.outline.all():
+            height, width = missing.outline.shape
+            columns, rows = np.arange(width) + cloud.region.col0, np.arange(height) + cloud.region.row0
+            axes.contour(columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8)
+        _frame(axes, cloud, box)
+        _circle(axes, cloud, ((n, one) for n, one in enumerate(detections, start=1) if one.kind == "no return"))
+
+    _save(path, f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw)
+
+
+def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
+    """Write the PNG: colour, else amplitude, else depth of a grid, with each outline (h, w), its text and its number,
+    counted from 1 as ``taken`` is."""
+    import cv2
+    from matplotlib.patheffects import withStroke
+
+    height, width = grid.valid.shape
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.imshow(_view(grid), interpolation="nearest")
+        axes.set_axis_off()
+        colours = iter(OTHERS * 2)
+        for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
+            chosen = number == taken
+            colour = TAKEN if chosen else next(colours)
+            x, y = np.arange(-1, width + 1), np.arange(-1, height + 1)
+            padded = np.pad(outline, 1)
+            axes.contour(x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4)
+            # the pixel that lies deepest inside
+            depth = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+            v, u = np.unravel_index(int(depth.argmax()), depth.shape)
+            style: dict[str, Any] = {"fontsize": 22, "weight": "bold", "ha": "center", "va": "center", "color": colour}
+            style["path_effects"] = [withStroke(linewidth=4, foreground="black")]
+            axes.text(float(u), float(v), str(number), **style)
+            how = "taken" if chosen else f"--target {number}"
+            axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
+        figure.legend(loc="outside lower center", fontsize=9, frameon=False)
+
+    _save(path, "", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw)
+
+
+def _save(path: Path, title: str, height_in: float, draw: Callable[[Figure], None]) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, min(height_in + 0.4, 30.0)), dpi=DPI, layout="compressed")
+    canvas = FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=10, parse_math=False)  # a file may be called $x$
+    draw(figure)
+    canvas.print_png(str(path))
+
+
+def _height_in(box: Box) -> float:
+    left, right, bottom, top = box
+    return WIDTH_IN * 0.82 * max(bottom - top, 1e-9) / max(right - left, 1e-9) + 0.5
+
+
+def _around(cloud: Cloud, part: np.ndarray) -> Box:
+    """(left, right, bottom, top) of a part (h, w) bool of the cloud's grid and a twelfth of it around."""
+    left, right, bottom, top = _edges(cloud)
+    rows, columns = np.nonzero(part)
+    if not cloud.organised or not len(rows):
+        return left, right, bottom, top
+    u0, u1, v0, v1 = (float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    margin = max(u1 - u0, v1 - v0) / 12.0
+    sides = left + np.array([u0 - margin, u1 + margin]), top + np.array([v1 + margin, v0 - margin])
+    (a, b), (c, d) = np.clip(sides[0], left, right), np.clip(sides[1], top, bottom)
+    return float(a), float(b), float(c), float(d)
+
+
+def _edges(cloud: Cloud) -> Box:
+    """(left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid; down is positive."""
+    if cloud.organised:
+        region = cloud.region
+        return region.col0 - 0.5, region.col1 - 0.5, region.row1 - 0.5, region.row0 - 0.5
+    x, y = (cloud.points_m[..., axis][cloud.valid] / MM for axis in (0, 1))
+    return float(x.min()), float(x.max()), float(y.max()), float(y.min())
+
+
+def _frame(axes: Axes, cloud: Cloud, box: Box) -> None:
+    unit = "cell" if cloud.projection == "parallel" else "px"
+    x, y = (f"u, {unit}", f"v, {unit}") if cloud.organised else ("x, mm", "y, mm")
+    axes.set(xlabel=x, ylabel=y, xlim=box[:2], ylim=box[2:], aspect="equal", autoscale_on=False)
+
+
+def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]]) -> None:
+    """Draw a circle round each cluster, with its number at the upper right."""
+    from matplotlib.patches import Circle
+
+    for number, detection in numbered:
+        if cloud.organised:
+            rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+            u, v, margin = columns + cloud.region.col0, rows + cloud.region.row0, 3.0
+        else:
+            u, v = (cloud.points_m.reshape(-1, 3)[detection.pixels] / MM).T[:2]
+            margin = 2.0
+        centre = 0.5 * float(u.min() + u.max()), 0.5 * float(v.min() + v.max())
+        radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
+        axes.add_patch(Circle(centre, radius, fill=False, color=TAKEN, linewidth=0.9))
+        at = (centre[0] + 0.71 * radius, centre[1] - 0.71 * radius)
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.4}
+        axes.annotate(str(number), at, (1, 1), textcoords="offset points", bbox=box, fontsize=7, annotation_clip=True)
+
+
+def _bytes(rgb: Any) -> np.ndarray:
+    return np.clip(np.nan_to_num(np.asarray(rgb)), 0, 255).astype(np.uint8)
+
+
+def _view(grid: Cloud) -> np.ndarray:
+    """(h, w, 3) bytes: colour, else amplitude, else depth."""
+    if grid.rgb is not None and np.isfinite(grid.rgb).any():
+        return _bytes(grid.rgb)
+    values = -grid.points_m[..., 2]
+    if grid.amplitude is not None and np.isfinite(grid.amplitude).any():
+        values = np.sqrt(np.maximum(grid.amplitude, 0.0))
+    known = values[np.isfinite(values)]
+    low, high = np.quantile(known, (0.02, 0.98)) if len(known) else (0.0, 1.0)
+    grey = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) * 190.0 + 50.0
+    return np.repeat(np.nan_to_num(grey)[..., None], 3, axis=-1).astype(np.uint8)

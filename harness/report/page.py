@@ -3,47 +3,331 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
 
-from harness.evaluation.noise import noise_against_frames
-from harness.evaluation.profile import RINGS, hole_shapes
-from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.set_ups import LIMIT_RULE, EffectCosts, SwitchCost, compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import (
     MAIN,
-    STATES,
     false_calls,
+    fit_floor,
     found_holes,
-    found_rule,
     hole_list,
+    noise_against_frames,
     summarise_holes,
 )
-from harness.report.blocks import closing, figure, heading, note, page, paragraph
-from harness.report.claims import claims_section, counted_verdicts, verdict_cell
-from harness.report.clouds import LOOKS, cloud_figure, profile_figure, residual_figure
-from harness.report.examples import ExampleCloud, MappedExample
-from harness.report.measures import positions_figure, sizes_figure
+from harness.report import sections
+from harness.report.blocks import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    INK,
+    MARKERS,
+    ORANGE,
+    PALE,
+    closing,
+    figure,
+    heading,
+    note,
+    page,
+    paragraph,
+    svg,
+)
+from harness.report.clouds import ExampleCloud, MappedExample, residual_figure, sights_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
-from harness.report.set_ups import CALLS_NOTE, calls_grid, left_out, records, set_ups_html, varied_section
-from harness.report.set_ups_figures import noise_figure
 from harness.report.view3d import write_view3d
-from harness.tables.grid import Cell, Grid
-from harness.tables.text import bounded, inches, mm, plus_minus
-from harness.tables.trials import ResultTables
-from harness.thesis.claims import RULES, score_claims, verdicts_by_variant
-from harness.thesis.verdicts import Verdict
+from harness.tables.outputs import REPORT
+from harness.tables.text import Grid, inches, many
+from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
+from harness.thesis.claims import Verdict, claim_c11, score_claims
 from harness.vocabulary.files import write_text
+from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
-DRAWS = (
-    "{} of the camera's noise before the same board in the same place: the intervals speak of this set-up, not of "
-    "other boards, places or cameras."
+GUIDE = "#cfd6dd"
+RULER_MM = 25.4 / 16
+"""One graduation of a ruler in 1/16 in, to compare positions with."""
+
+
+def errors_figure(rows: pd.DataFrame) -> str:
+    """Measured less true diameter and distance from the largest hole, by both measures; ``rows``: one for each hole."""
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(1, 2)
+        for axes, what, of, name in zip(
+            panels,
+            ("diameter", "offset"),
+            ("bias", "offset_bias"),
+            ("diameter", "distance from the largest hole"),
+            strict=True,
+        ):
+            reach = 0.006 * float(rows[f"true_{what}_mm"].max())
+            axes.axhspan(-RULER_MM, RULER_MM, color=PALE, label="±1/16 in")
+            axes.axhline(0, color=GREY, lw=1)
+            for side, measure, colour in ((-1, "extent", ORANGE), (1, "model", BLUE)):
+                seen = rows[rows[f"{measure}_{of}_mm"].notna()]
+                x, std = seen[f"true_{what}_mm"] + side * reach, seen[f"{measure}_{what}_std_mm"].fillna(0)
+                mean = seen[f"{measure}_{of}_mm"]
+                axes.errorbar(x, mean, std, fmt="o", ms=5, capsize=2.5, color=colour, label=measure)
+            axes.set(xlabel=f"true {name} (mm)", ylabel="measured − true (mm)")
+            axes.set_title("Sizes" if what == "diameter" else "Positions")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+    alt = "Error of the measured diameter and of the distance from the largest hole, with one standard deviation."
+    return svg("errors", (10, 4.2), alt, draw)
+
+
+def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
+    """The smallest diameter found against the last axis, a panel for each number of frames."""
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(1, len(frames), squeeze=False)[0]
+        top = 1.15 * float(np.nanmax([*compared["limit_mm"], 1.0]))
+        for axes, n in zip(panels, frames, strict=True):
+            limits = compared[compared["frames"] == n].set_index("variant")["limit_mm"]
+            for (title, variants), marker, colour in zip(layout.rows.items(), MARKERS, COLOURS, strict=False):
+                values = [float(limits.get(variant, np.nan)) for variant in variants]
+                axes.plot(layout.column_values, values, marker=marker, ms=5, color=colour, label=title, alpha=0.9)
+            axes.set_xticks(layout.column_values, [f"{value:g}" for value in layout.column_values])
+            axes.set(ylim=(0, top), ylabel="smallest diameter found (mm)", xlabel=layout.column_name)
+            axes.set_title(many(n, "frame"))
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
+
+    return svg("limits", (10, 3.8), "Smallest diameter found by each set-up, in millimetres.", draw)
+
+
+def noise_figure(noise: pd.DataFrame) -> str:
+    """Temporal, systematic and total error of one variant against frames, with the 1/sqrt(N) guide and the floor."""
+    frames = noise["frames"].to_numpy(float)
+    fit = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(frames, noise["guide_mm"], color=GUIDE, lw=7, solid_capstyle="round", label="1/√N guide")
+        for column, colour, marker, label in (
+            ("temporal_rms_mm", BLUE, "o", "temporal noise, rms"),
+            ("systematic_mm", ORANGE, "s", "systematic error (offset and pattern)"),
+            ("pattern_mm", GREEN, "v", "of it, pattern over pixels"),
+            ("total_rms_mm", INK, "D", "total error, rms"),
+        ):
+            values = noise[column].where(noise[column] > 0)
+            axes.plot(frames, values, marker=marker, ms=5, lw=1.4, color=colour, label=label)
+        if fit is not None and fit.floor_mm > 0:
+            axes.axhline(fit.floor_mm, color=INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {fit.floor_mm:.2f} mm")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xticks(frames, [f"{n:g}" for n in frames])
+        axes.minorticks_off()
+        low, high = axes.get_ylim()
+        ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high]
+        axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        axes.set(xlabel="frames averaged", ylabel="range error (mm)")
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+
+    alt = "Range error in millimetres against the number of averaged frames: noise falls, the systematic error stays."
+    return svg("noise", (10, 4.2), alt, draw)
+
+
+def cost_text(cost: SwitchCost) -> str:
+    """``+0.42 mm (0.30 to 0.55)``; a bound where a size lies off the ladder."""
+    if not np.isfinite(cost.mm):
+        return "off the ladder of sizes" if np.isnan(cost.mm) else f"{'+' if cost.mm > 0 else '−'}∞"
+    low, high = (f"{end:+.2f}" if np.isfinite(end) else "∞" for end in (cost.interval.low, cost.interval.high))
+    bound = "" if cost.certain else ", a bound: a size lies off the ladder"
+    return f"{cost.mm:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
+
+
+def effects_figure(costs: Sequence[EffectCosts]) -> str:
+    """Bars of every effect's cost with 95 % intervals, one panel for each place and number of frames."""
+    names = [one.effect for one in costs[0].effects]
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(1, len(costs), squeeze=False, sharex=True, sharey=True)[0]
+        for axes, at in zip(panels, costs, strict=True):
+            for shift, colour, label, chosen in (
+                (-0.2, BLUE, "alone, against nothing on", [*(one.alone for one in at.effects), at.together]),
+                (0.2, ORANGE, "on top of all the others", [one.last for one in at.effects]),
+            ):
+                places = np.arange(len(chosen)) + shift
+                sizes = np.array([one.mm if np.isfinite(one.mm) else 0.0 for one in chosen])
+                ends = np.array([[one.interval.low, one.interval.high] for one in chosen])
+                errors = np.abs(np.where(np.isfinite(ends), ends, sizes[:, None]) - sizes[:, None]).T
+                axes.barh(places, sizes, 0.36, xerr=errors, color=colour, label=label, ecolor=INK, capsize=2)
+                for place, one in zip(places, chosen, strict=True):
+                    if not np.isfinite(one.mm):
+                        axes.text(0, place, " off the ladder", va="center", fontsize=8, color=GREY)
+            axes.set_title(many(at.frames, "frame"))
+            axes.set_xlabel("loss of the 50 % size (mm)")
+            axes.axvline(0, color=GREY, lw=1)
+            axes.grid(axis="y", visible=False)
+        panels[0].set_yticks(range(len(names) + 1), [*names, "all together"])
+        panels[0].invert_yaxis()
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+    alt = "Loss of the 50 per cent detectable diameter in millimetres to each effect, alone and on top of the others."
+    return svg("effects", (10, 0.42 * (len(names) + 1) + 1.6), alt, draw)
+
+
+CAMERA = (
+    *("set-up", "frames", "mm per pixel", "valid", "one frame (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
+    "surface noise (mm)",
 )
+CAMERA_NOTE = (
+    "From hole-free runs, but the surface. One frame: standard deviation of its temporal noise, displacements of whole "
+    "frames taken out; average: scatter over repeats, likewise. Offset and pattern: mean and spread over probe pixels "
+    "of what all repeats share. Surface: robust deviation from the fitted surface on undamaged face."
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The places of set-ups: the last axis across, all others down; of a single axis, all down. ``rows``: text of a row
+    -> its set-ups, one a column. ``columns``: the last axis' values, ``column_values`` numbers."""
+
+    rows: Mapping[str, Sequence[str]]
+    columns: tuple[str, ...] = ()
+    column_name: str = ""
+    column_values: tuple[float, ...] = ()
+
+    @staticmethod
+    def of(tables: ResultTables) -> Layout:
+        """The layout of an experiment's set-ups."""
+        set_ups = tables.variants[~tables.variants["is_variation"].astype(bool)]
+        paths = [str(path) for path in tables.axes["path"]]
+        values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
+        if not values or len(set_ups) % len(values):
+            return Layout({str(name): [str(name)] for name in set_ups["variant"]})
+        rows: dict[str, list[str]] = {}
+        for _, row in set_ups.iterrows():
+            title = ", ".join(value_text(path, row[path]) for path in paths[:-1])
+            rows.setdefault(title, []).append(str(row["variant"]))
+        numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
+        last = tables.axes.iloc[-1]
+        unit = f" ({last['unit']})" if last["unit"] else ""
+        return Layout(rows, tuple(value_text(paths[-1], v) for v in values), last["name"] + unit, numbers)
+
+
+def set_ups_html(
+    tables: ResultTables,
+    examples: Sequence[ExampleCloud],
+    provenance: Mapping[str, Any],
+    experiment_yaml_text: str,
+    title: str,
+    with_claims: bool = False,
+) -> str:
+    """The page as text; the arguments are those of `harness.report.page.write_report`."""
+    axes = [str(path) for path in tables.axes["path"]]
+    summary, variants = summarise_holes(tables.holes, axes), set_ups_of(tables)
+    compared = compare_set_ups(tables, summary, variants)
+    layout, costs, frames = Layout.of(tables), effect_costs(tables), sections.shown_frames(compared)
+    verdict = claim_c11(summary[summary["variant"].isin(variants)], axes) if with_claims else None
+    middle = max(0, (len(layout.columns) - 1) // 2)
+    clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
+    sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}
+    figures: dict[str, str] = {}
+    if len(compared) and layout.column_values and len(layout.rows) <= len(COLOURS):
+        figures["limits"] = limits_figure(compared, layout, frames)
+    if not costs and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
+        figures["sights"] = sights_figure(sights)
+    shown = [row for row in sections.records(compared) if row["frames"] in frames]
+    body = [heading("Holes found"), sections.set_ups_grid(compared).html()]
+    if "limits" in figures:
+        body.append(figure(figures, "limits", "The smallest diameter from which on every hole is found."))
+    body += _effects_section(costs)
+    if "sights" in figures:
+        at = f" at {layout.columns[middle]}" if layout.columns else ""
+        caption = (
+            f"Distance behind (+) or before (−) the fitted surface{at}, most frames, first damaged repeat. Circle: the "
+            "true rim. Dots: detected pixels. Grey: no valid point. Linear within ±1 mm, logarithmic beyond."
+        )
+        body += [heading("The same hole, as each sees it"), figure(figures, "sights", caption)]
+    body += [
+        heading("Sizes and positions"),
+        paragraph(
+            "Over all single measurements of the holes found: mean error ± standard deviation (number), in mm. "
+            "Positions are distances from the largest hole. A set-up that finds small holes is judged by them too."
+        ),
+        SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
+        heading("What each camera gives"),
+        SET_UPS.grid(shown, only=CAMERA).html(),
+        note(CAMERA_NOTE),
+        *sections.claims_section("The thesis' claim", [verdict] if verdict else []),
+    ]
+    everything = [str(name) for name in tables.variants["variant"]]
+    body += sections.varied_section(tables, compare_set_ups(tables, summary, everything, half_sizes=False), frames)
+    calls = false_calls(tables.runs)
+    calls = calls[(calls["role"] == "damaged") & calls["variant"].isin(variants) & calls["frames"].isin(frames)]
+    body += [
+        heading("Thresholds and false calls"),
+        note(sections.CALLS_NOTE),
+        FALSE_CALLS.grid(sections.records(calls)).html(),
+    ]
+    body += closing(provenance, experiment_yaml_text, sections.left_out(tables.runs))
+    rule = "Each set-up has hole-free runs and a threshold of its own."
+    under = sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule)
+    return page(title, set_ups_answer(compared, layout, costs, verdict), body, [under])
+
+
+def set_ups_answer(
+    compared: pd.DataFrame, layout: Layout, costs: Sequence[EffectCosts], verdict: Verdict | None
+) -> str:
+    """Say what the experiment found: each row's holes with the most frames, the dearest effect, C11."""
+    if compared.empty:
+        return "No trial of any set-up finished, so there is no answer."
+    frames = sections.shown_frames(compared)
+    many_frames = compared[compared["frames"] == frames[-1]]
+    found = {row["variant"]: len(row["found"]) for row in sections.records(many_frames)}
+    rows = [f"{row} {', '.join(str(found.get(name, '–')) for name in names)}" for row, names in layout.rows.items()]
+    where = f" at {', '.join(layout.columns)}" if layout.columns else ""
+    said = [f"Found of {int(compared['holes'].max())} holes{where} with {_averaged(frames[-1])}: {'; '.join(rows)}."]
+    if costs:
+        said = []
+    for each in (costs_at for costs_at in costs if costs_at.frames in frames):
+        place = f"{each.place}, " if each.place else ""
+        moved = f"all effects together move the 50 % size by {cost_text(each.together)}"
+        dearest = max(each.effects, key=lambda one: np.nan_to_num(one.alone.mm, nan=-np.inf), default=None)
+        alone = f"; alone, {dearest.effect} does most: {cost_text(dearest.alone)}" if dearest else ""
+        said.append(f"With {place}{_averaged(each.frames)}, {moved}{alone}.")
+    if verdict:
+        said.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
+    return " ".join(said)
+
+
+def _averaged(frames: int) -> str:
+    return "one frame" if frames == 1 else f"{frames} averaged frames"
+
+
+def _effects_section(costs: Sequence[EffectCosts]) -> list[Markup]:
+    if not costs:
+        return []
+    places = [", ".join(part for part in (each.place, many(each.frames, "frame")) if part) for each in costs]
+    heads = ("effect", *(f"{place}: {which}" for place in places for which in ("alone", "on top of all others")))
+    rows = [
+        [one.effect, *(cost_text(cost) for each in costs for cost in (each.effects[at].alone, each.effects[at].last))]
+        for at, one in enumerate(costs[0].effects)
+    ]
+    rows.append(["all together", *(cell for each in costs for cell in (cost_text(each.together), "–"))])
+    return [
+        heading("What each effect costs"),
+        paragraph(
+            "The loss is the change of the 50 % size when an effect goes on: alone, and on top of all others. The same "
+            "noise and holes stand behind both sides. Without noise the rounding of the output is the only error left."
+        ),
+        figure(
+            {"effects": effects_figure(costs)},
+            "effects",
+            "Error bars are 95 % bootstrap intervals over holes of one size and over repeats, paired.",
+        ),
+        Grid.of(heads, rows).html(),
+    ]
 
 
 def write_report(
@@ -56,14 +340,9 @@ def write_report(
     target: str = "",
 ) -> Path:
     """Write ``folder/report.html`` and return its path: the page of one set-up, that of several side by side, or that
-    of maps, with a page beside it for each map of ``examples`` that turns in the browser.
-
-    ``provenance`` may hold: ``command``, ``commit``, ``dirty``, ``versions``, ``mitsuba_variant``, ``seed``,
-    ``machine``, ``started``, ``seconds`` (by stage), ``indirect_noise_mm``, ``renders``, ``failures`` (texts, or
-    mappings with their parts); whatever else it holds is shown as it is, and a missing one as not recorded. ``target``:
-    its name; claims of the thesis are scored where it is "thesis". The same input gives the same bytes. Raises
-    UserError where the folder cannot be written.
-    """
+    of maps, with a page beside it for each map of ``examples`` that turns in the browser. ``provenance``: see
+    `harness.report.blocks.closing`. Claims of the thesis are scored where the ``target`` is "thesis". The same input
+    gives the same bytes. Raises UserError where the folder cannot be written."""
     rest = provenance, experiment_yaml_text, title, target == "thesis"
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
@@ -73,7 +352,7 @@ def write_report(
         text = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, *rest)
     for name, example in map_files(maps).items():
         write_view3d(Path(folder) / name, example, map_text(example))
-    path = Path(folder) / "report.html"
+    path = Path(folder) / REPORT.name
     write_text(path, text)
     return path
 
@@ -89,105 +368,72 @@ def report_html(
     """The page of an experiment with one set-up as text; see `write_report`."""
     summary = summarise_holes(tables.holes)
     main = summary[summary["variant"] == MAIN]
-    repeats = int(main["n"].max()) if len(main) else 0
     frames = sorted(int(n) for n in main["frames"].unique())
     noise = noise_against_frames(tables.probes[tables.probes["variant"] == MAIN])
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
     figures: dict[str, str] = {}
     if frames:
-        figures |= {"sizes": sizes_figure(main, frames[0], frames[-1]), "positions": positions_figure(main, frames[-1])}
+        figures["errors"] = errors_figure(main[main["frames"] == frames[-1]])
     if clouds:
-        drawn = {"cloud": cloud_figure, "residual": residual_figure, "profile": profile_figure}
-        figures |= {name: draw(clouds) for name, draw in drawn.items()}
+        figures["residual"] = residual_figure(clouds)
     if len(noise) and (noise["temporal_rms_mm"] > 0).all():
         figures["noise"] = noise_figure(noise)
-
     verdicts = score_claims(tables, MAIN, examples, summary) if with_claims else []
-    draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
+    calls = false_calls(tables.runs)
+    variants = [MAIN, *(str(name) for name in tables.variants["variant"] if name != MAIN)]
     body = [
         heading("Holes against frames"),
         paragraph(
             "Detections of trials, with the 95 % Wilson interval of the rate beneath. The bluer, the more often the "
             "hole was detected."
         ),
-        _rates(main, frames).html(),
-        heading("Sizes"),
+        sections.holes_grid(summary).html(),
+        heading("Sizes and positions"),
         figure(
             figures,
-            "sizes",
-            "Means over the trials in which the hole was detected; error bars are one standard deviation over the "
-            "repeats. The extent is that of the thresholded cluster; the model is a blurred hole fitted to the "
-            "residuals. Below: against the true diameter.",
+            "errors",
+            "With the most frames, over the trials that detected the hole: mean less truth ± one standard deviation. "
+            "Extent: of the thresholded cluster. Model: a blurred hole fitted to the residuals.",
         ),
-        *_measured(main),
-        heading("Positions"),
-        figure(
-            figures,
-            "positions",
-            "Distance from the centre of the largest cluster (extent) or from the largest cluster's modelled centre "
-            "(model). Right: the difference from the truth, with one graduation of a ruler in sixteenths of an inch.",
-        ),
-        heading("Averaged cloud"),
-        figure(
-            figures,
-            "cloud",
-            "Front view in the camera's frame. Magenta: pixels of detected clusters. Rings: the true holes, dashed "
-            "where this cloud shows no detection in them; the smallest are drawn wider than they are. Grey: no valid "
-            "point. These are single clouds, one for each number of frames; the rates above are over all repeats.",
+        SUMMARY.grid(sections.records(main[main["frames"] == main["frames"].max()])).html(),
+        note(
+            "Mean ± one standard deviation over the repeats, which share one fixed pattern: another unit of the camera "
+            "differs by more. Depth: along the optical axis to the floor or to what stands behind the hole."
         ),
         heading("Range residual"),
         figure(
             figures,
             "residual",
-            "Distance of each point behind (+) or before (−) the fitted surface. The scale is linear within ±1 mm and "
-            "logarithmic beyond. Grey: no valid point, or outside the crop.",
+            "Distance behind (+) or before (−) the fitted surface, linear within ±1 mm and logarithmic beyond. Magenta:"
+            " pixels of findings. Rings: the true holes, dashed where not found. Grey: no valid point, or outside the "
+            "crop. These are single clouds; the rates above are over all repeats.",
         ),
-        heading("Depth through holes"),
-        figure(
-            figures,
-            "profile",
-            "Residual along the row of pixels through each hole's centre, depth downwards. The dashed curve is the "
-            "hemisphere on the hole's rim with its depth fitted to all pixels inside the outline.",
-        ),
-        *([_shapes(clouds[-1]).html()] if clouds else []),
         heading("Noise against frames"),
         figure(
             figures,
             "noise",
             "Over the probe pixels of the undamaged face: the temporal noise is the scatter over repeats, "
-            "displacements of whole clouds taken out, the systematic error is what every repeat shares. The guide "
-            "falls as one over the square root of the number of frames; the floor is what no averaging removes.",
+            "displacements of whole clouds taken out, the systematic error is what every repeat shares.",
         ),
-        *([_noise(noise).html()] if len(noise) else []),
-        *claims_section("The thesis' claims", verdicts),
+        NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
+        *sections.claims_section("The thesis' claims", verdicts),
+        *sections.varied_section(
+            tables,
+            compare_set_ups(tables, summary, variants, half_sizes=False),
+            (*frames[:1], *frames[-1:]),
+            of=MAIN,
+        ),
+        heading("False calls"),
+        note(sections.CALLS_NOTE),
+        FALSE_CALLS.grid(sections.records(calls[calls["variant"] == MAIN]), heads={"set-up": ""}).html(),
+        *closing(provenance, experiment_yaml_text, sections.left_out(tables.runs)),
     ]
-    variants = [MAIN, *(str(name) for name in tables.variants["variant"] if name != MAIN)]
-    compared = compare_set_ups(tables, summary, variants, half_sizes=False)
-    body += varied_section(tables, compared, list(dict.fromkeys([*frames[:1], *frames[-1:]])), of=MAIN)
-    if verdicts and len(variants) > 1:
-        table = verdicts_by_variant(tables, examples, summary).set_index("variant").loc[variants]
-        usual = table.loc[MAIN]
-        cells = [[name, *(verdict_cell(str(table.loc[name, c]), str(usual[c])) for c in RULES)] for name in variants]
-        body += [
-            paragraph(
-                "The claims with each change. ≠: another verdict than as declared. C6 needs a kept cloud and is "
-                "undecided where there is none."
-            ),
-            Grid.of(("variation", *RULES), cells, left=1 + len(RULES)).html(),
-        ]
-    calls = false_calls(tables.runs)
-    body += [heading("False calls"), note(CALLS_NOTE), calls_grid(calls[calls["variant"] == MAIN]).html()]
-    under = [note(f"{found_rule(repeats)} {DRAWS.format(draws)}")]
-    end = closing(provenance, experiment_yaml_text, left_out(tables.runs))
-    return page(title, answer_sentence(main, verdicts), [*body, *end], under)
+    repeats = int(main["n"].max()) if len(main) else 0
+    return page(title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)])
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:
-    """Say what the experiment found in a sentence or two: the holes found with the most and the fewest frames, and
-    the claims.
-
-    ``main``: summary rows of the main variant.
-    """
+    """Say which holes were found with the most and the fewest frames, and the claims. ``main``: its summary rows."""
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())
@@ -204,103 +450,4 @@ def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str
         text += f", with {hole_list(open_)} undecided" if open_ else ""
         counted = "one frame" if n == 1 else f"{n} averaged frames"
         parts.append(f"with {counted} {text}" if parts else f"With {counted} the camera finds {text}")
-    return f"{'; '.join(parts)}.{counted_verdicts(verdicts)}"
-
-
-def _rates(main: pd.DataFrame, frames: Sequence[int]) -> Grid:
-    """A row per hole with a cell per number of frames: counts, interval, status, shade of blue by rate."""
-    rows = []
-    for hole, part in main.groupby("hole", sort=False):
-        first, there = part.iloc[0], {int(row["frames"]): row for row in records(part)}
-        cells: list[str | Cell] = [str(hole), inches(float(first["true_diameter_mm"]))]
-        cells += [f"{first['true_diameter_mm']:.2f}", str(first["kind"])]
-        rows.append(cells + [_rate(there[n]) if n in there else "–" for n in frames])
-    heads = ("hole", "drill", "true diameter (mm)", "kind", *(f"{n} frame{'s' if n > 1 else ''}" for n in frames))
-    return Grid.of(heads, rows, left=2)
-
-
-def _rate(row: Mapping[str, Any]) -> Cell:
-    rate, low, high = (float(row[name]) for name in ("rate", "rate_low", "rate_high"))
-    shares = {state: float(row[f"share_{state.replace(' ', '_')}"]) for state in STATES}
-    seen = ", ".join(f"{state} {100 * share:.0f} %" for state, share in shares.items() if share > 0)
-    interval = f"rate {bounded(rate, low, high)}, 95 % Wilson interval"
-    hover = f"{row['status']}: {interval}. The hole's pixels: {seen or 'unknown'}"
-    return Cell(f"{row['detected']}/{row['n']}\n{low:.2f}–{high:.2f}, {row['status']}", share=rate, hover=hover)
-
-
-def _measured(main: pd.DataFrame) -> list[Markup]:
-    """Size, depth and centre of each hole with the most frames, by both measures, against the truth."""
-    if main.empty:
-        return []
-    rows = [
-        (
-            str(row["hole"]),
-            mm(row["true_diameter_mm"]),
-            plus_minus(row["extent_diameter_mean_mm"], row["extent_diameter_std_mm"]),
-            plus_minus(row["model_diameter_mean_mm"], row["model_diameter_std_mm"]),
-            mm(row["model_diameter_se_mean_mm"]),
-            f"{100 * row['model_diameter_covered']:.0f} %" if np.isfinite(row["model_diameter_covered"]) else "–",
-            mm(row["seen_depth_mm"], 1),
-            plus_minus(row["model_depth_mean_mm"], row["model_depth_std_mm"]),
-            mm(row["model_depth_se_mean_mm"]),
-            mm(row["extent_error_mean_mm"]),
-            mm(row["model_error_mean_mm"]),
-        )
-        for row in records(main[main["frames"] == main["frames"].max()])
-    ]
-    heads = (
-        *("hole", "true (mm)", "extent (mm)", "model (mm)", "its stated error (mm)", "truth within 1.96 of it"),
-        *("depth seen (mm)", "model's depth (mm)", "its stated error (mm)"),
-        *("centre off, extent (mm)", "centre off, model (mm)"),
-    )
-    said = (
-        "With the most frames: mean ± one standard deviation over the repeats, which share one fixed pattern; another "
-        "unit of the camera differs by more than they do. The stated errors are those of the fits. \"Depth seen\" is "
-        "along the optical axis to the floor or to what stands behind the hole; centres are in three dimensions, and "
-        "that of the extent lies at the points' mean depth."
-    )  # fmt: skip
-    return [Grid.of(heads, rows).html(), note(said)]
-
-
-def _shapes(cloud: ExampleCloud) -> Grid:
-    """Misfits of bowl and cylinder to each hole, and to the true geometry at the same pixels."""
-    heads = (
-        *("hole", "pixels", "true depth (mm)", "misfit as a bowl (mm)", "as a cylinder (mm)"),
-        *("as the true hole seen (mm)", "true geometry as a bowl (mm)", "as a cylinder (mm)"),
-        *(f"reached at {ring:g} R" for ring in RINGS),
-        "looks",
-    )
-    rows = [
-        (
-            shape.hole,
-            str(shape.pixels),
-            mm(shape.true_depth_mm, 1),
-            *map(mm, (shape.bowl_rms_mm, shape.cylinder_rms_mm, shape.seen_rms_mm)),
-            *map(mm, (shape.true_bowl_rms_mm, shape.true_cylinder_rms_mm)),
-            *(f"{100 * share:.0f} %" if np.isfinite(share) else "–" for share in shape.reached),
-            LOOKS[shape.looks],
-        )
-        for shape in hole_shapes(cloud)
-    ]
-    return Grid.of(heads, rows)
-
-
-def _noise(noise: pd.DataFrame) -> Grid:
-    shown = {
-        "temporal_rms_mm": "temporal noise (mm)",
-        "guide_mm": "1/√N guide (mm)",
-        "offset_mm": "offset (mm)",
-        "pattern_mm": "pattern (mm)",
-        "systematic_mm": "systematic (mm)",
-        "total_rms_mm": "total (mm)",
-        "displacement_mm": "whole cloud displaced (mm)",
-    }
-    rows = [
-        (
-            str(row["frames"]),
-            *(f"{row[name]:+.3f}" if name == "offset_mm" else mm(row[name], 3) for name in shown),
-            f"{row['pixels']} × {row['repeats']}",
-        )
-        for row in records(noise)
-    ]
-    return Grid.of(("frames", *shown.values(), "pixels × repeats"), rows, left=0)
+    return f"{'; '.join(parts)}.{sections.counted_verdicts(verdicts)}"

@@ -1,4 +1,4 @@
-"""A probability of detection curve: its table for terminal and page, and its figure, with the inspections behind it."""
+"""A probability of detection curve: its tables for terminal and page, and its figure with the inspections behind it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.pod.curve import Bound
-from harness.evaluation.pod.statement import POD, ModelRow, PodStatement
-from harness.report.blocks import bullets, command_of, figure, heading, note, page, subheading
-from harness.report.canvas import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, save_png, svg
-from harness.tables.grid import Cell, Grid
+from harness.evaluation.pod.statement import POD, PodStatement
+from harness.report.blocks import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    bullets,
+    command_of,
+    figure,
+    heading,
+    note,
+    page,
+    save_png,
+    subheading,
+    svg,
+)
+from harness.tables.schema import Column, Table
+from harness.tables.text import Grid
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,27 +80,34 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 
 def sizes_grid(statement: PodStatement) -> Grid:
     """a50, a90 and every bound: size, and how it was found."""
-    rows = [("a50", statement.a50, "estimate"), ("a90", statement.a90, "estimate")]
     bounds = [(statement.bound, f"{statement.bound.method}: the limit to quote")]
     bounds += [(each, each.method) for each in statement.others]
     if statement.independent is not None:
         bounds.append((statement.independent, "WRONG here: as if every inspection were a target of its own"))
-    cells = [(name, sized(size, statement.unit), how) for name, size, how in rows]
-    cells += [("a90/95", _bound_text(bound, statement.unit), how) for bound, how in bounds]
-    return Grid.of(("", "size", "how"), cells, left=3)
+    rows = [(name, sized(getattr(statement, name), statement.unit), "estimate") for name in ("a50", "a90")]
+    rows += [("a90/95", _bound_text(bound, statement.unit), how) for bound, how in bounds]
+    return Grid.of(("", "size", "how"), rows, left=3)
+
+
+MODELS = Table(
+    "models",
+    "one row per model that was tried",
+    (
+        Column("", "model", lambda row: f"{row.name}{' (used)' if row.chosen else ''}"),
+        Column("", "criterion", lambda row: f"{row.criterion:.2f}"),
+        Column("", "a50", lambda row: sized(row.a50, "")),
+        Column("", "a90", lambda row: sized(row.a90, "")),
+        Column("", "a90/95", lambda row: _bound_text(row.bound, ""), tone=lambda row: "key" if row.chosen else ""),
+    ),
+    formats=(),
+)
 
 
 def models_grid(statement: PodStatement) -> Grid:
     """The models that were tried, the one in use marked."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
-
-    def cells(row: ModelRow) -> list[Cell]:
-        sizes = sized(row.a50, ""), sized(row.a90, ""), _bound_text(row.bound, "")
-        texts = (f"{row.name}{' (used)' if row.chosen else ''}", f"{row.criterion:.2f}", *sizes)
-        return [Cell(text, "key" if row.chosen else "") for text in texts]
-
-    heads = ("model", statement.criterion, f"a50{of_unit}", f"a90{of_unit}", f"a90/95{of_unit}")
-    return Grid.of(heads, map(cells, statement.models))
+    heads = {name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
+    return MODELS.grid(statement.models, heads={"criterion": statement.criterion, **heads})
 
 
 def fit_grid(statement: PodStatement) -> Grid:
@@ -96,7 +120,7 @@ def _bound_text(bound: Bound, unit: str) -> str:
 
 
 def save_pod_png(path: Path, statement: PodStatement) -> None:
-    """The figure as a PNG of 160 dots an inch at ``path``; the same bytes for the same statement."""
+    """The figure as a PNG at ``path``; the same bytes for the same statement."""
     size_in, draw = _plan(statement)
     save_png(path, size_in, draw)
 
@@ -133,28 +157,26 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
         if statement.signal:
-            _signals(panels[0], statement)
-        _curve(panels[-1], statement)
+            draw_signals(panels[0], statement)
+            panels[0].set(ylabel=plain(statement.response_column), title="Signals")
+        draw_pod(panels[-1], statement, statement.bound)
+        if statement.curve.log_size:
+            _log_sizes(panels[-1], statement.sizes)
+        panels[-1].set_ylabel("probability of detection")
+        panels[-1].set_title(f"Probability of detection, {statement.targets} targets")
+        for axes in panels:
+            axes.set_xlim(statement.sizes[0], statement.sizes[-1])
+            axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+            axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
     return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
-
-
-def _curve(axes: Axes, statement: PodStatement) -> None:
-    draw_pod(axes, statement, statement.bound)
-    if statement.curve.log_size:
-        _log_sizes(axes, statement.sizes)
-    axes.set_xlim(statement.sizes[0], statement.sizes[-1])
-    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
-    axes.set_ylabel("probability of detection")
-    axes.set_title(f"Probability of detection, {statement.targets} targets")
-    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
 
 def draw_pod(
     axes: Axes, statement: PodStatement, bound: Bound, strength: float = 0.6, most: float = float("inf")
 ) -> None:
-    """Curve, band, data (strokes of opacity ``strength``) and the sizes read off, ``bound`` among them, without words
-    at the axes; the height leaves room for the data. Sizes beyond ``most`` are named as such and not drawn."""
+    """Curve, band, data (strokes of opacity ``strength``) and the sizes read off, ``bound`` among them; sizes beyond
+    ``most`` are named as such and not drawn."""
     curve, sizes = statement.curve, statement.sizes
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
@@ -169,14 +191,21 @@ def draw_pod(
         ("a90", statement.a90, POD, ORANGE),
         ("a90/95", bound.value, POD, RED),
     ):
-        _mark(axes, statement, name, value, pod, colour, most)
+        text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
+        if most < value < np.inf:
+            text = f"> {most:.3g} {statement.unit}"
+        inside = sizes[0] <= value <= min(sizes[-1], most)
+        if inside:
+            axes.plot([value, value], [0, pod], color=colour, lw=1.1)
+        at = ([value], [pod]) if inside else ([], [])
+        axes.plot(*at, "o", color=colour, ms=6, mec="white", mew=0.8, label=plain(f"{name}: {text}"), zorder=5)
     hits_in_view(axes, STRIPE + 0.06 if statement.signal is None else 0.03)
 
 
 def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) -> None:
-    """Each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke: hits above 1, misses below 0, spread in height
-    so that equal sizes stay apart."""
-    spread = STRIPE * _spread(len(size))
+    """Each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke, spread in height so that equals stay apart."""
+    # multiples of the golden ratio keep apart without chance
+    spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
     style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": strength, "clip_on": False}
     axes.scatter(size[hit], 1.03 + spread[hit], **style)
     label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"
@@ -187,27 +216,6 @@ def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
     """The axis of POD, with room above and below its 0 and 1."""
     axes.set_ylim(-beside, 1 + beside)
     axes.set_yticks(np.linspace(0, 1, 6))
-
-
-def _mark(axes: Axes, statement: PodStatement, name: str, value: float, pod: float, colour: str, most: float) -> None:
-    text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
-    if most < value < np.inf:
-        text = f"> {most:.3g} {statement.unit}"
-    label = plain(f"{name}: {text}")
-    if statement.sizes[0] <= value <= min(statement.sizes[-1], most):
-        axes.plot([value, value], [0, pod], color=colour, lw=1.1)
-        axes.plot([value], [pod], "o", color=colour, ms=6, mec="white", mew=0.8, label=label, zorder=5)
-    else:
-        told = not np.isfinite(value) or value > most
-        axes.plot([], [], "o", color=colour, ms=6, label=label if told else f"{label}, not shown")
-
-
-def _signals(axes: Axes, statement: PodStatement) -> None:
-    draw_signals(axes, statement)
-    axes.set_xlabel(axis_text(statement.size_column, statement.unit))
-    axes.set_ylabel(plain(statement.response_column))
-    axes.set_title("Signals")
-    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
 
 def draw_signals(axes: Axes, statement: PodStatement) -> None:
@@ -225,17 +233,12 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
     for value in (model.left, model.right):
         if value is not None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
-    kept = np.ones(len(statement.size), bool)
-    if model.left is not None:
-        kept &= statement.response > model.left
-    if model.right is not None:
-        kept &= statement.response < model.right
+    left, right = -np.inf if model.left is None else model.left, np.inf if model.right is None else model.right
+    kept = (statement.response > left) & (statement.response < right)
     axes.scatter(statement.size[kept], statement.response[kept], s=14, color=INK, alpha=0.7, lw=0, label="signals")
     if ends:
-        label = f"censored, {' or '.join(ends)}"
-        axes.scatter(
-            statement.size[~kept], statement.response[~kept], s=18, marker="x", color=PURPLE, lw=1, label=label
-        )
+        censored: dict[str, Any] = {"marker": "x", "color": PURPLE, "label": f"censored, {' or '.join(ends)}"}
+        axes.scatter(statement.size[~kept], statement.response[~kept], s=18, lw=1, **censored)
     if model.log_signal:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)
@@ -257,8 +260,3 @@ def plain_numbers(axis: Axis, at: tuple[float, ...] = (1, 2, 5)) -> None:
     axis.set_major_locator(LogLocator(subs=at))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _spread(n: int) -> np.ndarray:
-    """(n,) numbers in [0, 1) that keep apart without chance: multiples of the golden ratio."""
-    return np.asarray((np.arange(n) * 0.6180339887498949) % 1.0)

@@ -1,55 +1,264 @@
-"""The page of a study: its detection limits, what they rest on, and how far they hold."""
+"""The page of a study: its detection limits, what they rest on, how far they hold, and its figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from textwrap import fill, shorten
+from typing import TYPE_CHECKING, Any
 
-from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.result import StudyResult
-from harness.evaluation.study.surface import depth_varies
-from harness.report.blocks import closing, joined, template
-from harness.report.examples import StudyExample
-from harness.report.set_ups_figures import COLOURS
-from harness.report.study_axes_figure import axis_figure
-from harness.report.study_examples_figure import examples_figure
-from harness.report.study_figures import (
-    MOST_PANELS,
-    calls_figure,
-    curves_figure,
-    operating_figure,
-    signals_figure,
-    surface_figure,
-    with_room,
-)
-from harness.tables.grid import Grid
-from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, name_of, study_answer
+import numpy as np
+
+from harness.evaluation.study.curves import PRO_LIMIT
+from harness.evaluation.study.limit import PodSurface, SetUpLimit, depth_varies
+from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.report.blocks import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, closing, joined, svg, template
+from harness.report.clouds import StudyExample, examples_figure
+from harness.report.page import COLOURS, MARKERS
+from harness.report.pod import draw_hits, draw_pod, draw_signals, hits_in_view, plain, plain_numbers
+from harness.tables import study
+from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, name_of, study_answer
+from harness.tables.outputs import REPORT
 from harness.tables.schema import Table
-from harness.tables.study import (
-    CHANCE,
-    OPERATING,
-    SET_BY,
-    SIGNALS,
-    SURFACES,
-    THRESHOLDS,
-    AxisGroup,
-    axis_grid,
-    axis_groups,
-    axis_note,
-    operating_notes,
-    signal_notes,
-    signal_tests,
-    size_grids,
-    study_tables,
-    threshold_note,
-    threshold_warnings,
-)
-from harness.tables.text import unbroken
+from harness.tables.text import Grid, unbroken
 from harness.vocabulary.files import write_text
+from harness.vocabulary.path_names import value_text
 
-MOST_NAMED = 3
-"""Set-ups that a note calls by name; of more it gives the number."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MOST_PANELS = 6
+PANEL_IN = (5.2, 4.5)
+ONE_IN = (8.6, 5.2)
+LEVELS = {0.1: SKY, 0.5: GREEN, 0.9: ORANGE}
+GRID = 121
+STYLES = ("-", "--", ":", "-.")
+LONGEST_NAME = 60
+
+
+def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
+    """Return those shown in figures: all, or `MOST_PANELS` evenly from the smallest limit to the largest, in order."""
+    by_limit = sorted(set_ups, key=lambda one: one.limit.a90_95.value)
+    places = np.linspace(0, len(by_limit) - 1, min(MOST_PANELS, len(by_limit))).round().astype(int)
+    chosen = {id(by_limit[place]) for place in places}
+    return [one for one in set_ups if id(one) in chosen]
+
+
+def curves_figure(limits: Sequence[SetUpLimit]) -> str:
+    """Draw hits and misses, the curve with its band, a50, a90 and a90/95, on one scale of sizes."""
+    span = _span(limits)
+
+    def draw(axes: Axes, limit: SetUpLimit) -> None:
+        strength = min(0.6, 150 / max(limit.inspections, 1))
+        if limit.statement is not None:
+            draw_pod(axes, limit.statement, limit.a90_95, strength, most=limit.largest_mm)
+        else:
+            seen = limit.record.inspected
+            draw_hits(axes, seen.diameter_mm, seen.hit, strength=strength)
+            hits_in_view(axes)
+            if limit.a90_95.demonstrated:
+                axes.plot([limit.a90_95.value], [0.9], "o", color=PURPLE, label=f"a90/95: {limit.a90_95.value:.2f} mm")
+            words, place = plain(fill(f"no curve: {limit.why}", 44)), axes.transAxes
+            axes.text(0.5, 0.5, words, transform=place, ha="center", va="center", color=GREY, fontsize=9)
+        axes.set(xlim=span, xlabel="diameter (mm)", ylabel="probability of detection")
+
+    return _panels("curves", limits, draw, " ".join(limit_sentence(limit) for limit in limits))
+
+
+def signals_figure(limits: Sequence[SetUpLimit]) -> str:
+    """Draw signals against size, their regression and the threshold, of set-ups that have a regression."""
+
+    def draw(axes: Axes, limit: SetUpLimit) -> None:
+        assert limit.signals is not None
+        draw_signals(axes, limit.signals)
+        axes.set(xlim=_span([limit]), xlabel="diameter (mm)", ylabel="highest score at the damage")
+
+    names = "; ".join(name_of(limit) for limit in limits)
+    return _panels("signals", limits, draw, f"Score of each damage against its diameter, with the threshold: {names}.")
+
+
+def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
+    """Draw lines of equal POD over diameter and depth, the interval of that of 90 %, every damage found or missed."""
+    of_limit = {id(limit): surface for limit, surface in surfaces}
+
+    def draw(axes: Axes, limit: SetUpLimit) -> None:
+        surface = of_limit[id(limit)]
+        (left, right), (low, high) = surface.diameter_range_mm, surface.depth_range_mm
+        diameter, depth = np.linspace(left, right, GRID), np.geomspace(low, high, GRID)
+        pod = surface.pod(*np.meshgrid(diameter, depth))
+        shade = axes.contourf(diameter, depth, pod, levels=np.linspace(0, 1, 11), cmap="Greys", alpha=0.28)
+        shade.set_rasterized(True)
+        inside = [np.clip(edge, left, right) for edge in (surface.a90_low_mm, surface.a90_high_mm)]
+        axes.fill_betweenx(surface.depth_mm, *inside, color=ORANGE, alpha=0.3, lw=0, label="90 %, interval over boards")
+        for level, colour in LEVELS.items():
+            if pod.min() < level < pod.max():
+                axes.contour(diameter, depth, pod, levels=[level], colors=[colour], linewidths=2)
+            axes.plot([], [], color=colour, lw=2, label=f"POD {100 * level:.0f} %")
+        seen = limit.record.inspected
+        hit = np.asarray(seen.hit, bool)
+        axes.scatter(seen.diameter_mm[hit], seen.depth_mm[hit], s=9, color=BLUE, lw=0, alpha=0.8, label="found")
+        missed: dict[str, Any] = {"s": 11, "facecolor": "white", "edgecolor": INK, "lw": 0.6, "alpha": 0.8}
+        axes.scatter(seen.diameter_mm[~hit], seen.depth_mm[~hit], label="missed", **missed)
+        axes.set(xlabel="diameter (mm)", ylabel="depth of removed material (mm)", xlim=(left, right), ylim=(low, high))
+
+    alt = "Probability of detection over diameter and depth."
+    return _panels("surface", [limit for limit, _ in surfaces], draw, alt, one_legend=True)
+
+
+def _panels(
+    name: str,
+    limits: Sequence[SetUpLimit],
+    draw_one: Callable[[Axes, SetUpLimit], None],
+    alt: str,
+    *,
+    one_legend: bool = False,
+) -> str:
+    across = min(2, len(limits))
+    down = -(-len(limits) // across)
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, limit in zip(grid, limits, strict=False):
+            draw_one(axes, limit)
+            axes.set_title(plain(fill(name_of(limit), 46 if across > 1 else 80)))
+            if not one_legend:
+                axes.legend(loc="upper left", bbox_to_anchor=(0, -0.17), ncols=2, borderaxespad=0, fontsize=8)
+        for axes in grid[len(limits) :]:
+            axes.set_visible(False)
+        if one_legend:
+            figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+    high = 3.9 * down + 0.7 if one_legend else PANEL_IN[1] * down
+    return svg(name, (PANEL_IN[0] * across, high) if across > 1 else ONE_IN, alt, draw)
+
+
+def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
+    """The sizes inspected with 4 % of them on either side; of a single size a tenth of it."""
+    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    if not len(sizes):
+        return 0.0, 1.0
+    low, high = float(sizes.min()), float(sizes.max())
+    margin = 0.04 * (high - low) or 0.1 * abs(high) or 0.5
+    return (max(low - margin, 0.5 * low) if low > 0 else low - margin), high + margin
+
+
+def operating_figure(results: Sequence[SetUpResult]) -> str:
+    """Draw ROC (of a single set-up by classes of size), free-response curve and overlap of regions of each set-up."""
+    by_size = len(results) == 1
+
+    def draw(figure: Figure) -> None:
+        left, middle, right = figure.subplots(1, 3)
+        for result, colour in zip(results, COLOURS, strict=False):
+            for roc, style in zip(result.roc if by_size else result.roc[:1], STYLES, strict=False):
+                label = f"{roc.name}: {roc.area:.3f}" if by_size else f"{roc.area:.3f}"
+                left.plot(roc.false, roc.true, color=colour, ls=style, lw=1.5, label=label)
+                left.plot(*roc.at, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
+            if (curve := result.free_response) is not None:
+                # thresholds without a false call have no place on a logarithmic axis: they stand at its left end
+                least = 0.5 / curve.area_m2
+                calls = np.maximum(curve.false_calls_per_m2, least)
+                middle.fill_between(calls, curve.found_low, curve.found_high, color=colour, alpha=0.13, lw=0)
+                name = plain(fill(name_of(result.limit), LONGEST_NAME))
+                middle.plot(calls, curve.found, color=colour, lw=1.6, label=name)
+                at = (max(curve.at[0], least), curve.at[1])
+                middle.plot(*at, "o", color=colour, ms=6.5, mec="white", mew=0.9, zorder=5)
+            if (pixels := result.pixels) is not None:
+                kept = pixels.false <= PRO_LIMIT
+                end = np.interp(PRO_LIMIT, pixels.false, pixels.overlap)
+                area = f"AU-PRO {pixels.pro:.3f}" if np.isfinite(pixels.pro) else "AU-PRO not reached"
+                x, y = np.append(pixels.false[kept], PRO_LIMIT), np.append(pixels.overlap[kept], end)
+                right.plot(x, y, color=colour, lw=1.6, label=area)
+        left.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls=":")
+        left.set(xlabel="share of unflawed places above", ylabel="share of damages above", xlim=(-0.02, 1))
+        left.set_title("ROC over places" + ("" if by_size else ", all sizes"))
+        middle.set(xscale="log", xlabel="false calls per m², hole-free", ylabel="share of damages found")
+        plain_numbers(middle.xaxis, (1,))
+        middle.plot([], [], "o", color=GREY, ms=6, label="threshold in use")
+        middle.set_title("Free-response curve")
+        right.set(xlabel="share of undamaged pixels above", ylabel="mean share of a damage's pixels above")
+        right.set(xlim=(0, PRO_LIMIT), title="Overlap of regions")
+        for axes in (left, middle, right):
+            axes.set_ylim(0, 1.02)
+        for axes in (left, right):
+            if axes.get_legend_handles_labels()[0]:
+                axes.legend(loc="lower right", fontsize=8, title="area under the curve" if axes is left else None)
+        figure.legend(*middle.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+    lines = sum(-(-len(name_of(one.limit)) // LONGEST_NAME) for one in results)
+    return svg(
+        "operating", (10.6, 4.3 + 0.13 * lines), "Operating curves over all thresholds, a colour for each set-up.", draw
+    )
+
+
+ROOM = 1.3
+WIDTH_CHARACTERS = 75
+
+
+def axis_figure(axis: study.AxisGroup, name: str) -> str:
+    """a90 with its interval over boards and a90/95 for each value of the axis; an arrow for what lies far beyond."""
+    shown = list(axis.lines.items())[: len(COLOURS)]
+    every = [limit for _, line in shown for limit in line.limits]
+    top_mm = ROOM * max((limit.largest_mm for limit in every if limit.inspections), default=np.inf)
+    places = np.array(axis.values, float) if axis.numeric else np.arange(len(axis.values), dtype=float)
+    logarithmic = axis.numeric and places.min() > 0 and places.max() / places.min() >= 8
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        # intervals of several lines stand beside each other, moved by 2.5 % of the axis, less where places are close
+        scale = np.log(places) if logarithmic else places
+        nearest = float(np.diff(np.sort(scale)).min()) if len(scale) > 1 else 1.0
+        step = min(0.025 * (float(np.ptp(scale)) or 1.0), 0.6 * nearest / len(shown))
+        beyond = False
+        for number, (label, line) in enumerate(shown):
+            moved = scale + step * (number - (len(shown) - 1) / 2)
+            x = (np.exp(moved) if logarithmic else moved)[[axis.values.index(value) for value in line.values]]
+            ends_of = [limit.a90_interval_mm for limit in line.limits]
+            sizes = [limit.a90_mm for limit in line.limits], [limit.a90_95.value for limit in line.limits]
+            a90, bound = np.array(sizes)
+            low, high = np.array([(ends.low, ends.high) for ends in ends_of]).T
+            inside = np.where(a90 <= top_mm, a90, np.nan)
+            ends = np.nan_to_num(np.clip([inside - low, np.minimum(high, top_mm) - inside], 0, None))
+            style: dict[str, Any] = {"ls": "-" if axis.numeric else "none", "lw": 1.2, "ms": 5.5, "capsize": 3}
+            style |= {"label": plain(label or "a90, 95 % over boards"), "color": COLOURS[number]}
+            axes.errorbar(x, inside, ends, fmt=MARKERS[number], **style)
+            axes.plot(x[bound <= top_mm], bound[bound <= top_mm], "_", color=COLOURS[number], ms=13, mew=2.4)
+            far = np.isfinite(a90) & (np.fmax(np.fmax(high, a90), bound) > top_mm) | np.isinf(a90)
+            axes.plot(x[far], np.full(far.sum(), top_mm), "^", color=COLOURS[number], ms=6.5, clip_on=False)
+            beyond |= bool(far.any())
+        axes.plot([], [], "_", color=GREY, ms=11, mew=2.2, label="a90/95")
+        if beyond:
+            axes.plot([], [], marker="^", ls="none", color=GREY, ms=6, label="goes on beyond")
+        if np.isfinite(top_mm):
+            axes.axhline(top_mm / ROOM, color=GREY, lw=1.0, ls=":", label="largest size inspected")
+        for value, place in zip(axis.values, places, strict=True):
+            pairs = [pair for _, line in shown for pair in zip(line.values, line.limits, strict=True)]
+            without = sum(at == value and not is_within_sizes(limit) for at, limit in pairs)
+            if without:
+                said = "no limit" if len(shown) == 1 else f"no limit\n({without})"
+                style = {"ha": "center", "va": "bottom", "fontsize": 8, "color": GREY}
+                axes.text(place, 1.02, said, transform=axes.get_xaxis_transform(), **style)
+        if logarithmic:
+            axes.set_xscale("log")
+            axes.minorticks_off()
+        labels = [f"{value:g}" for value in axis.values] if axis.numeric else [
+            plain(fill(shorten(value_text(axis.path, value), 40, placeholder=" …"), 18, break_long_words=False))
+            for value in axis.values
+        ]  # fmt: skip
+        axes.set_xticks(places, labels)
+        if max(len(line) for label in labels for line in label.split("\n")) * len(labels) > WIDTH_CHARACTERS:
+            axes.tick_params(axis="x", labelrotation=25)
+        axes.set(xlabel=plain(axis.title), ylabel="a90 (mm)")
+        axes.margins(x=0.08)
+        axes.set_ylim(0, top_mm if np.isfinite(top_mm) else None)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+    return svg(
+        name,
+        (8.6, 4.4 + 0.13 * len(shown)),
+        f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says.",
+        draw,
+    )
 
 
 def write_study_report(
@@ -60,16 +269,16 @@ def write_study_report(
     resolved_yaml: str,
     title: str,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path. ``provenance`` as of `harness.report.page.write_report`. The
-    same input gives the same bytes. Raises UserError where the folder cannot be written."""
-    path = Path(folder) / "report.html"
+    """Write ``folder/report.html`` and return its path. The same input gives the same bytes. Raises UserError where the
+    folder cannot be written."""
+    path = Path(folder) / REPORT.name
     write_text(path, study_html(result, examples, provenance, resolved_yaml, title))
     return path
 
 
 def study_parts(result: StudyResult) -> list[str | Grid]:
     """Return what a terminal shows of a study: warnings, limits, what to know beside them, the answer."""
-    warnings = [f"warning: {text}" for text in threshold_warnings(result.limits)]
+    warnings = [f"warning: {text}" for text in study.threshold_warnings(result.limits)]
     notes = limit_notes(result.limits)
     grid = LIMITS.grid(result.limits, terminal=True)
     return [*warnings, grid, *([""] if notes else []), *notes, "", study_answer(result.limits)]
@@ -83,14 +292,30 @@ def study_html(
     title: str,
 ) -> str:
     """Return the page as text; see `write_study_report`."""
-    limits, rows = result.limits, study_tables(result)
-    groups = {f"axis-{number}": group for number, group in enumerate(axis_groups(result.axes), 1)}
-    shown = _examples_by_set_up(result, examples)
+    limits, rows = result.limits, study.study_tables(result)
+    groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
+    shown = with_room(result.set_ups)
+    inspected = [one.limit for one in shown if one.limit.inspections]
+    surfaces = [(one.limit, one.surface) for one in shown if one.surface is not None]
+    signals = [one.limit for one in shown if one.limit.signals is not None]
+    curved = [one for one in shown if one.roc or one.free_response or one.pixels]
+    figures = {name: axis_figure(group, name) for name, group in groups.items()}
+    figures |= {"curves": curves_figure(inspected)} if inspected else {}
+    figures |= {"surface": surface_figure(surfaces)} if surfaces else {}
+    figures |= {"signals": signals_figure(signals)} if signals else {}
+    figures |= {"operating": operating_figure(curved)} if curved else {}
+    named: list[tuple[str, str]] = []
+    for limit in (one.limit for one in shown):
+        record = limit.record
+        some = [one for one in examples if (one.variant, one.frames) == (record.variant, record.frames)]
+        if some:
+            title_of, name = name_of(limit), f"examples-{len(named) + 1}"
+            named.append((title_of, name))
+            figures[name] = examples_figure(name, some, title_of, by_limit=is_within_sizes(limit))
 
     def table(of: Table) -> Any:
         return of.grid(rows[of]).html() if rows[of] else None
 
-    tests = signal_tests(limits)
     return template("study.html").render(
         title=title,
         answer=unbroken(study_answer(limits)),
@@ -106,93 +331,49 @@ def study_html(
                 "title": group.name,
                 "figure": name,
                 "caption": _axis_caption(group),
-                "table": axis_grid(group).html(),
-                "note": axis_note(group),
+                "table": study.axis_grid(group).html(),
+                "note": study.axis_note(group),
             }
             for name, group in groups.items()
         ],
         has_depths=any(depth_varies(limit.record.inspected.depth_mm) for limit in limits),
-        surfaces=table(SURFACES),
+        surfaces=table(study.SURFACES),
         surface_notes=_surface_notes(result),
-        chance=table(CHANCE),
-        thresholds=table(THRESHOLDS),
-        threshold_note=threshold_note(result.record),
-        warnings=[unbroken(text) for text in threshold_warnings(limits)],
-        set_by=table(SET_BY),
-        signals=table(SIGNALS),
-        signal_tests=tests.html() if tests else None,
-        signal_notes=signal_notes(limits),
-        operating=table(OPERATING),
-        operating_notes=operating_notes(result.set_ups),
-        examples=[(name_of(limit), name) for name, (limit, _) in shown.items()],
-        sizes=[grid.html() for grid in size_grids(result.set_ups)],
+        judged=any(limit.false_calls is not None for limit in limits),
+        chance=table(study.CHANCE),
+        thresholds=table(study.THRESHOLDS),
+        threshold_note=study.threshold_note(result.record),
+        warnings=[unbroken(text) for text in study.threshold_warnings(limits)],
+        set_by=table(study.SET_BY),
+        signals=table(study.SIGNALS),
+        signal_notes=study.signal_notes(limits),
+        operating=table(study.OPERATING),
+        operating_notes=study.operating_notes(result.set_ups),
+        examples=named,
+        sizes=table(study.SIZES),
         validity=result.validity,
-        figures=_figures(result, groups, shown),
+        figures=figures,
         closing=joined(closing(provenance, resolved_yaml)),
     )
 
 
-def _figures(
-    result: StudyResult,
-    groups: Mapping[str, AxisGroup],
-    examples: Mapping[str, tuple[SetUpLimit, Sequence[StudyExample]]],
-) -> dict[str, str]:
-    """The figures that the data allow, as SVG text by name."""
-    shown = with_room(result.set_ups)
-    inspected = [one.limit for one in shown if one.limit.inspections]
-    surfaces = [(one.limit, one.surface) for one in shown if one.surface is not None]
-    signals = [one.limit for one in shown if one.limit.signals is not None]
-    curved = [one for one in shown if one.roc or one.free_response or one.pixels]
-    figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    if inspected:
-        figures["curves"] = curves_figure(inspected)
-    if surfaces:
-        figures["surface"] = surface_figure(surfaces)
-    if any(limit.false_calls is not None for limit in result.limits):
-        figures["calls"] = calls_figure(result.limits, result.record.false_calls_per_m2)
-    if signals:
-        figures["signals"] = signals_figure(signals)
-    if curved:
-        figures["operating"] = operating_figure(curved)
-    return figures | {
-        name: examples_figure(name, some, name_of(limit), by_limit=is_within_sizes(limit))
-        for name, (limit, some) in examples.items()
-    }
-
-
-def _axis_caption(group: AxisGroup) -> str:
+def _axis_caption(group: study.AxisGroup) -> str:
     caption = (
         "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95. What lies far beyond the "
-        "largest size inspected (dotted) is an arrow. No limit: a90/95 is not demonstrated within the sizes inspected."
+        "largest size inspected (dotted) is an arrow."
     )
     if len(group.lines) > len(COLOURS):
         caption += f" The first {len(COLOURS)} of {len(group.lines)} lines; the table goes on."
     return caption if group.numeric else f"{caption} The values have no order."
 
 
-def _examples_by_set_up(
-    result: StudyResult, examples: Sequence[StudyExample]
-) -> dict[str, tuple[SetUpLimit, list[StudyExample]]]:
-    """Name of the figure -> the set-up and its examples, of those set-ups with room on the page."""
-    found = []
-    for one in with_room(result.set_ups):
-        record = one.limit.record
-        some = [e for e in examples if (e.variant, e.frames) == (record.variant, record.frames)]
-        if some:
-            found.append((one.limit, some))
-    return {f"examples-{number + 1}": pair for number, pair in enumerate(found)}
-
-
 def _surface_notes(result: StudyResult) -> list[str]:
     """Reasons why there is no surface over diameter and depth, or what to know beside one, with their set-ups."""
-    reasons: dict[tuple[str, str], list[str]] = {}
+    reasons: dict[str, list[str]] = {}
     for one in result.set_ups:
-        reason = ("No surface", one.surface_why) if one.surface is None else ("Surface", one.surface.note)
-        reasons.setdefault(reason, []).append(name_of(one.limit))
-    notes = []
-    for (what, why), labels in reasons.items():
+        why = f"No surface: {one.surface_why}" if one.surface is None else one.surface.note
         if why:
-            some = ", ".join(labels) if len(labels) <= MOST_NAMED else f"{len(labels)} of {len(result.set_ups)} set-ups"
-            every = len(labels) == len(result.set_ups)
-            notes.append(f"{what}{'' if every else f' for {some}'}: {why}.")
-    return notes
+            reasons.setdefault(why, []).append(name_of(one.limit))
+    every = len(result.set_ups)
+    said = {why: "" if len(names) == every else f" ({', '.join(names)})" for why, names in reasons.items()}
+    return [f"{why}{where}." for why, where in said.items()]

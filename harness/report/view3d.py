@@ -9,13 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from harness.report.blocks import template
-from harness.report.canvas import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
-from harness.report.examples import FindingSeen, HoleSeen, MappedExample
+from harness.report.blocks import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, template
+from harness.report.clouds import FindingSeen, HoleSeen, MappedExample
 from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
-"""13 bytes a point, a third more as text: 2.6 MB."""
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#F0E442", "#332288", "#882255", "#44AA99")
 """Okabe and Ito's, then four of Tol's muted ones; further views begin anew."""
 SEVERAL = GREY
@@ -34,8 +32,7 @@ KINDS: dict[Kind, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A ring with a label: a true hole or a finding. ``centre_mm`` (3,), unit ``normal`` (3,), in the cloud's frame.
-    "found" and "missed" are true holes, "finding" and "false call" what a detector says."""
+    """A true hole ("found", "missed") or a finding: ``centre_mm`` (3,), unit ``normal`` (3,), in the cloud's frame."""
 
     centre_mm: np.ndarray
     normal: np.ndarray
@@ -46,10 +43,9 @@ class Circle3d:
 
 @dataclass(frozen=True)
 class Scene3d:
-    """The cloud that is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,) behind (+) or before
-    (-) the fitted surface, NaN where not judged; ``view_of`` (n,) index into ``view_names``, -1 of several;
-    ``detected`` (n,) bool. ``frame``: "board" (x right, y up, z to the viewer) or "camera" (x right, y down, z away).
-    ``facts``: what stands beside the picture, (name, value)."""
+    """The cloud that is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN where not judged;
+    ``view_of`` (n,) index into ``view_names``, -1 of several; ``detected`` (n,) bool. ``frame``: "board" (x right, y
+    up, z to the viewer) or "camera" (x right, y down, z away). ``facts``: (name, value) beside the picture."""
 
     points_mm: np.ndarray
     frame: Literal["board", "camera"]
@@ -64,43 +60,34 @@ class Scene3d:
 
 def scene_of(example: MappedExample) -> Scene3d:
     """The scene of a merged cloud of the report, with the truth."""
-
-    def circle(of: HoleSeen | FindingSeen, label: str, kind: Kind) -> Circle3d:
-        return Circle3d(np.array([of.x_mm, of.y_mm, 0.0]), np.array([0.0, 0.0, 1.0]), of.diameter_mm, label, kind)
-
-    truth = [circle(hole, hole.hole, "found" if hole.found else "missed") for hole in example.holes]
-    findings = [
-        circle(finding, f"{finding.diameter_mm:.1f}", "finding" if finding.hole else "false call")
-        for finding in example.findings
-    ]
-    facts = (
-        ("views", str(example.views)),
-        ("frames a view", str(example.frames)),
-        ("registration", example.registration),
-        ("merge", example.merge),
-        ("holes found", f"{sum(h.found for h in example.holes)} of {len(example.holes)}"),
-    )
-    names = tuple(view.name for view in example.placed) or tuple(f"view {n + 1}" for n in range(example.views))
+    circles: list[tuple[HoleSeen | FindingSeen, str, Kind]] = []
+    circles += [(hole, hole.hole, "found" if hole.found else "missed") for hole in example.holes]
+    circles += [(one, f"{one.diameter_mm:.1f}", "finding" if one.hole else "false call") for one in example.findings]
+    normal = np.array([0.0, 0.0, 1.0])
     return Scene3d(
         points_mm=example.points_mm,
         frame="board",
         rgb=example.rgb,
         residual_mm=example.residual_mm,
         view_of=example.view_of,
-        view_names=names,
+        view_names=example.view_names or tuple(f"view {n + 1}" for n in range(example.views)),
         detected=example.detected,
-        circles=(*truth, *findings),
-        facts=facts,
+        circles=tuple(
+            Circle3d(np.array([of.x_mm, of.y_mm, 0.0]), normal, of.diameter_mm, label, kind)
+            for of, label, kind in circles
+        ),
+        facts=(
+            ("views", f"{example.views} ({example.registration}, {example.merge})"),
+            ("frames a view", str(example.frames)),
+            ("holes found", f"{sum(h.found for h in example.holes)} of {len(example.holes)}"),
+        ),
     )
 
 
 def write_view3d(path: Path, shown: Scene3d | MappedExample, title: str) -> Path:
-    """Write one self-contained page that shows the cloud and return its path.
-
-    It needs WebGL 1 and no network, and says so where there is none. Of more than `MOST_POINTS` points all detected
-    ones and an even sample of the others are kept. The same input gives the same bytes. Raises UserError where the
-    file cannot be written, ValueError where no point is finite.
-    """
+    """Write one self-contained page that shows the cloud (by WebGL 1) and return its path. Of more than `MOST_POINTS`
+    points all detected ones and a sample of the others are kept. Raises UserError where the file cannot be written,
+    ValueError where no point is finite."""
     write_text(Path(path), view3d_html(scene_of(shown) if isinstance(shown, MappedExample) else shown, title))
     return Path(path)
 
@@ -113,8 +100,8 @@ def view3d_html(scene: Scene3d, title: str) -> str:
 
 
 def packed(scene: Scene3d) -> dict[str, Any]:
-    """The cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers, None where there is
-    none. Places are whole numbers of 16 bits within the bounding box: steps of 0.01 mm over 0.6 m."""
+    """The cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers. Places are whole
+    numbers of 16 bits within the bounding box: steps of 0.01 mm over 0.6 m."""
     kept = _kept(scene)
     # The page's frame: x right, y up, z to the viewer. From a camera's that is half a turn about x.
     turn = np.array([1.0, 1.0, 1.0] if scene.frame == "board" else [1.0, -1.0, -1.0])

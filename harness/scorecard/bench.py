@@ -1,4 +1,9 @@
-"""The bench: a camera before a scene of known geometry, the frames that it takes, and numbers with their intervals."""
+"""The bench: a camera before a scene of known geometry, and the analysis of depth images: planes, noise, depth steps.
+
+A plane z = d + sx x + sy y is exactly linear in 1/z over the rays' slopes: 1/z = (1 - sx X - sy Y) / d. A stack is
+``z_m`` (n, h, w) of a static scene, NaN where a frame has no range; ``where`` (h, w) bool names the pixels that count:
+those of it that at least half of the frames, and at least two, give a range.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +13,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage, optimize
 
 from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval, mean_t, wilson
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import MM, Region
+from harness.vocabulary.seeds import random_stream
+from scenes.closed_form import Plane
+from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, EffectsConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
-from scenes.view import NoiseFreeView
 
 SEED = 1
-"""Seed of all noise on the bench; streams differ by camera and scene."""
 NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
 """The noise of each pixel, which the calibration point speaks of, without traits of a unit or of a frame."""
-WHOLE = EffectsConfig()
-"""All effects of the camera."""
-STEADY = WHOLE.model_copy(update={"frame_jumps": False})
+STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
 JITTER = NOISE.model_copy(update={"frame_jumps": True})
 PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 GROUPS = 10
-"""Groups of frames of the jackknife: 9 degrees of freedom, Student's factor 2.26."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +37,13 @@ class Effort:
     """Numbers of frames of each kind of measurement, and of units on which a unit's error is judged."""
 
     noise_frames: int
-    valid_frames: int
-    edge_frames: int
-    bias_frames: int
+    few_frames: int
     whole_frames: int
     units: int
 
 
-FULL = Effort(noise_frames=80, valid_frames=12, edge_frames=12, bias_frames=12, whole_frames=400, units=10)
-QUICK = Effort(noise_frames=20, valid_frames=4, edge_frames=4, bias_frames=4, whole_frames=80, units=4)
+FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
+QUICK = Effort(noise_frames=20, few_frames=4, whole_frames=80, units=4)
 
 
 @dataclass(frozen=True)
@@ -59,47 +61,33 @@ class Bench:
 
     def patch(self, height: int, width: int) -> Region:
         """Pixels about the optical axis, with the margin that the camera's own filter needs, within the sensor."""
-        lens, margin = self.camera.nominal_lens, self.camera.optics.margin_px
+        lens = self.camera.nominal_lens
         row, column = round(lens.cy) - height // 2, round(lens.cx) - width // 2
         tight = Region(row, row + height, column, column + width)
-        return tight.grown(margin, lens.height, lens.width)
+        return tight.grown(self.camera.optics.margin_px, lens.height, lens.width)
 
-    def unit(self, view: NoiseFreeView, effects: EffectsConfig, unit_seed: int = 1) -> SimulatedUnit:
-        """A unit of the camera before a view."""
-        return SimulatedUnit(
-            self.camera, CameraConfig(name=self.camera_name, unit_seed=unit_seed, effects=effects), view
-        )
+    def taken(
+        self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, unit_seed: int = 1
+    ) -> FrameStack:
+        """Frames of a unit of the camera before a view; the noise is the stream of the labels."""
+        config = CameraConfig(name=self.camera_name, unit_seed=unit_seed, effects=effects)
+        unit = SimulatedUnit(self.camera, config, view)
+        cut = unit.cut
+        taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
+        true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
+        z_m = np.stack([frame.z_m for frame in taken.frames()]).astype(float)
+        return FrameStack(z_m, true_z_m, view.slopes[cut], unit.region)
 
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames of a static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``amplitude`` (h, w) mean
-    over frames in the camera's units; ``slopes`` (h, w, 2)."""
+    """Frames of a static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w, 2); the
+    ``region`` of the sensor."""
 
     z_m: np.ndarray
     true_z_m: np.ndarray
-    amplitude: np.ndarray
     slopes: np.ndarray
-
-    @property
-    def everywhere(self) -> np.ndarray:
-        """(h, w) bool, all true."""
-        return np.ones(self.true_z_m.shape, bool)
-
-
-def taken(unit: SimulatedUnit, frames: int, *labels: str | int) -> FrameStack:
-    """``frames`` frames of a unit; the noise is the stream of the labels."""
-    view, cut = unit.view, unit.cut
-    z_m = np.empty((frames, *unit.region.shape))
-    amplitude = np.zeros(unit.region.shape)
-    for number, frame in enumerate(unit.capture(frames, SEED, "scorecard", *labels).frames()):
-        z_m[number] = frame.z_m
-        amplitude += 0.0 if frame.amplitude is None else frame.amplitude / frames
-    true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
-    return FrameStack(z_m, true_z_m, amplitude, view.slopes[cut])
-
-
-# ---- numbers with their intervals ------------------------------------------------------------------------------------
+    region: Region
 
 
 @dataclass(frozen=True)
@@ -111,24 +99,19 @@ class Reading:
 
 
 NOTHING = Reading(float("nan"))
-"""The estimate under a condition in which the camera sees nothing."""
 
 
 def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
-    """``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over frames.
-
-    Frames must be independent, pixels need not be: what neighbours or a whole frame share is in the interval. Groups
-    are interleaved. The interval is unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11.
-    """
+    """``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over frames, which
+    must be independent; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
     from scipy.stats import t
 
-    value = float(statistic(frames))
-    g = min(groups, len(frames) // 2)
+    value, g = float(statistic(frames)), min(groups, len(frames) // 2)
     if g < 2 or not np.isfinite(value):
         return Reading(value)
     number = np.arange(len(frames)) % g
     without = np.array([statistic(frames[number != group]) for group in range(g)])
-    half = float(t.ppf(0.5 + CONFIDENCE / 2, g - 1) * np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
+    half = float(t.ppf(0.5 + CONFIDENCE / 2, g - 1) * np.sqrt((g - 1) * without.var()))
     return Reading(value, Interval(value - half, value + half) if np.isfinite(half) else UNKNOWN)
 
 
@@ -147,3 +130,229 @@ def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
     trials = hits.size / pixels_each
     low, high = wilson(hits.mean() * trials, trials)
     return Reading(float(hits.mean()), Interval(float(low), float(high)))
+
+
+BISQUARE = 4.685
+"""Tukey's constant: 95 % efficient on normal errors."""
+CANDIDATES, TRIPLE_PX, SCREENED = 400, 40, 4000
+"""Planes tried in each round, by triples of points so near to each other, each judged on so many pixels."""
+GROWN = 2.0
+MOST_PLANES = 6
+
+
+def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients c with 1/z = basis c, and which points count, by Tukey's bisquare on the residuals of z."""
+    weight = np.ones_like(z)
+    for _ in range(15):
+        # an error of z is z^2 times one of 1/z
+        row = weight * z**4
+        coefficients = np.linalg.lstsq(basis.T @ (basis * row[:, None]), basis.T @ (row / z), rcond=None)[0]
+        residual = z - 1 / (basis @ coefficients)
+        # on exact data the median is 0: a micrometre counts as exact
+        u = residual / (BISQUARE * max(1.4826 * float(np.median(np.abs(residual))), 1e-6))
+        weight = np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
+    return coefficients, weight > 0
+
+
+def _with_ones(slopes: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.ones((*slopes.shape[:-1], 1)), slopes], axis=-1)
+
+
+def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
+    """The plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a minority of others."""
+    (a, b, c), _ = robust_inverse_fit(_with_ones(slopes), z_m)
+    return Plane(float(1 / a), float(-b / a), float(-c / a))
+
+
+def find_planes(
+    z_m: np.ndarray, slopes: np.ndarray, tolerance_m: float, least_px: int
+) -> list[tuple[Plane, np.ndarray]]:
+    """The planes of a depth image with the connected pixels (h, w) bool on each, largest first, by RANSAC. ``z_m`` (h,
+    w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up to `GROWN`
+    times as far. Planes of fewer than ``least_px`` pixels are left out. The same image gives the same planes."""
+    basis = _with_ones(slopes)
+    left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
+    found: list[tuple[Plane, np.ndarray]] = []
+    while len(found) < MOST_PLANES and left.sum() >= least_px:
+        inverse = _best_candidate(z_m, basis, left, tolerance_m, len(found))
+        for _ in range(3):
+            mask = left & (_distance_m(inverse, basis, z_m) < tolerance_m)
+            if mask.sum() < 3:
+                break
+            inverse = robust_inverse_fit(basis[mask], z_m[mask])[0]
+        labels, _ = ndimage.label(left & (_distance_m(inverse, basis, z_m) < GROWN * tolerance_m))
+        sizes = np.bincount(labels[mask & (labels > 0)], minlength=1)
+        mask = labels == sizes.argmax() if sizes.any() else np.zeros_like(left)
+        if mask.sum() < least_px:
+            break
+        found.append((fit_plane(z_m[mask], slopes[mask]), mask))
+        left = left & ~mask
+    return sorted(found, key=lambda each: -int(each[1].sum()))
+
+
+def _best_candidate(
+    z_m: np.ndarray, basis: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
+) -> np.ndarray:
+    """(3,) coefficients of 1/z of the plane through three near points that most of the screened pixels lie on."""
+    rng = random_stream(0, "planes", number)
+    points = np.argwhere(left)
+    shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
+    shift[:, 0] = 0
+    at = np.clip(points[rng.integers(0, len(points), CANDIDATES)][:, None] + shift, 0, np.array(left.shape) - 1)
+    rays, z = basis[at[..., 0], at[..., 1]], z_m[at[..., 0], at[..., 1]]
+    usable = left[at[..., 0], at[..., 1]].all(axis=1)
+    usable[usable] = np.abs(np.linalg.det(rays[usable])) > 1e-8
+    if not usable.any():
+        return np.array([1 / np.nanmedian(z_m[left]), 0.0, 0.0])
+    candidates = np.linalg.solve(rays[usable], 1 / z[usable][..., None])[..., 0]
+    row, column = points[rng.integers(0, len(points), SCREENED)].T
+    near = _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
+    return np.asarray(candidates[int(near.sum(axis=1).argmax())])
+
+
+def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.ndarray:
+    """Distance of points from the plane with the coefficients ``inverse`` (..., 3) of 1/z; infinite for NaN."""
+    with np.errstate(invalid="ignore"):
+        distance = np.abs(z_m * (inverse * basis).sum(axis=-1) - 1) / np.linalg.norm(inverse, axis=-1)
+    return np.nan_to_num(distance, nan=np.inf)
+
+
+LAGS = 5
+SURFACE_DEGREE = 5
+WINDOW_PX = 5
+"""Up to this lag the part that is white before the Azure Kinect's filter window shows as a triangle."""
+
+
+def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
+    """(h, w) bool: the pixels of ``where`` that count."""
+    return where & (np.isfinite(z_m).sum(axis=0) >= max(2, len(z_m) / 2))
+
+
+def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
+    """Standard deviation over frames (n - 1), rms over the pixels that count; NaN where none does."""
+    use = often_valid(z_m, where)
+    return float(np.sqrt(np.nanvar(z_m[:, use], axis=0, ddof=1).mean())) if use.any() else float("nan")
+
+
+def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> np.ndarray:
+    """(n, h, w) deviations from each pixel's mean (less each frame's unless kept), 0 at pixels that do not count."""
+    use = often_valid(z_m, where)
+    d = np.zeros_like(z_m)
+    d[:, use] = z_m[:, use] - np.nanmean(z_m[:, use], axis=0)
+    if not keep_jitter and use.any():
+        d[:, use] -= np.nanmean(d[:, use], axis=1)[:, None]
+    return d
+
+
+def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tuple[float, float]:
+    """(mean product, mean square) of pairs of pixels (lag_x, lag_y) apart, both inside ``where``; NaN without pairs."""
+    h, w = where.shape
+    first, second = (slice(h - lag_y), slice(w - lag_x)), (slice(lag_y, h), slice(lag_x, w))
+    both = where[first] & where[second]
+    a, b = d[..., *first][..., both], d[..., *second][..., both]
+    pair = np.isfinite(a) & np.isfinite(b)
+    if not pair.any():
+        return float("nan"), float("nan")
+    return float((a * b)[pair].mean()), float(((a**2)[pair].mean() + (b**2)[pair].mean()) / 2)
+
+
+def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:
+    """Correlation of deviations of pixels (lag_x, lag_y) apart; NaN where there is none."""
+    product, square = covariance(d, where, lag_x, lag_y)
+    return product / square if square > 0 else float("nan")
+
+
+def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y: int) -> float:
+    """Correlation of the temporal noise of pixels (lag_x, lag_y) apart, with what a whole frame has in common."""
+    return correlation(deviations(z_m, where, keep_jitter=True), often_valid(z_m, where), lag_x, lag_y)
+
+
+@dataclass(frozen=True)
+class FixedPattern:
+    """The part of a wall's average that stays after a smooth surface and the temporal noise are taken off. ``std_m``;
+    ``length_px`` of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12; ``pixel_m``: the part that is white
+    before the engine's window of 5, told by its triangle up to lag 5; ``covariance_m2`` (lags 0..20)."""
+
+    std_m: float
+    length_px: float
+    pixel_m: float
+    covariance_m2: np.ndarray
+
+
+def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: int = 20) -> FixedPattern:
+    """The fixed pattern of a wall: average, minus a robust surface of degree 5 in 1/z, minus left temporal noise.
+    ``z_m`` (n, h, w), every pixel of ``where`` valid in every frame; ``slopes`` (h, w, 2)."""
+    average = z_m.mean(axis=0)[where]
+    # Legendre products up to total degree 5 over the slopes, scaled to -1..1
+    middle, half = slopes[where].mean(axis=0), np.ptp(slopes[where], axis=0) / 2
+    x, y = ((slopes[where] - middle) / half).T
+    basis = np.polynomial.legendre.legvander2d(x, y, (SURFACE_DEGREE, SURFACE_DEGREE))
+    i, j = np.divmod(np.arange(basis.shape[1]), SURFACE_DEGREE + 1)
+    basis = np.asarray(basis[:, i + j <= SURFACE_DEGREE])
+    coefficients, counts = robust_inverse_fit(basis, average)
+    good = np.zeros_like(where)
+    good[where] = counts
+    residual = np.zeros(where.shape)
+    residual[where] = average - 1 / (basis @ coefficients)
+    residual[good] -= residual[good].mean()
+    noise = deviations(z_m, good, keep_jitter=False)
+
+    def left_at(lag_x: int, lag_y: int) -> float:
+        # deviations from a mean of n frames have (n - 1)/n of the variance, the mean 1/n: together 1/(n - 1)
+        of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
+        return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
+
+    left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(axis=1)
+    length = float("nan")
+    if left[0] > 0:
+        lag, relative = np.arange(13), left[:13] / left[0]
+        found = optimize.least_squares(lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0])
+        length = float(abs(found.x[1]))
+    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest
+    k = np.arange(1.0, WINDOW_PX + 1)
+    rows = np.column_stack([k / WINDOW_PX, k**2, k**4])
+    white, *_ = np.linalg.lstsq(rows, left[0] - left[1 : WINDOW_PX + 1], rcond=None)[0]
+    pixel = float(np.sign(white) * np.sqrt(abs(white)))
+    return FixedPattern(float(np.sqrt(max(left[0], 0))), length, pixel, left)
+
+
+TOLERANCE_SIGMAS = 4.0
+TOLERANCE_STEP = 0.1
+"""A pixel is on a surface within four deviations of its noise and a tenth of the step of it."""
+LEAST_TOLERANCE_M = 0.5 * MM
+MOST_OF_STEP = 0.45
+FLAT_PX = 8.0
+"""Distance from an edge beyond which the camera's filter sees a single surface."""
+WIDTHS = ("gap", "flying", "front_erosion", "back_erosion")
+
+
+def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
+    """Return the distance from a surface within which a range counts as this surface's; NaN where noise hides the
+    step: a tolerance of more than `MOST_OF_STEP` of it would join the surfaces."""
+    noise = TOLERANCE_SIGMAS * sigma_m if np.isfinite(sigma_m) else 0.0
+    tolerance_m = max(noise, TOLERANCE_STEP * step_m, LEAST_TOLERANCE_M)
+    return tolerance_m if tolerance_m <= MOST_OF_STEP * step_m else float("nan")
+
+
+def edge_widths(
+    z_m: np.ndarray,
+    front_z_m: np.ndarray,
+    back_z_m: np.ndarray,
+    from_edge_px: np.ndarray,
+    tolerance_m: float,
+    reach_px: float,
+    lines: int,
+) -> dict[str, np.ndarray]:
+    """The `WIDTHS` (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that ``lines`` lines of
+    pixels cross: pixels without a range; with a range off both surfaces; whose central ray meets the front (the back)
+    and that do not show it, shadow included. All but the gap are NaN where noise hides the step. ``front_z_m``,
+    ``back_z_m`` (h, w): z along each pixel's ray. ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do
+    not count."""
+    near = np.abs(from_edge_px) <= reach_px
+    z, side = z_m[:, near], from_edge_px[near]
+    shows_front, shows_back = (np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m))
+    valid = np.isfinite(z)
+    missing = (~valid, valid & ~shows_front & ~shows_back, ~shows_front[:, side < 0], ~shows_back[:, side >= 0])
+    widths = {name: pixels.sum(axis=1) / lines for name, pixels in zip(WIDTHS, missing, strict=True)}
+    unknown = np.full(len(z_m), np.nan)
+    return {name: unknown if np.isnan(tolerance_m) and name != "gap" else each for name, each in widths.items()}

@@ -2,39 +2,49 @@
 
 Nothing is fitted to make the two agree: the camera's file is used as it stands, with the capture's own lens; planes are
 fitted to the capture and simulated in closed form, with one albedo for all surfaces. Not simulated: curved things,
-light that met more than one surface, the surfaces' own relief and texture.
-
-Where the true edge lies is not known to better than the gap, so widths of pixels without a range and of flying pixels
-are compared, and not the erosion of either side.
+light that met more than one surface, the surfaces' own relief and texture. Where the true edge lies is not known to
+better than the gap, so widths of pixels without a range and of flying pixels are compared, and not the erosion.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
 
-from detectors.recordings.recording import Recording
+from detectors.recordings import Recording
+from detectors.recordings.depth_images import read_picture
+from harness.inspection.arguments import opened
+from harness.report.blocks import COLOURS, plain, svg, template
+from harness.scorecard import bench
 from harness.scorecard.bench import JITTER, NOISE, PATTERNED, SEED, Reading, jackknifed, mean_of
-from harness.scorecard.noise import LAGS, correlation, deviations, fixed_pattern, temporal_sigma_m
-from harness.scorecard.planes import FoundPlane, find_planes
+from harness.scorecard.figures import BESIDE, Beside
 from harness.scorecard.quantities import jitter_of
-from harness.scorecard.steps import FLAT_PX, EdgeWidths, edge_widths, on_surface_tolerance_m
-from harness.scorecard.tables import Beside
+from harness.tables.schema import write_table
+from harness.tables.text import show
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.files import write_text
+from harness.vocabulary.geometry import MM, Lens, Region
+from harness.vocabulary.provenance import RESULTS_VERSION, record
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, camera_of, load_camera
+from scenes.optics import NoiseFreeView
+from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, camera_names, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
-from scenes.view import NoiseFreeView
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 LEAST_FRAMES = 4
-"""Fewest frames: below, no interval can be given for what varies from frame to frame."""
 TOLERANCE_M = 8 * MM
 """A point this near to a plane is on it: a nominal lens bows real walls by 3 mm rms."""
 LEAST_PLANE_PX = 2000
@@ -45,21 +55,16 @@ LEAST_BIN_PX = 300
 """Some 12 windows of 5 x 5: the deviation of 20 frames is then known to 5 %."""
 PATTERN_UNITS = (1, 2, 3)
 WIDEST_PX = 24
-"""Longest gap between the last pixel of a plane and the first of the next at an edge."""
 REACH_PX = 16.0
 LEAST_LINES = 30
-"""Lines of pixels across an edge: the mean gap is then known to a tenth of a pixel."""
 STRAIGHT_PX = 2.0
-"""A crossing this near to the fitted line is on it."""
 LEAST_STEP_M = 20 * MM
-"""Somewhat more than how far from a plane its pixels may lie."""
 TRIES = 200
 
 
 @dataclass(frozen=True)
 class Captured:
-    """A capture in memory: ``z_m`` (n, h, w) float32, NaN where invalid; ``slopes`` (h, w, 2); ``used`` (h, w) bool:
-    pixels that the user lets count."""
+    """A capture: ``z_m`` (n, h, w), NaN where invalid; ``slopes`` (h, w, 2); ``used`` (h, w) bool: pixels to count."""
 
     name: str
     lens: Lens
@@ -76,9 +81,9 @@ class Captured:
         return median
 
     @cached_property
-    def planes(self) -> list[FoundPlane]:
-        """The planes in it, largest first. Raises UserError where there is none."""
-        found = find_planes(self.median_m, self.slopes, TOLERANCE_M, LEAST_PLANE_PX)
+    def planes(self) -> list[tuple[Plane, np.ndarray]]:
+        """The planes in it with their pixels, largest first. Raises UserError where there is none."""
+        found = bench.find_planes(self.median_m, self.slopes, TOLERANCE_M, LEAST_PLANE_PX)
         if not found:
             raise UserError(
                 f"{self.name}: no plane of {LEAST_PLANE_PX} pixels in it",
@@ -96,28 +101,26 @@ def captured_of(recording: Recording, mask: np.ndarray | None) -> Captured:
             legal="depth images with a lens: PNG folders, .npy, .npz, .mat, .mkv",
         )
     z_m = np.stack([frame.z_m for frame in recording.frames()]).astype(np.float32)
-    if len(z_m) < LEAST_FRAMES:
-        frames = "1 frame" if len(z_m) == 1 else f"{len(z_m)} frames"
+    count, height, width = z_m.shape
+    if count < LEAST_FRAMES:
         raise UserError(
-            f"{recording.name}: {frames}; temporal noise needs repeats",
+            f"{recording.name}: {count} frame{'s' * (count > 1)}; temporal noise needs repeats",
             legal=f"{LEAST_FRAMES} frames or more of a static scene, twenty for a useful interval",
         )
-    used = np.ones(z_m.shape[1:], bool) if mask is None else mask
-    if used.shape != z_m.shape[1:]:
-        raise UserError(
-            f"--mask: {used.shape[1]} x {used.shape[0]} pixels, but the frames have {z_m.shape[2]} x {z_m.shape[1]}"
-        )
+    used = np.ones((height, width), bool) if mask is None else mask
+    if used.shape != (height, width):
+        raise UserError(f"--mask: {used.shape[1]} x {used.shape[0]} pixels, but the frames have {width} x {height}")
     return Captured(recording.name, recording.lens, z_m, recording.slopes, used)
 
 
 @dataclass(frozen=True)
 class Twin:
-    """The simulated camera that stands in for the one of the capture, and the surfaces' albedo."""
+    """The simulated camera that stands in for that of the capture, with its lens, and the surfaces' albedo."""
 
     config: CameraConfig
     albedo: float
 
-    @cached_property
+    @property
     def camera(self) -> AnyCamera:
         """The camera's file with the capture's lens."""
         return camera_of(self.config)
@@ -128,20 +131,13 @@ class Twin:
         return region.grown(self.camera.optics.margin_px, lens.height, lens.width)
 
     def frames(
-        self,
-        view: NoiseFreeView,
-        region: Region,
-        count: int,
-        effects: EffectsConfig,
-        unit_seed: int,
-        *labels: str | int,
+        self, view: NoiseFreeView, region: Region, count: int, effects: EffectsConfig, unit: int, *labels: str | int
     ) -> np.ndarray:
-        """Frames of a view on a region: z in metres, (n, h, w), NaN where invalid; the noise is the stream of the
-        labels."""
-        config = self.config.model_copy(update={"effects": effects, "unit_seed": unit_seed})
-        unit = SimulatedUnit(self.camera, config, view)
-        cut = region.within(unit.region)
-        return np.stack([f.z_m[cut] for f in unit.capture(count, SEED, "capture", *labels).frames()]).astype(float)
+        """Frames of a view on a region: z in metres, (n, h, w), NaN where invalid; the labels name the noise."""
+        config = self.config.model_copy(update={"effects": effects, "unit_seed": unit})
+        simulated = SimulatedUnit(self.camera, config, view)
+        cut, taken = region.within(simulated.region), simulated.capture(count, SEED, "capture", *labels)
+        return np.stack([frame.z_m[cut] for frame in taken.frames()]).astype(float)
 
 
 def twin_of(camera_name: str, lens: Lens, albedo: float) -> Twin:
@@ -159,209 +155,250 @@ def twin_of(camera_name: str, lens: Lens, albedo: float) -> Twin:
 
 
 def compared(captured: Captured, twin: Twin) -> list[Beside]:
-    """All comparisons: planes, then edges."""
+    """All comparisons: planes, then edges in order of the axis that they cross and of the planes."""
     rows = [
         row
-        for number, found in enumerate(captured.planes, start=1)
-        for row in _plane_rows(f"plane {number}", found, captured, twin)
+        for number, (plane, mask) in enumerate(captured.planes, start=1)
+        for row in _plane_rows(f"plane {number}", plane, mask, captured, twin)
     ]
-    return rows + [row for edge in _edges_of(captured) for row in _edge_rows(captured, edge, twin)]
+    labels = np.zeros(captured.used.shape, int)
+    for number, (_, mask) in enumerate(captured.planes, start=1):
+        labels[mask] = number
+    for axis in (0, 1):
+        # of each pair of planes that follow each other: line, last pixel of the first, first pixel of the second
+        crossings = defaultdict(list)
+        for number, line in enumerate(labels if axis == 0 else labels.T):
+            (known,) = np.nonzero(line)
+            for at in np.flatnonzero((np.diff(line[known]) != 0) & (np.diff(known) <= WIDEST_PX)):
+                last, first = known[at : at + 2]
+                crossings[int(line[last]), int(line[first])].append((number, last, first))
+        for pair in sorted(crossings):
+            rows += _edge_rows(captured, np.array(crossings[pair]), axis, pair, twin)
+    return rows
 
 
-# ---- planes ----------------------------------------------------------------------------------------------------------
-
-
-def _plane_rows(name: str, found: FoundPlane, captured: Captured, twin: Twin) -> list[Beside]:
-    """Everything that is compared on one plane: noise by range, correlation, jitter, fixed pattern.
-
-    The pixels that count lie well inside and are valid in every frame, of the capture and of the simulation.
-    """
-    deep = ndimage.distance_transform_edt(np.pad(found.mask, 1))[1:-1, 1:-1] > EDGE_PX
+def _plane_rows(name: str, plane: Plane, on_plane: np.ndarray, captured: Captured, twin: Twin) -> Iterator[Beside]:
+    """Everything that is compared on one plane, on pixels well inside that are valid in every frame of both."""
+    deep = ndimage.distance_transform_edt(np.pad(on_plane, 1))[1:-1, 1:-1] > EDGE_PX
     inside = deep & np.isfinite(captured.z_m).all(axis=0)
-    if inside.sum() < LEAST_BIN_PX:
-        return []
+    wanted = int(inside.sum())
+    if wanted < LEAST_BIN_PX:
+        return
     (rows, columns) = ndimage.find_objects(inside.astype(int))[0]
     region = Region(rows.start, rows.stop, columns.start, columns.stop)
     slopes, z_m = captured.slopes[rows, columns], captured.z_m[:, rows, columns].astype(float)
-    plane = found.plane
     view = plane_view(twin.camera, twin.outer(region), plane.distance_m, twin.albedo, plane.slope_x, plane.slope_y)
 
-    def frames(effects: EffectsConfig, unit_seed: int = 1) -> np.ndarray:
-        return twin.frames(view, region, len(z_m), effects, unit_seed, name, unit_seed)
+    def frames(effects: EffectsConfig, unit: int = 1) -> np.ndarray:
+        return twin.frames(view, region, len(z_m), effects, unit, name, unit)
 
     simulated = frames(NOISE)
     mask = inside[rows, columns] & np.isfinite(simulated).all(axis=0)
-    wanted, pixels = int(inside.sum()), int(mask.sum())
+    pixels = int(mask.sum())
+    if pixels >= LEAST_BIN_PX:
+        both = (z_m, simulated)
+
+        # temporal deviation in bins of range, and over all
+        number = np.floor(z_m.mean(axis=0) / BIN_M + 1e-9)
+        parts = [(f"{b * BIN_M:.1f} to {(b + 1) * BIN_M:.1f} m", mask & (number == b)) for b in np.unique(number)]
+        for at, where in (*parts, ("all", mask)):
+            if where.sum() >= LEAST_BIN_PX:
+                sigmas = (jackknifed(z[:, where][:, None], lambda s: bench.temporal_sigma_m(s) / MM) for z in both)
+                yield Beside(name, "temporal deviation", at, "mm", int(where.sum()), *sigmas)
+
+        # correlation along x and y, each frame's mean taken off
+        off = [bench.deviations(z, mask, keep_jitter=False) for z in both]
+        for axis in "xy":
+            for lag in range(1, bench.LAGS + 1):
+                lags = (lag, 0) if axis == "x" else (0, lag)
+                found = (Reading(bench.correlation(d, mask, *lags)) for d in off)
+                yield Beside(name, "noise correlation", f"{axis}, lag {lag}", "", pixels, *found)
+
+        # how much the plane's mean varies from frame to frame; jumps of over 5 mm left out
+        jitter = (jitter_of(np.nanmean(z[:, mask], axis=1)) for z in (z_m, frames(JITTER)))
+        yield Beside(name, "frame jitter", "all", "mm", pixels, *jitter)
+
+        # the fixed pattern of the capture's unit, and of some simulated units
+        own, others = bench.fixed_pattern(z_m, mask, slopes), []
+        for unit in PATTERN_UNITS:
+            patterned = frames(PATTERNED, unit)
+            known = mask & np.isfinite(patterned).all(axis=0)
+            others.append(bench.fixed_pattern(np.nan_to_num(patterned), known, slopes))
+        std, length = mean_of([p.std_m / MM for p in others]), mean_of([p.length_px for p in others])
+        yield Beside(name, "fixed pattern", "all", "mm", pixels, Reading(own.std_m / MM), std)
+        yield Beside(name, "length of the pattern", "all", "px", pixels, Reading(own.length_px), length)
     seen = Reading(float(pixels / wanted))
-    share = Beside(name, "pixels that the simulation sees", "all", "", wanted, Reading(1.0), seen)
-    if pixels < LEAST_BIN_PX:
-        return [share]
-    both = (z_m, simulated)
-    told = []
-
-    # temporal deviation in bins of range, and over all
-    number = np.floor(z_m.mean(axis=0) / BIN_M + 1e-9)
-    parts = [(f"{b * BIN_M:.1f} to {(b + 1) * BIN_M:.1f} m", mask & (number == b)) for b in np.unique(number)]
-    for at, where in (*parts, ("all", mask)):
-        if where.sum() >= LEAST_BIN_PX:
-            measured, model = (
-                jackknifed(z[:, where][:, None], lambda s: temporal_sigma_m(s, np.ones(s.shape[1:], bool)) / MM)
-                for z in both
-            )
-            told.append(Beside(name, "temporal deviation", at, "mm", int(where.sum()), measured, model))
-
-    # correlation along x and y, each frame's mean taken off
-    off = [deviations(z, mask, keep_jitter=False) for z in both]
-    for axis in "xy":
-        for lag in range(1, LAGS + 1):
-            lags = (lag, 0) if axis == "x" else (0, lag)
-            measured, model = (Reading(correlation(d, mask, *lags)) for d in off)
-            told.append(Beside(name, "noise correlation", f"{axis}, lag {lag}", "", pixels, measured, model))
-
-    # how much the plane's mean varies from frame to frame; jumps of over 5 mm left out
-    measured, model = (jitter_of(np.nanmean(z[:, mask], axis=1)) for z in (z_m, frames(JITTER)))
-    told.append(Beside(name, "frame jitter", "all", "mm", pixels, measured, model))
-
-    # the fixed pattern of the capture's unit, and of some simulated units
-    own, others = fixed_pattern(z_m, mask, slopes), []
-    for unit in PATTERN_UNITS:
-        patterned = frames(PATTERNED, unit)
-        known = mask & np.isfinite(patterned).all(axis=0)
-        others.append(fixed_pattern(np.nan_to_num(patterned), known, slopes))
-    deviation, length = mean_of([p.std_m / MM for p in others]), mean_of([p.length_px for p in others])
-    told.append(Beside(name, "fixed pattern", "all", "mm", pixels, Reading(own.std_m / MM), deviation))
-    told.append(Beside(name, "length of the pattern", "all", "px", pixels, Reading(own.length_px), length))
-    return [*told, share]
+    yield Beside(name, "pixels that the simulation sees", "all", "", wanted, Reading(1.0), seen)
 
 
-# ---- edges -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Edge:
-    """A straight edge: the front is where sign (p_axis - at - slant p_other) < 0, p the slopes of a ray.
-
-    ``axis`` 0: z steps along x. ``lines``: the rows (columns for axis 1) that cross it. ``focal_px``: pixels in a unit
-    of slope across it.
-    """
-
-    name: str
-    front: Plane
-    back: Plane
-    axis: int
-    sign: float
-    at: float
-    slant: float
-    lines: np.ndarray
-    step_m: float
-    focal_px: float
-
-    def signed(self, slopes: np.ndarray) -> np.ndarray:
-        """(...) signed distance in slopes: below 0 on the front."""
-        return np.asarray(self.sign * (slopes[..., self.axis] - self.at - self.slant * slopes[..., 1 - self.axis]))
-
-    def covers(self, slopes: np.ndarray) -> np.ndarray:
-        """Return whether the front is there; False for NaN."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(self.signed(slopes) < 0)
-
-    def is_crossed(self, region: Region) -> np.ndarray:
-        """(h, w) bool: the pixels of a region that lie on lines that cross the edge."""
-        on = np.zeros(region.shape, bool)
-        if self.axis == 0:
-            on[self.lines - region.row0] = True
-        else:
-            on[:, self.lines - region.col0] = True
-        return on
-
-
-def _edges_of(captured: Captured) -> list[Edge]:
-    """The straight edges between the capture's planes, in order of the planes."""
-    labels = np.zeros(captured.used.shape, int)
-    for number, found in enumerate(captured.planes, start=1):
-        labels[found.mask] = number
-    edges = []
-    for axis in (0, 1):
-        # (row, last column of one plane, first column of the next, both labels) where planes follow each other
-        crossings = []
-        for row, line in enumerate(labels if axis == 0 else labels.T):
-            (known,) = np.nonzero(line)
-            change = np.flatnonzero((np.diff(line[known]) != 0) & (np.diff(known) <= WIDEST_PX))
-            crossings += [
-                (row, a, b, int(line[a]), int(line[b])) for a, b in zip(known[change], known[change + 1], strict=True)
-            ]
-        for pair in sorted({crossing[3:] for crossing in crossings}):
-            edge = _fitted(captured, np.array([c[:3] for c in crossings if c[3:] == pair]), axis, *pair)
-            edges += [] if edge is None else [edge]
-    return edges
-
-
-def _fitted(captured: Captured, rows: np.ndarray, axis: int, first: int, second: int) -> Edge | None:
-    """The straight line that most crossings lie on; None where that is no step, too short, or nearer the other axis."""
-    if len(rows) < LEAST_LINES:
-        return None
-    focal_px = captured.lens.fx if axis == 0 else captured.lens.fy
-    middle = rows[:, 1:].mean(axis=1)
-    slopes = captured.lens.slopes(*((middle, rows[:, 0]) if axis == 0 else (rows[:, 0], middle)))
-    across, along = slopes[:, axis], slopes[:, 1 - axis]
+def _edge_rows(captured: Captured, crossings: np.ndarray, axis: int, pair: tuple[int, int], twin: Twin) -> list[Beside]:
+    """Gap and flying pixels at the straight edge between two planes; none where there is no such edge. ``crossings``
+    (n, 3): line of pixels, last pixel of the first plane, first of the second; ``axis`` 0: along x."""
+    lens = captured.lens
+    focal_px = lens.fx if axis == 0 else lens.fy
+    lines, middle = crossings[:, 0], crossings[:, 1:].mean(axis=1)
+    on_lines = lens.slopes(*((middle, lines) if axis == 0 else (lines, middle)))
+    across, along = on_lines[:, axis], on_lines[:, 1 - axis]
 
     # across = at + slant along, by RANSAC and a fit to those on it
-    rng = random_stream(0, "edges", first, second)
-    best = np.zeros(along.size, bool)
-    for i, j in rng.integers(0, along.size, (TRIES, 2)):
+    rng = random_stream(0, "edges", *pair)
+    near = np.zeros(len(along), bool)
+    for i, j in rng.integers(0, len(along), (TRIES, 2)):
         if along[i] != along[j]:
             slant = (across[i] - across[j]) / (along[i] - along[j])
-            near = np.abs(across - across[i] - slant * (along - along[i])) < STRAIGHT_PX / focal_px
-            best = near if near.sum() > best.sum() else best
-    if best.sum() < 2:
-        return None
-    slant, at = map(float, np.polyfit(along[best], across[best], 1))
+            on_it = np.abs(across - across[i] - slant * (along - along[i])) < STRAIGHT_PX / focal_px
+            near = on_it if on_it.sum() > near.sum() else near
+    if near.sum() < LEAST_LINES:
+        return []
+    slant, at = map(float, np.polyfit(along[near], across[near], 1))
     near = np.abs(across - at - slant * along) < STRAIGHT_PX / focal_px
+    count, planes = int(near.sum()), [captured.planes[number - 1][0] for number in pair]
+    step_m = float(np.median(planes[1].z_along_m(on_lines[near]) - planes[0].z_along_m(on_lines[near])))
+    if count < LEAST_LINES or abs(slant) > 1 or not abs(step_m) > LEAST_STEP_M:
+        return []
+    sign, (before, behind) = np.sign(step_m), pair if step_m > 0 else pair[::-1]
+    front, back = (captured.planes[number - 1][0] for number in (before, behind))
 
-    planes = [captured.planes[number - 1].plane for number in (first, second)]
-    step_m = float(np.median(planes[1].z_along_m(slopes[near]) - planes[0].z_along_m(slopes[near])))
-    if near.sum() < LEAST_LINES or abs(slant) > 1 or not abs(step_m) > LEAST_STEP_M:
-        return None
-    front, back = (0, 1) if step_m > 0 else (1, 0)
-    return Edge(
-        name=f"edge of plane {(first, second)[front]} before plane {(first, second)[back]}, across {'xy'[axis]}",
-        front=planes[front],
-        back=planes[back],
-        axis=axis,
-        sign=1.0 if step_m > 0 else -1.0,
-        at=at,
-        slant=slant,
-        lines=rows[near, 0],
-        step_m=abs(step_m),
-        focal_px=focal_px,
+    def signed(slopes: np.ndarray) -> np.ndarray:
+        """(...) signed distance in slopes: below 0 on the front."""
+        return np.asarray(sign * (slopes[..., axis] - at - slant * slopes[..., 1 - axis]))
+
+    # the pixels within reach of the edge on the lines that cross it
+    from_edge = signed(captured.slopes) * focal_px
+    crossed = np.isin(np.arange(captured.used.shape[axis]), lines[near])
+    from_edge[~crossed if axis == 0 else np.s_[:, ~crossed]] = np.nan
+    rows, columns = np.nonzero(np.abs(from_edge) <= REACH_PX)
+    region = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
+    cut = region.within(lens.whole)
+    from_edge, slopes, z_m = from_edge[cut], captured.slopes[cut], captured.z_m[:, *cut].astype(float)
+    name = f"edge of plane {before} before plane {behind}, across {'xy'[axis]}"
+    view = layered_view(twin.camera, twin.outer(region), front, back, lambda s: signed(s) < 0, twin.albedo)
+    simulated = twin.frames(view, region, len(z_m), NOISE, twin.config.unit_seed, name)
+    front_z, back_z = front.z_along_m(slopes), back.z_along_m(slopes)
+
+    def widths(z: np.ndarray) -> dict[str, np.ndarray]:
+        """A surface's own unevenness widens what counts as on it."""
+        flat = np.abs(from_edge) > bench.FLAT_PX
+        off = (z - np.where(from_edge < 0, front_z, back_z))[:, flat]
+        uneven = float(np.nanmedian(np.abs(off))) * 1.4826 if np.isfinite(off).any() else 0.0
+        tolerance_m = bench.on_surface_tolerance_m(max(bench.temporal_sigma_m(z, flat), uneven), abs(step_m))
+        return bench.edge_widths(z, front_z, back_z, from_edge, tolerance_m, REACH_PX, count)
+
+    both, step = (widths(z_m), widths(simulated)), f"step {abs(step_m) / MM:.0f} mm"
+    return [
+        Beside(name, title, step, "px", count, *(mean_of(found[key]) for found in both))
+        for title, key in (("gap at an edge", "gap"), ("flying pixels", "flying"))
+    ]
+
+
+METHOD = (
+    "{frames} frames of a static scene. The planes in it were found, fitted and simulated in closed form, as many "
+    "frames as were captured, with the capture's lens and an albedo of {albedo:g} for all surfaces; one analysis is "
+    "applied to both. Nothing is fitted to make them agree. Not simulated: what is not flat, light that met more than "
+    "one surface, the surfaces' relief and texture. Pixels within 3 px of a plane's rim, and pixels without a range in "
+    "any frame, are left out."
+)
+CAPTION = (
+    "The planes that were found, coloured over the median depth (nearer is lighter). Temporal deviations are rms over "
+    "pixels in bins of 0.1 m, with 95 % intervals of a jackknife over frames; each frame's mean is off correlations."
+)
+NO_EDGE = "No straight edge of one plane before another, at least 30 lines of pixels long and 20 mm high, was found."
+
+
+def run_capture(options: argparse.Namespace, command: str) -> int:
+    """Compare, print, write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError for what cannot
+    be read or simulated: too few frames, another size, no plane, no lens."""
+    if len(options.camera) > 1:
+        raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
+    if not 0 < options.albedo <= 1:
+        raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+    recording = _opened(options)
+    captured = captured_of(recording, None if options.mask is None else read_mask(options.mask))
+    name = options.camera[0] if options.camera else camera_of_size(captured.lens)
+    twin = twin_of(name, captured.lens, options.albedo)
+    rows = compared(captured, twin)
+    print(f"{captured.name}: {len(captured.z_m)} frames beside {twin.camera.title}, albedo {options.albedo:g}")
+    for remark in recording.notes:
+        print(f"note: {remark}")
+    show([BESIDE.grid(rows)])
+    provenance = {
+        "results_version": RESULTS_VERSION,
+        **record(command),
+        "camera": name,
+        "files": [str(path) for path in recording.files],
+    }
+    ratios = ", ".join(
+        f"{row.ratio:.2f} ({row.where})" for row in rows if (row.quantity, row.at) == ("temporal deviation", "all")
+    )
+    answer = f"Temporal deviation, simulated by measured: {ratios}."
+    page = template("capture.html", Path(__file__).parent).render(
+        name=captured.name,
+        camera=twin.camera.title,
+        answer=answer if ratios else "The simulation sees none of the planes of this capture.",
+        method=METHOD.format(frames=len(captured.z_m), albedo=twin.albedo),
+        figure=svg("capture", (6.0, 4.2), "Planes found", lambda figure: _draw(figure, captured)),
+        caption=CAPTION,
+        numbers=BESIDE.grid(rows).html() if rows else "",
+        edges=any("edge" in row.where for row in rows),
+        no_edge=NO_EDGE,
+        provenance=[(key, plain(value)) for key, value in provenance.items()],
+    )
+    write_table(options.out, BESIDE, BESIDE.frame(rows))
+    write_text(options.out / "capture.html", page)
+    write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
+    print(f"wrote {options.out / 'capture.html'}")
+    return 0
+
+
+def _opened(options: argparse.Namespace) -> Recording:
+    """The capture. Without a lens anywhere, the nominal one of the camera that the user names counts."""
+    first = slice(options.frames) if options.frames else None
+    try:
+        return opened(options.capture, options.intrinsics, unit=options.unit, frames=first)
+    except UserError:
+        if not options.camera or options.intrinsics is not None:
+            raise
+        nominal = load_camera(options.camera[0]).nominal_lens
+        recording = opened(options.capture, None, unit=options.unit, lens=nominal, frames=first)
+        print(f"note: the capture names no lens; the nominal one of {options.camera[0]} counts", file=sys.stderr)
+        return recording
+
+
+def camera_of_size(lens: Lens) -> str:
+    """The one simulated camera with as many pixels. Raises UserError where there is none, or more than one."""
+    sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
+    fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
+    if len(fitting) == 1:
+        return fitting[0]
+    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not ones aligned to a"
+    raise UserError(
+        f"several cameras have {wrong}: {', '.join(fitting)}" if fitting else f"no simulated camera has {wrong}",
+        legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
+        fix="name the one that took it with --camera" if fitting else f"{size} colour camera or of another mode",
     )
 
 
-def _edge_rows(captured: Captured, edge: Edge, twin: Twin) -> list[Beside]:
-    """Gap and flying pixels at one edge, on the pixels within reach of it on its lines."""
-    whole = captured.lens.whole
-    near = np.abs(edge.signed(captured.slopes)) * edge.focal_px <= REACH_PX
-    rows, columns = np.nonzero(near & edge.is_crossed(whole))
-    region = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
-    z_m = captured.z_m[(slice(None), *region.within(whole))].astype(float)
-    view = layered_view(twin.camera, twin.outer(region), edge.front, edge.back, edge.covers, twin.albedo)
-    simulated_m = twin.frames(view, region, len(z_m), NOISE, twin.config.unit_seed, edge.name)
-    slopes = captured.slopes[region.within(whole)]
-    from_edge = np.where(edge.is_crossed(region), edge.signed(slopes) * edge.focal_px, np.nan)
-    front_z, back_z = edge.front.z_along_m(slopes), edge.back.z_along_m(slopes)
+def read_mask(path: Path) -> np.ndarray:
+    """(h, w) bool: the pixels of an image that are not black. Raises UserError where it cannot be read."""
+    import cv2
 
-    def widths(z: np.ndarray) -> EdgeWidths:
-        """A surface's own unevenness widens what counts as on it."""
-        with np.errstate(invalid="ignore"):
-            flat = np.abs(from_edge) > FLAT_PX
-            off = (z - np.where(from_edge < 0, front_z, back_z))[:, flat]
-        uneven = float(np.nanmedian(np.abs(off))) * 1.4826 if np.isfinite(off).any() else 0.0
-        tolerance_m = on_surface_tolerance_m(max(temporal_sigma_m(z, flat), uneven), edge.step_m)
-        return edge_widths(z, front_z, back_z, from_edge, tolerance_m, REACH_PX, len(edge.lines))
+    try:
+        return np.asarray(read_picture(path, cv2.IMREAD_GRAYSCALE) > 0)
+    except UserError as error:
+        legal = "a PNG of the frames' size, black = left out"
+        why = error.message.removeprefix(f"{path}: ")
+        raise UserError(f"--mask {path}: no image that can be read ({why})", legal=legal) from error
 
-    measured, simulated = widths(z_m), widths(simulated_m)
-    at, lines = f"step {edge.step_m / MM:.0f} mm", len(edge.lines)
-    return [
-        Beside(edge.name, title, at, "px", lines, mean_of(getattr(measured, key)), mean_of(getattr(simulated, key)))
-        for title, key in (("gap at an edge", "gap"), ("flying pixels", "flying"))
-    ]
+
+def _draw(figure: Canvas, captured: Captured) -> None:
+    """The median depth, with each plane's pixels in its colour."""
+    from matplotlib.colors import to_rgb
+
+    axes = figure.subplots()
+    low, high = np.nanpercentile(captured.median_m, [2, 98])
+    shade = np.clip((high - captured.median_m) / max(high - low, MM), 0, 1) * 0.5 + 0.45
+    picture = np.repeat(np.nan_to_num(shade, nan=0.05)[..., None], 3, axis=-1)
+    for number, (_, mask) in enumerate(captured.planes):
+        picture[mask] = 0.45 * picture[mask] + 0.55 * np.array(to_rgb(COLOURS[number % len(COLOURS)]))
+    axes.imshow(picture)
+    axes.set_axis_off()

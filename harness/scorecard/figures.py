@@ -1,4 +1,4 @@
-"""Published figures: what others measured or specified of a camera, and the judgement of the simulation by them.
+"""Published figures: what others measured or specified of a camera, what the simulation gives, and its judgement.
 
 The file of figures is YAML; adding an entry is all that a further figure needs. Every problem of a file is told at
 once, with its place. No change may fall behind the baseline, which names the figures that passed.
@@ -7,32 +7,48 @@ once, with its place. No change may fall behind the baseline, which names the fi
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from harness.scorecard.bench import Reading
-from harness.scorecard.quantities import QUANTITIES, Quantity, in_words
+from harness.evaluation.intervals import Interval
+from harness.scorecard.bench import Bench, Effort, Reading
+from harness.scorecard.quantities import (
+    QUANTITIES,
+    LagConditions,
+    PlaneConditions,
+    Quantity,
+    RoomConditions,
+    StepConditions,
+    SurvivalConditions,
+    in_words,
+    scene_of,
+)
+from harness.tables.schema import Column, Table
+from harness.tables.text import Tone
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
-from harness.vocabulary.declaration.problems import DeclarationError, Problem
 from harness.vocabulary.declaration.shape import child
-from harness.vocabulary.declaration.yaml_source import KeyPath, read_yaml
+from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_text
-from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.limits import TEXT_BYTES, bounded_bytes
-from harness.vocabulary.versions import check_version
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json, write_text
+from harness.vocabulary.provenance import RESULTS_VERSION, check_version
+from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.camera import camera_names
 
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 BASELINE_FILE = Path(__file__).with_name("baseline.json")
 SCORECARD_VERSION = 1
-"""Version of a baseline; raised when the meaning of its keys changes."""
 
 
 class Published(Config):
@@ -62,27 +78,20 @@ class Published(Config):
     @property
     def limits(self) -> tuple[float, float]:
         """The lowest and highest simulated value that passes, tolerance included."""
+        low, high = self.between or ((self.above, self.below) if self.value is None else (self.value, self.value))
         slack = self.tolerance or 0.0
-        if self.value is not None:
-            return self.value - slack, self.value + slack
-        low, high = self.between or (self.above, self.below)
         return (-float("inf") if low is None else low - slack), (float("inf") if high is None else high + slack)
 
     def in_words(self) -> str:
         """``1.42``, ``below 17``, ``0.15 to 0.35``."""
-        if self.value is not None:
-            return f"{self.value:g}"
         if self.between is not None:
             return f"{self.between[0]:g} to {self.between[1]:g}"
-        return f"below {self.below:g}" if self.below is not None else f"above {self.above:g}"
+        ((key, bound),) = self.model_dump(include={"value", "below", "above"}, exclude_none=True).items()
+        return f"{bound:g}" if key == "value" else f"{key} {bound:g}"
 
 
 class FigureEntry(Config):
-    """One published figure as the file holds it; ``conditions`` are those of its quantity.
-
-    ``calibration``: whether the camera's file was, or may be, fitted to it; such a figure is no test of the model.
-    ``note`` says what was assumed where the source leaves conditions open.
-    """
+    """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", description="small letters, digits and _; once in the file")]
     camera: str
@@ -122,8 +131,7 @@ class Figure:
 def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
     """The figures of a file. Raises UserError naming each key that is missing, unknown or impossible, and where."""
     source = read_yaml(path)
-    entries = child(source.data, "figures")
-    problems: list[Problem] = []
+    entries, problems = child(source.data, "figures"), list[Problem]()
     first: dict[str, int] = {}
     splices: dict[KeyPath, type[Config]] = {}
     for number, data in enumerate(entries if isinstance(entries, list) else []):
@@ -131,10 +139,9 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
             word, at = child(data, key), ("figures", number, key)
             if isinstance(word, str) and word not in legal:
                 problems.append(wrong_choice(at, word, legal, source.place_of(at)))
-        quantity = child(data, "quantity")
+        quantity, name = child(data, "quantity"), child(data, "name")
         if isinstance(quantity, str) and quantity in QUANTITIES and isinstance(child(data, "conditions"), dict):
             splices["figures", number, "conditions"] = QUANTITIES[quantity].conditions
-        name = child(data, "name")
         if isinstance(name, str) and first.setdefault(name, number) != number:
             here, there = (source.place_of(("figures", n, "name")) for n in (number, first[name]))
             problems.append(Problem(f"two figures have the name {name}", here, other=there, other_says="first used at"))
@@ -146,9 +153,6 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
         for entry in file.figures
         for quantity in [QUANTITIES[entry.quantity]]
     )
-
-
-# ---- the judgement and the baseline ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -184,17 +188,14 @@ def judged(
 
 
 def read_baseline(path: Path) -> dict[str, bool]:
-    """Read which figures passed, by name; empty where there is no file. Raises UserError where it is no baseline, or a
-    baseline of another version."""
+    """Read which figures passed; empty where there is no file. Raises UserError where it is no baseline of today's."""
     return {name: known["passes"] for name, known in _known(path).items()}
 
 
 def write_baseline(path: Path, scores: Iterable[Score], known: Iterable[str]) -> None:
-    """Write which figures pass, and the simulated values for the reader of a change.
-
-    Entries of other figures stay as they are where their name is among the ``known`` ones.
-    """
-    figures = {name: entry for name, entry in _known(path).items() if name in set(known)}
+    """Write which figures pass, and the simulated values; entries of other ``known`` figures stay as they are."""
+    kept = set(known)
+    figures = {name: entry for name, entry in _known(path).items() if name in kept}
     for score in scores:
         value = score.simulated.value
         rounded = float(f"{value:.4g}") if np.isfinite(value) else None
@@ -216,9 +217,224 @@ def _known(path: Path) -> dict[str, dict[str, Any]]:
         if not all(isinstance(known["passes"], bool) for known in figures.values()):
             raise ValueError("passes is neither true nor false")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path}: is no baseline of the scorecard",
-            legal='JSON: {"scorecard_version": 1, "figures": {NAME: {"passes": true or false, "simulated": number}}}',
-            fix=again,
-        ) from error
+        legal = 'JSON: {"scorecard_version": 1, "figures": {NAME: {"passes": true or false, "simulated": number}}}'
+        raise UserError(f"{path}: is no baseline of the scorecard", legal=legal, fix=again) from error
     return figures
+
+
+SAID_EVERY_S = 10.0
+EDGES = ("edge_gap_px", "flying_pixels_px", "front_erosion_px", "back_erosion_px")
+FULL_GRIDS: dict[str, tuple[float, ...]] = {
+    "distance_m": tuple(0.5 + 0.25 * k for k in range(15)),
+    "albedo": (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 0.95),
+    "angle_deg": (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0),
+    "lag_px": tuple(range(1, 9)),
+    "map_distance_m": (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0),
+    "map_albedo": (0.05, 0.1, 0.15, 0.2, 0.4, 0.6, 0.8, 0.95),
+    "step_mm": (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0),
+    "diameter_px": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0),
+    "bias_distance_m": tuple(0.5 + 0.25 * k for k in range(15)),
+    "room_distance_m": (0.5, 0.7, 1.0, 1.5),
+}
+QUICK_GRIDS = {key: values[1 :: len(values) // 2] for key, values in FULL_GRIDS.items()} | {"room_distance_m": ()}
+
+Request = tuple[str, str, Config]
+
+
+class CurvePoint(NamedTuple):
+    """One point of one curve: ``curve`` names the picture that it belongs to."""
+
+    curve: str
+    quantity: str
+    conditions: Config
+
+
+def curve_points(grids: Mapping[str, tuple[float, ...]]) -> Iterator[CurvePoint]:
+    """All points of all curves."""
+    for curve, key in (("distance", "distance_m"), ("albedo", "albedo"), ("angle", "angle_deg")):
+        yield from (CurvePoint(curve, "temporal_sigma_mm", PlaneConditions(**{key: value})) for value in grids[key])
+    for lag in map(int, grids["lag_px"]):
+        yield CurvePoint("correlation_x", "noise_correlation", LagConditions(lag_x_px=lag, lag_y_px=0))
+        yield CurvePoint("correlation_y", "noise_correlation", LagConditions(lag_x_px=0, lag_y_px=lag))
+    for d, a in product(grids["map_distance_m"], grids["map_albedo"]):
+        yield CurvePoint("valid", "valid_fraction", PlaneConditions(distance_m=d, albedo=a))
+    for step, quantity in product(grids["step_mm"], EDGES):
+        yield CurvePoint("edge_lit", quantity, StepConditions(step_mm=step))
+        yield CurvePoint("edge_shadowed", quantity, StepConditions(step_mm=step, shadow=True))
+        yield CurvePoint("edge_across_y", quantity, StepConditions(step_mm=step, across="y"))
+    for size in grids["diameter_px"]:
+        yield CurvePoint("survival", "smallest_step_mm", SurvivalConditions(diameter_px=size))
+    for d in grids["bias_distance_m"]:
+        yield CurvePoint("bias", "bias_mm", PlaneConditions(distance_m=d))
+    for d, on, quantity in product(grids["room_distance_m"], (False, True), ("board_bias_mm", "board_bend_mm")):
+        yield CurvePoint("room", quantity, RoomConditions(distance_m=d, multipath=on))
+
+
+def requests_of(cameras: Sequence[str], figures: Sequence[Figure], points: Sequence[CurvePoint]) -> list[Request]:
+    """The numbers that curves and figures need, each once."""
+    wanted: list[Request] = [(each.entry.camera, each.quantity.name, each.conditions) for each in figures]
+    wanted += [(camera, point.quantity, point.conditions) for camera in cameras for point in points]
+    return list(dict.fromkeys(wanted))
+
+
+def measured(requests: Iterable[Request], effort: Effort, renders: Path, jobs: int) -> dict[Request, Reading]:
+    """Measure all requests, ``jobs`` scenes at a time. The numbers do not depend on ``jobs`` or on the order."""
+    scenes: dict[str, list[Request]] = defaultdict(list)
+    for request in requests:
+        scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
+    # scenes that take seconds are begun first, so that no process ends on one alone
+    groups = sorted(scenes.values(), key=lambda group: not isinstance(group[0][2], RoomConditions | SurvivalConditions))
+    results: dict[Request, Reading] = {}
+    said = time.monotonic()
+    # processes that start anew: a forked one would share the locks of this one's libraries
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        mapped = map if jobs == 1 else pool.map
+        count = len(groups)
+        found = mapped(measure_group, groups, [effort] * count, [renders] * count)
+        for group, readings in zip(groups, found, strict=True):
+            results |= zip(group, readings, strict=True)
+            if time.monotonic() - said > SAID_EVERY_S:
+                said = time.monotonic()
+                print(f"measured {len(results)} of {sum(map(len, groups))} numbers", file=sys.stderr, flush=True)
+    return results
+
+
+def measure_group(group: Sequence[Request], effort: Effort, renders: Path) -> list[Reading]:
+    """Measure quantities of one camera on one scene, in this process."""
+    return [QUANTITIES[name].measure(Bench(camera, effort, renders), conditions) for camera, name, conditions in group]
+
+
+CONDITIONS = tuple(dict.fromkeys(name for each in QUANTITIES.values() for name in each.conditions.model_fields))
+SCORE_FILE: dict[str, Any] = {"formats": ("csv",), "digits": "%.9g"}
+
+
+@dataclass(frozen=True)
+class MeasuredPoint:
+    """One point of one curve of one camera."""
+
+    camera: str
+    point: CurvePoint
+    simulated: Reading
+
+
+@dataclass(frozen=True)
+class Beside:
+    """One number of the capture and of the simulation; ``at``: the condition."""
+
+    where: str
+    quantity: str
+    at: str
+    unit: str
+    pixels: int
+    measured: Reading
+    simulated: Reading
+
+    @property
+    def ratio(self) -> float:
+        """Simulated by measured; NaN for what may be 0."""
+        return self.simulated.value / self.measured.value if self.unit == "mm" and self.measured.value else float("nan")
+
+
+def number(value: float) -> str:
+    """Three significant digits; ``none`` where there is no value."""
+    if not np.isfinite(value):
+        return "none" if np.isnan(value) else "none survives"
+    if 0.0995 <= abs(value) < 99.95:
+        return f"{value:#.3g}"
+    return f"{value:.3g}" if abs(value) >= 99.95 or value == 0 else f"{value:.2g}"
+
+
+def _interval(between: Interval) -> str:
+    high = number(between.high) if np.isfinite(between.high) else "inf"
+    return f"{number(between.low)} to {high}" if between.known else "–"
+
+
+def _conditions(conditions: Config) -> dict[str, Any]:
+    return {key: conditions.to_data().get(key) for key in CONDITIONS}
+
+
+def _reading(name: str, low: str, high: str, note: str, label: str = "") -> tuple[Column, ...]:
+    """A reading: its value and its interval's ends in three columns of a file, and in two of a page."""
+    return (
+        Column(name, label, f"{name}.value", note, number),
+        Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),
+        Column(high, "", f"{name}.interval.high", "upper end of its 95 % interval"),
+        Column("", "95 %" if label else "", f"{name}.interval", text=_interval),
+    )
+
+
+def _tone(score: Score) -> Tone:
+    return "good" if score.passes else "bad" if score.regressed else "open"
+
+
+SIMULATED = _reading("simulated", "low", "high", "simulated value", "simulated")
+VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
+ENTRY, PUBLISHED = "figure.entry", "figure.entry.published"
+SCORES = Table(
+    "scorecard",
+    "one row per published figure",
+    (
+        Column("name", "", "figure.name", "name in the file of figures"),
+        Column("camera", "camera", f"{ENTRY}.camera", "simulated camera"),
+        Column("", "figure", lambda score: score.figure.what()),
+        Column("quantity", "", f"{ENTRY}.quantity", "quantity that is measured"),
+        Column("unit", "", "figure.quantity.unit", "unit of all values"),
+        Column("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
+        *SIMULATED,
+        Column("published", "published", lambda score: score.figure.entry.published.in_words(), "published value"),
+        Column(
+            "tolerance",
+            "tolerance",
+            f"{PUBLISHED}.tolerance",
+            "how far beyond it the simulated value may lie",
+            lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
+        ),
+        Column("", "unit", lambda score: score.figure.quantity.unit or "–"),
+        Column("passes_from", "", lambda score: score.figure.entry.published.limits[0], "lowest value that passes"),
+        Column("passes_to", "", lambda score: score.figure.entry.published.limits[1], "highest value that passes"),
+        Column("verdict", "verdict", "verdict", "whether the simulated value passes", tone=_tone),
+        Column("passed_before", "", "passed_before", "whether it passed in the baseline; empty where that lacks it"),
+        Column("calibration", "", f"{ENTRY}.calibration", "whether the camera's file was, or may be, fitted to it"),
+        Column("", "use", lambda score: "calibration" if score.figure.entry.calibration else "test"),
+        Column("tag", "", f"{ENTRY}.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
+        Column("source", "", f"{ENTRY}.source", "source of the published value"),
+        Column("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
+        Column("note", "note", f"{ENTRY}.note", "what was assumed", brief=False),
+        VERSION,
+    ),
+    left=20,
+    kind="scores",
+    **SCORE_FILE,
+)
+CURVES = Table(
+    "curves",
+    "one row per point of a curve",
+    (
+        Column("curve", "", "point.curve", "picture that it belongs to"),
+        Column("camera", "", "camera", "simulated camera"),
+        Column("quantity", "", "point.quantity", "quantity that is measured"),
+        Column("unit", "", lambda row: QUANTITIES[row.point.quantity].unit, "unit of the value"),
+        Column("conditions", "", lambda row: _conditions(row.point.conditions), "conditions", spread=True),
+        *SIMULATED[:3],
+        VERSION,
+    ),
+    **SCORE_FILE,
+)
+BESIDE = Table(
+    "capture",
+    "one row per number of a capture beside its simulation",
+    (
+        Column("where", "where", "where", "plane or edge"),
+        Column("quantity", "quantity", "quantity", "quantity that is measured"),
+        Column("at", "at", "at", "condition"),
+        Column("unit", "", "unit", "unit of the values"),
+        Column("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
+        *_reading("measured", "measured_low", "measured_high", "measured on the capture", "measured"),
+        *_reading("simulated", "simulated_low", "simulated_high", "measured on its simulation", "simulated"),
+        Column("", "ratio", "ratio", text=lambda ratio: f"{ratio:.2f}" if np.isfinite(ratio) else "–"),
+        Column("", "unit", lambda row: row.unit or "–"),
+        VERSION,
+    ),
+    left=3,
+    **SCORE_FILE,
+)

@@ -1,8 +1,7 @@
 """The closed list of what the scorecard measures: each quantity with its conditions and how it is measured.
 
-A published figure names a quantity and conditions; a curve is a quantity over a range of conditions. Both are measured
-by the same function, so a figure stands on the curve. All scenes lie about the optical axis. Defaults of conditions are
-the usual case; a published figure states what differs.
+A published figure names a quantity and conditions, a curve is a quantity over a range of conditions; both are measured
+by the same function. All scenes lie about the optical axis. A published figure states what differs from the defaults.
 """
 
 from __future__ import annotations
@@ -10,50 +9,58 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
 from harness.evaluation.intervals import Interval
-from harness.scorecard import steps
 from harness.scorecard.bench import (
+    FLAT_PX,
     JITTER,
     NOISE,
     NOTHING,
     PATTERNED,
     STEADY,
-    WHOLE,
     Bench,
     FrameStack,
     Reading,
+    correlation_at,
+    edge_widths,
+    fixed_pattern,
     jackknifed,
     mean_of,
+    on_surface_tolerance_m,
     share_of,
-    taken,
+    temporal_sigma_m,
 )
-from harness.scorecard.noise import correlation_at, fixed_pattern, temporal_sigma_m
 from harness.vocabulary.config import Config
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import digest
-from harness.vocabulary.units import MM
-from scenes.closed_form import plane_view
+from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import NO_EFFECTS, EffectsConfig
-from scenes.view import NoiseFreeView
 
 PATCH = (40, 24)
 """Height and width in pixels. Narrow: at 70 degrees of incidence z then varies by 6 % to either side on the coarsest
 camera, and the deviation's mean by under 1 %."""
 PATTERN_PATCH = (140, 180)
-"""Some 200 patches of the fixed pattern's correlation length."""
 LEAST_TILT = (0.05, 0.02)
 """Slopes of the frontal plane: 3 degrees, so that rounding of the output meets every phase of its step."""
 JUMP_M = 5 * MM
 """A frame whose mean is farther than this from the median of all is a jump, no jitter."""
+EDGE_PATCH = (40, 96)
+REACH_PX = 44.0
+"""Distance from the edge within which pixels are counted: beyond the widest shadow at 0.75 m shorter than 44 pixels."""
+SLANT = 0.1
+"""Pixels across for each pixel along: every position of the edge within a pixel occurs, as in ISO 12233."""
+PITCH_PX, COPIES = 22, 4
+"""Distance of plateaus (the largest diameter, and twice the reach of a filter of 11 pixels), and number an axis."""
+R2 = (0.7548776662466927, 0.5698402909980532)
+"""Roberts' low-discrepancy sequence: the plateaus' positions within a pixel."""
 SURVIVES = 0.5
 """A step survives where at least this share of its height is seen, in most plateaus."""
 LADDER_MM = (2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 500.0)
-"""Heights that are tried for the smallest step that survives."""
 MONTE_CARLO_SIGMAS = 2.0
 
 # ---- conditions ------------------------------------------------------------------------------------------------------
@@ -81,11 +88,8 @@ class LagConditions(PlaneConditions):
 
 
 class StepConditions(Config):
-    """A straight edge of one matte plane before another, both frontal, the edge 6 degrees off the pixel grid.
-
-    ``across``: the image axis along which z steps. ``shadow``: whether the front stands on the emitter's side, so that
-    it throws its shadow on the visible back (where the emitter is offset along that axis).
-    """
+    """A straight edge of one matte plane before another, both frontal, 6 degrees off the pixel grid. z steps along the
+    image axis ``across``; with ``shadow`` the front is on the emitter's side and throws its shadow on the back."""
 
     distance_m: Distance = 0.75
     step_mm: StepMm = 50.0
@@ -116,15 +120,15 @@ class RoomConditions(Config):
 
 
 _WORDS: dict[str, Callable[[Any], str]] = {
-    "distance_m": lambda v: f"{v:g} m",
-    "albedo": lambda v: f"albedo {v:g}",
+    "distance_m": "{:g} m".format,
+    "albedo": "albedo {:g}".format,
     "angle_deg": lambda v: f"{v:g}°" if v else "",
-    "step_mm": lambda v: f"step {v:g} mm",
-    "across": lambda v: f"across {v}",
+    "step_mm": "step {:g} mm".format,
+    "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
-    "diameter_px": lambda v: f"⌀ {v:g} px",
+    "diameter_px": "⌀ {:g} px".format,
     "multipath": lambda v: "multipath on" if v else "multipath off",
-    "lag_px": lambda v: f"lag ({v[0]}, {v[1]}) px",
+    "lag_px": "lag {} px".format,
 }
 
 
@@ -138,16 +142,17 @@ def in_words(conditions: Config) -> str:
 
 def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
     """The scene to simulate for some conditions: equal for those that share it, such as all lags on one plane."""
-    shared = _plane(conditions) if isinstance(conditions, LagConditions) else conditions
+    shared = _plane(conditions) if isinstance(conditions, PlaneConditions) else conditions
     return type(shared).__name__, shared.to_data()
 
 
 def _plane(c: PlaneConditions) -> PlaneConditions:
-    """The plane alone, so that all that is measured on it shares its frames."""
     return PlaneConditions(distance_m=c.distance_m, albedo=c.albedo, angle_deg=c.angle_deg)
 
 
 # ---- the list --------------------------------------------------------------------------------------------------------
+
+Measure = Callable[[Bench, Any], Reading]
 
 
 @dataclass(frozen=True)
@@ -158,127 +163,103 @@ class Quantity:
     title: str
     unit: str
     conditions: type[Config]
-    measure: Callable[[Bench, Any], Reading]
+    measure: Measure
     says: str
 
 
 QUANTITIES: dict[str, Quantity] = {}
-M = TypeVar("M", bound=Callable[..., Reading])
 
 
-def _quantity(title: str, conditions: type[Config]) -> Callable[[M], M]:
-    """Put a measuring function on the list. Its name is the quantity's, with the unit as its ending (the amplitude is
-    in the camera's own units); its docstring's first paragraph is what the page says of it."""
+def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
+    """Put a measuring function on the list. Its name is the quantity's, with the unit as its ending; its docstring's
+    first paragraph is what the page says of it."""
 
-    def listed(measure: M) -> M:
-        name = measure.__name__
+    def listed(measure: Measure) -> Measure:
+        name, says = measure.__name__, " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
         ending = name.rpartition("_")[2]
-        unit = "units" if name == "amplitude" else ending if ending in ("mm", "px") else ""
-        says = " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
+        unit = ending if ending in ("mm", "px") else ""
         QUANTITIES[name] = Quantity(name, title, unit, conditions, measure, says)
         return measure
 
     return listed
 
 
-# ---- planes ----------------------------------------------------------------------------------------------------------
-
-
-def _view(bench: Bench, c: PlaneConditions, patch: tuple[int, int]) -> NoiseFreeView:
-    slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
-    return plane_view(bench.camera, bench.patch(*patch), c.distance_m, c.albedo, slope_x, LEAST_TILT[1])
-
-
-def _taken(
-    bench: Bench, c: PlaneConditions, view: NoiseFreeView, effects: EffectsConfig, frames: int, unit: int
-) -> FrameStack:
-    label = digest([c.to_data(), effects.to_data()])
-    return taken(bench.unit(view, effects, unit), frames, bench.camera_name, "plane", label, unit)
-
-
 @lru_cache(maxsize=8)
-def plane_stack(bench: Bench, c: PlaneConditions, effects: EffectsConfig, frames: int, unit: int = 1) -> FrameStack:
-    """Frames of a plane about the axis."""
-    return _taken(bench, c, _view(bench, c, PATCH), effects, frames, unit)
-
-
-def _noise_stack(bench: Bench, c: PlaneConditions) -> FrameStack:
-    return plane_stack(bench, _plane(c), NOISE, bench.effort.noise_frames)
+def plane_stack(
+    bench: Bench,
+    c: PlaneConditions,
+    effects: EffectsConfig = NOISE,
+    frames: int | None = None,
+    unit: int = 1,
+    patch: tuple[int, int] = PATCH,
+) -> FrameStack:
+    """Frames of a plane about the axis; all that is measured on one plane with the same effects shares them."""
+    slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
+    view = plane_view(bench.camera, bench.patch(*patch), c.distance_m, c.albedo, slope_x, LEAST_TILT[1])
+    labels = ("plane", digest([c.to_data(), effects.to_data()]), unit)
+    return bench.taken(view, effects, frames or bench.effort.noise_frames, *labels, unit_seed=unit)
 
 
 def _deviation(stack: FrameStack) -> Reading:
-    return jackknifed(stack.z_m, lambda z: temporal_sigma_m(z, stack.everywhere) / MM)
+    return jackknifed(stack.z_m, lambda z: temporal_sigma_m(z) / MM)
 
 
 @_quantity("temporal deviation", PlaneConditions)
 def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over frames of one pixel's z, rms over pixels, noise alone."""
-    return _deviation(_noise_stack(bench, c))
+    return _deviation(plane_stack(bench, c))
 
 
 @_quantity("random error", PlaneConditions)
 def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over frames of one pixel's z with whole-frame jitter and jumps, rms over pixels."""
-    return _deviation(plane_stack(bench, _plane(c), WHOLE, bench.effort.whole_frames))
+    return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
 
 
 @_quantity("noise correlation", LagConditions)
 def noise_correlation(bench: Bench, c: LagConditions) -> Reading:
     """Correlation of the temporal noise of two pixels, noise alone."""
-    stack = _noise_stack(bench, c)
-    return jackknifed(stack.z_m, lambda z: correlation_at(z, stack.everywhere, c.lag_x_px, c.lag_y_px))
+    return jackknifed(plane_stack(bench, _plane(c)).z_m, lambda z: correlation_at(z, True, c.lag_x_px, c.lag_y_px))
 
 
 @_quantity("valid fraction", PlaneConditions)
 def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
-    """Share of pixels about the axis that have a range.
-
-    As many neighbours count as a single pixel as the camera's own filter mixes.
-    """
-    stack = plane_stack(bench, _plane(c), NOISE, bench.effort.valid_frames)
+    """Share of pixels about the axis that have a range."""
+    # as many neighbours count as a single pixel as the camera's own filter mixes
+    stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
     return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
 
 
-@_quantity("amplitude", PlaneConditions)
-def amplitude(bench: Bench, c: PlaneConditions) -> Reading:
-    """Mean amplitude, camera's units."""
-    return Reading(float(np.nanmean(_noise_stack(bench, c).amplitude)))
-
-
-def _mean_errors_mm(bench: Bench, c: PlaneConditions, unit: int) -> np.ndarray:
+def _mean_errors_mm(stack: FrameStack) -> np.ndarray:
     """(n,) each frame's mean error over the pixels with a range; NaN where it has none."""
-    stack = plane_stack(bench, _plane(c), STEADY, bench.effort.bias_frames, unit)
-    some = np.isfinite(stack.z_m).any(axis=(1, 2))
-    errors = np.full(len(stack.z_m), np.nan)
-    errors[some] = np.nanmean(stack.z_m[some] - stack.true_z_m, axis=(1, 2)) / MM
-    return errors
+    valid = np.isfinite(stack.z_m)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(valid, stack.z_m - stack.true_z_m, 0).sum(axis=(1, 2)) / valid.sum(axis=(1, 2)) / MM)
+
+
+def _bias_mm(bench: Bench, c: PlaneConditions, unit: int) -> Reading:
+    return mean_of(_mean_errors_mm(plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)))
 
 
 @_quantity("bias of one unit", PlaneConditions)
 def bias_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Mean error of z of unit 1 with all its effects but jumps, direct light only."""
-    return mean_of(_mean_errors_mm(bench, c, 1))
+    return _bias_mm(bench, c, 1)
 
 
 @_quantity("systematic error", PlaneConditions)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Greatest absolute mean error of z among ten units an hour after power-on, direct light only.
-
-    It has no interval: it is the worst of these units.
-    """
-    units = range(1, bench.effort.units + 1)
-    errors = [abs(float(np.nanmean(_mean_errors_mm(bench, c, unit)))) for unit in units]
-    known = [error for error in errors if np.isfinite(error)]
-    return Reading(max(known)) if known else NOTHING
+    """Greatest absolute mean error of z among ten units an hour after power-on, direct light only."""
+    errors = [abs(_bias_mm(bench, c, unit).value) for unit in range(1, bench.effort.units + 1)]
+    return Reading(float(np.fmax.reduce(errors)))
 
 
 @_quantity("fixed pattern", PlaneConditions)
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Deviation over pixels of the average less a smooth surface and the noise left in it, mean of five units."""
-    view = _view(bench, _plane(c), PATTERN_PATCH)
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
-        stack = _taken(bench, _plane(c), view, PATTERNED, bench.effort.noise_frames // 4, unit)
+        stack = plane_stack(bench, c, PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH)
         where = np.isfinite(stack.z_m).all(axis=0)
         if where.mean() > 0.5:
             found.append(fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12).std_m / MM)
@@ -288,10 +269,7 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
 @_quantity("frame jitter", PlaneConditions)
 def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Deviation of a frame's mean over 960 pixels from frame to frame; jumps of over 5 mm left out."""
-    stack = plane_stack(bench, _plane(c), JITTER, bench.effort.whole_frames)
-    if not np.isfinite(stack.z_m).any(axis=(1, 2)).all():
-        return NOTHING
-    return jitter_of(np.nanmean(stack.z_m - stack.true_z_m, axis=(1, 2)))
+    return jitter_of(_mean_errors_mm(plane_stack(bench, c, JITTER, bench.effort.whole_frames)) * MM)
 
 
 def jitter_of(means_m: np.ndarray) -> Reading:
@@ -300,67 +278,105 @@ def jitter_of(means_m: np.ndarray) -> Reading:
     return jackknifed(steady, lambda m: float(m.std(ddof=1)) / MM) if steady.size >= 2 else NOTHING
 
 
-# ---- steps -----------------------------------------------------------------------------------------------------------
+@lru_cache(maxsize=4)
+def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
+    """Widths at a straight edge near the axis: the front is where sign (across - slant along) < 0, in pixels of the
+    undistorted lens about the principal point."""
+    camera, axis = bench.camera, ("x", "y").index(c.across)
+    lens = camera.nominal_lens
+    region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
+    toward_emitter = -1.0 if camera.optics.emitter_m[axis] < 0 else 1.0
+    # the front lies where sign * (position across) < edge: on the emitter's side for a shadow
+    sign = -toward_emitter if c.shadow else toward_emitter
+
+    def signed_px(slopes: np.ndarray) -> np.ndarray:
+        px = slopes * np.array([lens.fx, lens.fy])
+        return np.asarray(sign * (px[..., axis] - SLANT * px[..., 1 - axis]))
+
+    front, back = Plane(c.distance_m), Plane(c.distance_m + c.step_mm * MM)
+    view = layered_view(camera, region, front, back, lambda slopes: signed_px(slopes) < 0, c.albedo)
+    stack = bench.taken(view, NOISE, bench.effort.few_frames, "step", digest(c.to_data()))
+    from_edge = signed_px(lens.region_slopes(stack.region))
+    tolerance_m = on_surface_tolerance_m(temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM)
+    front_z, back_z = (plane.z_along_m(stack.slopes) for plane in (front, back))
+    return edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, stack.region.shape[axis])
 
 
 @_quantity("gap at an edge", StepConditions)
 def edge_gap_px(bench: Bench, c: StepConditions) -> Reading:
     """Width across an edge of pixels without a range, shadow included."""
-    return mean_of(steps.widths(bench, c).gap)
+    return mean_of(_widths(bench, c)["gap"])
 
 
 @_quantity("flying pixels", StepConditions)
 def flying_pixels_px(bench: Bench, c: StepConditions) -> Reading:
     """Width across an edge of pixels whose range is off both surfaces by more than four deviations and a tenth of the
     step."""
-    return mean_of(steps.widths(bench, c).flying)
+    return mean_of(_widths(bench, c)["flying"])
 
 
 @_quantity("erosion of the front", StepConditions)
 def front_erosion_px(bench: Bench, c: StepConditions) -> Reading:
     """Width of pixels that look at the front and do not show it."""
-    return mean_of(steps.widths(bench, c).front_erosion)
+    return mean_of(_widths(bench, c)["front_erosion"])
 
 
 @_quantity("erosion of the back", StepConditions)
 def back_erosion_px(bench: Bench, c: StepConditions) -> Reading:
     """Width of pixels that look at the back and do not show it, shadow included."""
-    return mean_of(steps.widths(bench, c).back_erosion)
+    return mean_of(_widths(bench, c)["back_erosion"])
+
+
+def _seen_shares(bench: Bench, c: PlateauConditions) -> np.ndarray:
+    """Seen share of the height at the pixel nearest to each plateau's centre; NaN where most frames have no range.
+    Plateaus stand on a grid about the principal point, each at another place within its pixel."""
+    camera, focal_px = bench.camera, [bench.camera.nominal_lens.fx, bench.camera.nominal_lens.fy]
+    v, u = np.mgrid[:COPIES, :COPIES]
+    number, middle = (u + COPIES * v + 1)[..., None], (COPIES - 1) / 2
+    centres = (np.stack([u, v], axis=-1) - middle) * PITCH_PX + (number * np.array(R2)) % 1 - 0.5
+
+    def covers(slopes: np.ndarray) -> np.ndarray:
+        at = np.nan_to_num(slopes, nan=1e3) * focal_px
+        nearest = np.clip(np.round(at / PITCH_PX + middle), 0, COPIES - 1).astype(int)
+        off = at - centres[nearest[..., 1], nearest[..., 0]]
+        return np.asarray((off**2).sum(axis=-1) < (c.diameter_px / 2) ** 2)
+
+    step_m = c.step_mm * MM
+    front, back = Plane(c.distance_m), Plane(c.distance_m + step_m)
+    view = layered_view(camera, bench.patch(COPIES * PITCH_PX, COPIES * PITCH_PX), front, back, covers, c.albedo)
+    stack = bench.taken(view, NOISE, bench.effort.few_frames, "plateaus", digest(c.to_data()))
+    rays = np.pad(centres.reshape(-1, 2) / focal_px, ((0, 0), (0, 1)), constant_values=1.0)
+    columns, rows = np.round(camera.nominal_lens.project(rays)).astype(int).T
+    at = (rows - stack.region.row0, columns - stack.region.col0)
+    z = stack.z_m[:, at[0], at[1]]
+    often = np.isfinite(z).mean(axis=0) > 0.5
+    height = np.full(len(rays), np.nan)
+    height[often] = back.z_along_m(stack.slopes)[at][often] - np.nanmean(z[:, often], axis=0)
+    return height / step_m
 
 
 @_quantity("seen share of a step", PlateauConditions)
 def seen_share(bench: Bench, c: PlateauConditions) -> Reading:
-    """Height seen in the middle of a round plateau by its true height.
-
-    The mean is over plateaus that most frames see.
-    """
-    return mean_of(steps.seen_shares(bench, c))
+    """Height seen in the middle of a round plateau by its true height."""
+    return mean_of(_seen_shares(bench, c))
 
 
 @_quantity("smallest surviving step", SurvivalConditions)
 def smallest_step_mm(bench: Bench, c: SurvivalConditions) -> Reading:
-    """Lowest step of a round plateau of which at least half is seen in its middle, in most of 16 places.
-
-    It is infinite where none of the heights that are tried survives.
-    """
+    """Lowest step of a round plateau of which at least half is seen in its middle, in most of 16 places."""
     below = 0.0
     for step_mm in LADDER_MM:
-        shares = steps.seen_shares(bench, PlateauConditions(**c.to_data(), step_mm=step_mm))
+        shares = _seen_shares(bench, PlateauConditions(**c.to_data(), step_mm=step_mm))
         if np.mean(np.nan_to_num(shares, nan=0.0) >= SURVIVES) > 0.5:
             return Reading(step_mm, Interval(below, step_mm))
         below = step_mm
     return Reading(float("inf"), Interval(below, float("inf")))
 
 
-# ---- a board in a room: what light that met more than one surface does to its depth ----------------------------------
-
-
 @_quantity("bias of a board in a room", RoomConditions)
 def board_bias_mm(bench: Bench, c: RoomConditions) -> Reading:
-    """Mean error of z over a board of 400 x 300 mm before a floor and a wall, without noise and traits of a unit.
-
-    The interval is two deviations of what the render's Monte Carlo leaves in a pixel, as if all pixels shared it.
-    """
+    """Mean error of z over a board of 400 x 300 mm before a floor and a wall, without noise and traits of a unit."""
+    # the interval: two deviations of what the render's Monte Carlo leaves in a pixel, as if all pixels shared it
     errors_mm, monte_carlo_mm = _room_errors_mm(bench, c)
     if errors_mm.size == 0:
         return NOTHING
@@ -378,13 +394,10 @@ def board_bend_mm(bench: Bench, c: RoomConditions) -> Reading:
 
 @lru_cache(maxsize=4)
 def _room_errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) errors of z at the valid pixels of the board's inside, and what the render leaves of noise there; in mm.
-
-    A plain flat board stands on a wooden table, which is lit before the board and lights it from below, with a wall
-    behind. Its tilt lets rounding of the output meet every phase of its step.
-    """
+    """(n,) errors of z at the valid pixels of the board's inside, and what the render leaves of noise there; in mm."""
+    # the board's tilt lets rounding of the output meet every phase of its step
+    from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
-    from scenes.render.settings import RenderConfig
     from scenes.target.custom import BoardConfig, FlatConfig, MaterialConfig, PoseConfig, RoomConfig, TargetConfig
 
     target = TargetConfig(
@@ -394,9 +407,9 @@ def _room_errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.nda
         pose=PoseConfig(distance_m=c.distance_m, tilt_x_deg=3.0, tilt_y_deg=4.0),
     )
     view, _ = cached_view(target, bench.camera.optics, RenderConfig(), bench.renders)
-    unit = bench.unit(view, NO_EFFECTS.model_copy(update={"multipath": c.multipath}))
-    stack = taken(unit, 1, bench.camera_name, "room")
-    board = view.surface == view.surface_names.index("board")
+    stack = bench.taken(view, NO_EFFECTS.model_copy(update={"multipath": c.multipath}), 1, "room")
+    cut = stack.region.within(view.region)
     rim = 2 * (2 * bench.camera.optics.margin_px + 1)
-    inside = ndimage.binary_erosion(board, iterations=rim)[unit.cut] & np.isfinite(stack.z_m[0])
-    return (stack.z_m[0] - stack.true_z_m)[inside] / MM, view.indirect_noise_m[unit.cut][inside] / MM
+    board = ndimage.binary_erosion(view.surface == view.surface_names.index("board"), iterations=rim)
+    inside = board[cut] & np.isfinite(stack.z_m[0])
+    return (stack.z_m[0] - stack.true_z_m)[inside] / MM, view.indirect_noise_m[cut][inside] / MM

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.pod.curve import Bound
-from harness.evaluation.pod.false_calls import FalseCallRate
 from harness.evaluation.study.limit import SetUpLimit
 from harness.tables import text
 from harness.tables.schema import Column, Estimate, Table
 
 MOST_ANSWERS = 3
-"""Set-ups that the first words of a page name each by itself; of more they give the span."""
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
 """Words of a statement's note on an extrapolated bound; pages have words of their own for it."""
@@ -46,33 +44,13 @@ def bound_text(bound: Estimate) -> str:
     return NOT_DEMONSTRATED if np.isnan(bound.value) else bound.text()
 
 
-def estimate_of(limit: SetUpLimit, size_mm: float, interval: Interval = UNKNOWN) -> Estimate:
-    """Return a50 or a90 as a table shows it: at most the smallest size where everything was found."""
-    return Estimate(size_mm, interval.low, interval.high, limit.largest_mm, limit.is_at_most)
+def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
+    """Return a50 or a90 (``of``) with its interval: at most the smallest size where everything was found."""
+    size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
+    return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-def rate_estimate(calls: FalseCallRate | None) -> Estimate:
-    """Return false calls per square metre with their exact Poisson interval; NaN where nothing was inspected."""
-    if calls is None:
-        return Estimate(np.nan)
-    return Estimate(calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
-
-
-def rate_text(rate: Estimate) -> str:
-    """Return a rate of false calls as text."""
-    return "none inspected" if np.isnan(rate.value) else rate.text()
-
-
-def a50_of(limit: SetUpLimit) -> Estimate:
-    """Return a50 with its interval."""
-    return estimate_of(limit, limit.a50_mm, limit.a50_interval_mm)
-
-
-def a90_of(limit: SetUpLimit) -> Estimate:
-    """Return a90 with its interval."""
-    return estimate_of(limit, limit.a90_mm, limit.a90_interval_mm)
-
-
+a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"diameter found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
 EFFECT = "variance of a90 with boards as units over that with damages as units"
@@ -81,10 +59,9 @@ CALLS = (
     Column(
         "false_calls_per_m2",
         "calls/m² (95 %)",
-        lambda one: rate_estimate(one.false_calls),
+        ("false_calls.rate_per_m2", "false_calls.interval_per_m2"),
         "false calls on hole-free boards, with the exact 95 % Poisson interval",
-        rate_text,
-        interval=True,
+        lambda rate: "none inspected" if np.isnan(rate.value) else rate.text(),
     ),
     Column("false_calls", "", "false_calls.calls", "false calls counted"),
     Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "hole-free face inspected"),
@@ -169,9 +146,6 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
     return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
 
 
-# ---------------------------------------------------------------- words
-
-
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
     """Return what the study says: a sentence for each set-up, or the span of the limits of many."""
     if not limits:
@@ -248,9 +222,8 @@ def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return what to know beside the limits: what all of them have in common, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
     shared = [one for one in notes[0][1] if all(one in said for _, said in notes)] if len(notes) > 1 else []
-    own = [(name, [one for one in said if one not in shared]) for name, said in notes]
-    every = [f"every set-up: {'; '.join(shared)}"] if shared else []
-    return every + [f"{name}: {'; '.join(said)}" for name, said in own if said]
+    own = [("every set-up", shared), *((name, [one for one in said if one not in shared]) for name, said in notes)]
+    return [f"{name}: {'; '.join(said)}" for name, said in own if said]
 
 
 def _reason(limit: SetUpLimit) -> str:

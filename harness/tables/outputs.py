@@ -1,5 +1,5 @@
-"""Files that programs leave in a folder of results: those who write them, `harness.clean` and `results/README.md` take
-their names from here."""
+"""Files that programs leave in a folder of results (those who write them, `harness.clean` and `results/README.md` take
+their names from here)."""
 
 from __future__ import annotations
 
@@ -44,9 +44,7 @@ FILES = (
     FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"
-"""Folder of the records of trials."""
 LATEST = "latest"
-"""Link to the newest run of an experiment, beside its runs."""
 LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
 
 

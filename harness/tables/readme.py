@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from harness.tables.outputs import FILES, JOURNAL, LATEST
 from harness.tables.schema import Table
 from harness.tables.study import STUDY_TABLES
-from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
+from harness.tables.trials import FINDINGS_OF_CAPTURE, POINTS_OF_CAPTURES, STORED, STUDY_ONLY, SUMMARISED
 
 HEAD = f"""# Results
 
@@ -51,6 +51,7 @@ def _lines() -> Iterator[str]:
     yield from _tables("Summaries of an experiment that is no study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
+    yield from _tables("Real captures", (POINTS_OF_CAPTURES, FINDINGS_OF_CAPTURE))
     yield ""
 
 

@@ -15,48 +15,34 @@ interval fills three columns of a file (``speed_m``, ``speed_low_m``, ``speed_hi
         ),
     )
     SPEEDS.frame(animals)        # a DataFrame; write_table(folder, SPEEDS, frame) makes speeds.csv, speeds.parquet
-    SPEEDS.grid(animals).html()  # a page's table; .lines() and .rich() for terminals; harness.tables.grid.show prints
+    SPEEDS.grid(animals).html()  # a page's table; .lines() and .rich() for terminals; harness.tables.text.show prints
     SPEEDS.data(animals)         # JSON's types
-
-Declared are: tables of trials (`harness.tables.trials`), of limits (`harness.tables.limits`) and of a study's other
-results (`harness.tables.study`); `harness.tables.outputs` lists every file that a program leaves in `results/`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.tables import text
-from harness.tables.grid import Cell, Grid, Tone
+from harness.tables.text import Cell, Grid, Tone
 from harness.vocabulary.files import atomic_path, write_text
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
     import pandas as pd
 
-UNITS = {
-    "_per_m2": "1/m²",
-    "_m2": "m²",
-    "_mm": "mm",
-    "_m": "m",
-    "_s": "s",
-    "_mb": "MB",
-    "_px": "pixels",
-    "_bytes": "bytes",
-}
-"""Endings of a column's name that name its unit, longer ones first."""
+UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with the ends of its interval, NaN where unknown. It reads as ``> most`` beyond ``most``, and as an
-    upper limit where it is only known to be ``at_most`` the value."""
+    """A number with the ends of its interval, NaN where unknown; ``> most`` beyond ``most``, ``≤`` if ``at_most``."""
 
     value: float
     low: float = np.nan
@@ -78,28 +64,24 @@ def _share(share: float | Estimate) -> str:
     return text.UNKNOWN_TEXT if np.isnan(one.value) else f"{100 * one.value:.2g} %{ends}"
 
 
-def _area(area: Estimate) -> str:
-    return text.UNKNOWN_TEXT if np.isnan(area.value) else area.text(3)
-
-
-def _size(size: float | Estimate) -> str:
-    return size.text() if isinstance(size, Estimate) else text.mm(size)
-
-
-FORMATS: dict[str, Callable[[Any], str]] = {"_mm": _size, "_share": _share, "_area": _area, "_p": text.p_value}
+FORMATS: dict[str, Callable[[Any], str]] = {
+    "_mm": lambda size: size.text() if isinstance(size, Estimate) else text.mm(np.nan if size is None else size),
+    "_share": _share,
+    "_area": lambda area: text.UNKNOWN_TEXT if np.isnan(area.value) else area.text(3),
+    "_p": text.p_value,
+    "": lambda value: value.text() if isinstance(value, Estimate) else text.plain(value),
+}
 """Default texts of numbers by the endings of columns' names."""
-Value = str | tuple[str, str] | Callable[[Any], Any] | None
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a result table; see the module's first lines. ``interval``: its values are `Estimate` (understood of
-    a pair of paths); ``spread``: they are mappings, each key a column of its own. ``tone``: how a row's cell is meant;
-    ``brief``: how a terminal shows it, False where it does not."""
+    """A column of a result table; see the module's first lines. ``interval``: its values are `Estimate`; ``spread``:
+    mappings, each key a column of its own; ``brief``: its text at a terminal, False where it is not shown there."""
 
     name: str
     label: str = ""
-    value: Value = None
+    value: str | tuple[str, str] | Callable[[Any], Any] | None = None
     note: str = ""
     text: Callable[[Any], str] | None = None
     interval: bool = False
@@ -122,9 +104,10 @@ class Column:
         return (self.name, f"{stem}_low{ending}", f"{stem}_high{ending}")
 
     def of(self, row: Any) -> Any:
-        """Return the row's value; None where an attribute on its path is None."""
+        """Return the row's value; None where a mapping lacks it or an attribute on its path is None."""
         if self.value is None:
-            return row[self.name]
+            values = [row.get(name) for name in self.names]
+            return values[0] if len(values) == 1 or values[0] is None else Estimate(*values)
         if isinstance(self.value, str):
             return _attribute(row, self.value)
         if isinstance(self.value, tuple):
@@ -135,17 +118,17 @@ class Column:
     def cell(self, row: Any, *, terminal: bool = False) -> Cell:
         """Return the row's value as text."""
         value = self.of(row)
-        how = self.brief if terminal and not isinstance(self.brief, bool) else self.text
-        how = how or next((one for ending, one in FORMATS.items() if self.name.endswith(ending)), text.plain)
-        shown = value.text() if how is text.plain and isinstance(value, Estimate) else how(value)
-        return Cell(shown, self.tone(row) if self.tone else "")
+        if isinstance(value, Cell):
+            return replace(value, text=value.text.replace("\n", " ")) if terminal else value
+        how = self.brief if terminal and callable(self.brief) else self.text
+        how = how or next(one for ending, one in FORMATS.items() if self.name.endswith(ending))
+        return Cell(how(value), self.tone(row) if self.tone else "")
 
 
 @dataclass(frozen=True)
 class Table:
-    """A result table. ``note``: what a row is; ``order``: the columns that its rows are sorted by; ``formats``: the
-    files that it is written as; ``title``: what a terminal writes above it; ``always``: it is written without rows
-    too."""
+    """A result table. ``note``: what a row is; ``order``: sorts rows; ``formats``: its files, ``digits`` those of CSV;
+    ``title``: above it at a terminal; ``always``: written without rows too; ``left``: columns of text on a page."""
 
     name: str
     note: str
@@ -154,6 +137,9 @@ class Table:
     formats: tuple[str, ...] = ("csv", "parquet")
     title: str = ""
     always: bool = False
+    left: int = 1
+    digits: str = "%.6g"
+    kind: str = "limits"
 
     @property
     def stored(self) -> tuple[Column, ...]:
@@ -201,28 +187,34 @@ class Table:
 
     def data(self, rows: Iterable[Any]) -> list[dict[str, Any]]:
         """Return the rows as JSON's types; what is no finite number is None."""
-        return [{name: _json(value) for name, value in record.items()} for record in self.records(rows)]
+        return [jsonable(record) for record in self.records(rows)]
 
-    def grid(self, rows: Sequence[Any], *, terminal: bool = False, heads: Mapping[str, str] | None = None) -> Grid:
-        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``heads``: other labels in
-        place of those declared; empty for a column to be left out."""
+    def grid(
+        self,
+        rows: Sequence[Any],
+        *,
+        terminal: bool = False,
+        heads: Mapping[str, str] | None = None,
+        only: Collection[str] = (),
+    ) -> Grid:
+        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only``: labels of those
+        shown. ``heads``: other labels in place of those declared; empty for a column to be left out."""
         shown = [column for column in self.columns if column.label and not (terminal and column.brief is False)]
-        labels = {column: (heads or {}).get(column.label, column.label) for column in shown}
-        shown = [column for column in shown if labels[column]]
+        labels = {one: (heads or {}).get(one.label, one.label) for one in shown if not only or one.label in only}
+        shown = [column for column, label in labels.items() if label]
         cells = [[column.cell(row, terminal=terminal) for column in shown] for row in rows]
-        return Grid.of([labels[column] for column in shown], cells, title=self.title)
+        return Grid.of([labels[column] for column in shown], cells, self.left, self.title, self.kind)
 
 
 def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[str, Any] | None = None) -> None:
-    """Write a table's files: CSV with six digits; Parquet with all, the units and notes in its schema and ``about`` as
-    JSON under the key "tofpod". A table without rows is not written, and files of an earlier run are removed. Raises
-    UserError where the folder cannot be written."""
+    """Write a table's files: CSV; Parquet with units and notes in its schema, ``about`` as JSON under "tofpod". Without
+    rows none, and those of an earlier run are removed. Raises UserError where the folder cannot be written."""
     for ending, name in zip(table.formats, table.files, strict=True):
         if frame.empty and not table.always:
             (Path(folder) / name).unlink(missing_ok=True)
             continue
         if ending == "csv":
-            write_text(Path(folder) / name, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+            write_text(Path(folder) / name, frame.to_csv(index=False, float_format=table.digits, lineterminator="\n"))
             continue
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -241,6 +233,17 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
             pq.write_table(stored.cast(pa.schema(fields, metadata=metadata)), path)
 
 
+def jsonable(value: Any) -> Any:
+    """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for what is no finite number."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def _attribute(row: Any, path: str) -> Any:
     for name in path.split("."):
         row = None if row is None else getattr(row, name)
@@ -253,9 +256,3 @@ def _scalar(value: Any) -> Any:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else canonical_json(value)
-
-
-def _json(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value

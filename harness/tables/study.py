@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from harness.evaluation.intervals import Interval
 from harness.evaluation.pod.statement import CONFIDENCE
-from harness.evaluation.study.axes import FRAMES, AxisLine, Difference
 from harness.evaluation.study.curves import PRO_LIMIT, PixelCurves, Roc
 from harness.evaluation.study.limit import SetUpLimit, SizeRow
 from harness.evaluation.study.record import StudyRecord
-from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.evaluation.study.result import FRAMES, AxisLine, Difference, SetUpResult, StudyResult
 from harness.tables import text
-from harness.tables.grid import Grid
 from harness.tables.limits import (
     CALLS,
     FOUND_50,
@@ -30,31 +28,25 @@ from harness.tables.limits import (
     name_of,
 )
 from harness.tables.schema import Column, Estimate, Table
+from harness.tables.text import Grid
 from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text
 
 HIGH_THRESHOLD = 10.0
-"""Deviations: the highest of a hole-free board's 30,000 pixels is 4 with Gaussian noise, and 5 to 6 with the fixed
-pattern that an Azure Kinect's average of 50 frames keeps."""
+"""Deviations: the highest of a hole-free board is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
-MOST_COLUMNS = 4
-"""Set-ups side by side in a table of holes."""
 SHOWN_ROWS = 60
 BOUND = "its upper bound at 95 % confidence; empty where not demonstrated"
 
-
 SET_UP_OF = Column("set_up", "set-up", "limit.record.label", SET_UP.note, text.unbroken)
 
-# ---------------------------------------------------------------- hits by chance, thresholds
+
+def _share_text(pod: float | None) -> str:
+    return text.UNKNOWN_TEXT if pod is None else f"{text.percent(pod)} %"
 
 
 def _pod_at_smallest(result: SetUpResult) -> float | None:
     stated = result.limit.statement
     return None if stated is None else float(stated.curve.pod(np.array(stated.size.min())))
-
-
-def _smallest_text(result: SetUpResult) -> str:
-    pod, stated = _pod_at_smallest(result), result.limit.statement
-    return f"{text.percent(pod)} % at {stated.size.min():.2f} mm" if pod is not None and stated else text.UNKNOWN_TEXT
 
 
 SHUFFLED, UNFLAWED = ("chance.probability", "chance.interval"), ("chance.of_sites", "chance.sites_interval")
@@ -69,18 +61,9 @@ CHANCE = Table(
         Column("places", "places", "chance.sites", "unflawed places"),
         Column("expected_share", "from the rate", "chance.expected", "hits, were false calls spread evenly"),
         Column("expected_upper_share", "", "chance.expected_upper", "its upper bound"),
-        Column("pod_at_smallest", "", _pod_at_smallest, "curve at the smallest size inspected"),
-        Column("", "curve at the smallest size", _smallest_text),
+        Column("pod_at_smallest", "curve at the smallest size", _pod_at_smallest, "of those inspected", _share_text),
     ),
 )
-
-
-def _calls_text(limit: SetUpLimit) -> str:
-    calls, unseen = limit.false_calls, _unseen(limit)
-    if calls is None:
-        return text.UNKNOWN_TEXT
-    beside = "" if unseen is None else f", {unseen} without return"
-    return f"{text.many(calls.calls, 'call')} on {calls.area_m2:.3g} m²{beside}"
 
 
 def _unseen(limit: SetUpLimit) -> int | None:
@@ -88,14 +71,11 @@ def _unseen(limit: SetUpLimit) -> int | None:
     return None if unseen is None else int(unseen.sum())
 
 
-def _runs_text(runs: int) -> str:
-    return str(runs) if runs else "none: given"
-
-
 def _ends_text(rate: Estimate) -> str:
     return text.UNKNOWN_TEXT if np.isnan(rate.low) else text.interval(rate.low, rate.high)
 
 
+GIVEN = "hole-free runs that set it; 0: given"
 OVER_BOARDS = ("false_calls.rate_per_m2", "false_calls_interval_per_m2")
 THRESHOLDS = Table(
     "thresholds",
@@ -104,10 +84,13 @@ THRESHOLDS = Table(
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "in the detector's units"),
         Column("threshold_mm", "in mm", "record.threshold_mm", "times the mean scale"),
-        Column("calibration_runs", "calibration runs", "record.calibration_runs", "that set it; 0: given", _runs_text),
-        Column("", "false calls on other boards", _calls_text),
-        *(replace(column, label="per m² (95 %)" if column.label else "") for column in CALLS),
-        Column("no_return_calls", "", _unseen, "false calls without return"),
+        Column(
+            "calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or "none: given")
+        ),
+        replace(CALLS[0], label="per m² (95 %)"),
+        replace(CALLS[1], label="false calls on other boards"),
+        replace(CALLS[2], label="hole-free m²"),
+        Column("no_return_calls", "without return", _unseen, "false calls without return"),
         Column("over_boards_per_m2", "over boards (95 %)", OVER_BOARDS, "the rate, interval over boards", _ends_text),
     ),
 )
@@ -115,8 +98,7 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run whose highest score is a set-up's threshold: its board, the place of that score on it, its rank
-    among so many runs, and the highest score of all with its board."""
+    """The hole-free run whose highest score is a set-up's threshold, its rank, and the highest score of all."""
 
     limit: SetUpLimit
     board: int
@@ -145,10 +127,6 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
     return found
 
 
-def _rank_text(row: SetBy) -> str:
-    return f"{'highest' if row.rank == 1 else f'number {row.rank}'} of {row.runs}"
-
-
 SET_BY = Table(
     "threshold_runs",
     "one row per calibrated threshold: the hole-free finding that set it",
@@ -159,12 +137,10 @@ SET_BY = Table(
         Column("", "x, y on it (mm)", "place"),
         Column("x_mm", "", "x_mm", "place of the pixel with the highest score"),
         Column("y_mm", "", "y_mm", "likewise"),
-        Column("rank", "", "rank", "rank of the score among all calibration runs; 1: highest"),
-        Column("runs", "", "runs", "calibration runs"),
-        Column("", "of the runs", _rank_text),
-        Column("highest_score", "", "highest_score", "highest score of all runs"),
-        Column("highest_board", "", "highest_board", "its board"),
-        Column("", "highest of all", lambda one: f"{one.highest_score:.3g} on board {one.highest_board}"),
+        Column("rank", "rank", "rank", "rank of the score among all calibration runs; 1: highest"),
+        Column("runs", "of runs", "runs", "calibration runs"),
+        Column("highest_score", "highest of all", "highest_score", "highest score of all runs"),
+        Column("highest_board", "on board", "highest_board", "its board"),
     ),
 )
 
@@ -178,8 +154,7 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
             where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
             said.append(
                 f"{one.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
-                f"something other than noise sets it (calibration board {one.board}, {where}), and "
-                "the limit is that of it"
+                f"something other than noise sets it (calibration board {one.board}, {where}), and the limit with it"
             )
     return said
 
@@ -190,26 +165,20 @@ def threshold_note(record: StudyRecord) -> str:
         return "Thresholds were given, not calibrated: the rates beside them are what came of it."
     wanted = record.false_calls_per_m2
     return (
-        f"Calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on hole-free boards of their own, "
-        "never on those that are judged: the threshold is the lowest of their runs' highest scores that, by order "
-        "statistics (Wilks 1941), keeps to that rate. A threshold is itself an estimate: the rate on other boards "
-        "scatters about the wanted one."
+        f"Calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on hole-free boards of their own: the "
+        "threshold is the lowest of their runs' highest scores that, by order statistics (Wilks 1941), keeps to that "
+        "rate. It is itself an estimate: the rate on other boards scatters about the wanted one."
     )
 
 
-# ---------------------------------------------------------------- signals, operating points
-
-
-def _hits_bound(limit: SetUpLimit) -> Estimate:
-    return bound_estimate(limit, limit.a90_95)
-
-
-def _p_values(limit: SetUpLimit) -> dict[str, float]:
-    return {} if limit.signals is None else {what: p for what, p, _ in limit.signals.tests}
-
-
 def _tests(limit: SetUpLimit) -> dict[str, float]:
-    return {f"p: {what}": p for what, p in _p_values(limit).items()}
+    return {} if limit.signals is None else {f"p: {what}": p for what, p, _ in limit.signals.tests}
+
+
+def _against(limit: SetUpLimit) -> str:
+    """Return the assumptions of a regression that its tests speak against."""
+    assert limit.signals is not None
+    return ", ".join(f"{what} (p = {p:.2g})" for what, p, _ in limit.signals.tests if p < 1 - CONFIDENCE) or "nothing"
 
 
 SIGNALS = Table(
@@ -222,22 +191,11 @@ SIGNALS = Table(
         Column("a50_mm", "a50 (mm)", lambda one: Estimate(one.signals.a50, most=one.largest_mm), FOUND_50),
         Column("a90_mm", "a90 (mm)", lambda one: Estimate(one.signals.a90, most=one.largest_mm), FOUND_90),
         Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one, one.signals.bound), BOUND, bound_text),
-        Column("hits_a90_95_mm", "from hits: a90/95 (mm)", _hits_bound, "the same from hits", bound_text),
+        Column("hits_a90_95_mm", "from hits (mm)", lambda one: bound_estimate(one, one.a90_95), "same", bound_text),
         Column("p: <test>", "", _tests, "p-value of a test of what the regression takes for granted", spread=True),
+        Column("", "tests speak against", _against),
     ),
 )
-
-
-def signal_tests(limits: Sequence[SetUpLimit]) -> Grid | None:
-    """Return the p-values of what a regression takes for granted; * marks those that speak against it."""
-    tested = {
-        name_of(limit): {what: f"{p:.2g}{' *' if p < 1 - CONFIDENCE else ''}" for what, p in _p_values(limit).items()}
-        for limit in limits
-        if limit.signals is not None
-    }
-    names = list(dict.fromkeys(name for tests in tested.values() for name in tests))
-    rows = [(label, *(tests.get(name, text.UNKNOWN_TEXT) for name in names)) for label, tests in tested.items()]
-    return Grid.of(("set-up", *names), rows) if names else None
 
 
 def signal_notes(limits: Sequence[SetUpLimit]) -> list[str]:
@@ -249,22 +207,12 @@ def signal_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     return notes
 
 
-@dataclass(frozen=True)
-class OperatingRow:
+class OperatingRow(NamedTuple):
     """A class of sizes of a set-up; ``pixels`` stand in its first row."""
 
     limit: SetUpLimit
     roc: Roc | None
     pixels: PixelCurves | None
-
-
-def operating_rows(results: Sequence[SetUpResult]) -> list[OperatingRow]:
-    """Return the classes of sizes of all set-ups."""
-    return [
-        OperatingRow(one.limit, roc, None if k else one.pixels)
-        for one in results
-        for k, roc in enumerate(one.roc or (None,))
-    ]
 
 
 OPERATING = Table(
@@ -283,18 +231,13 @@ OPERATING = Table(
 
 
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
-    """Return what the areas are, and which of them could not be had."""
-    notes = [
-        f"AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
-        f"{PRO_LIMIT:g} and divided by it, as MVTec AD does; judged pixels of damaged boards. Intervals over boards."
-    ]
-    for result in results:
-        if result.pixels is not None and result.pixels.why:
-            notes.append(f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}.")
-    return notes
-
-
-# ---------------------------------------------------------------- axes, depths, known sizes
+    """Return what AU-PRO is, and of which set-ups it could not be had."""
+    said = (
+        "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
+        f"{PRO_LIMIT:g} and divided by it, as MVTec AD does. Intervals over boards."
+    )
+    without = [one for one in results if one.pixels is not None and one.pixels.why]
+    return [said, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,8 +289,7 @@ def axis_value(path: str, value: Any) -> str:
     return text.many(value, "frame") if path == FRAMES else value_text(path, value)
 
 
-@dataclass(frozen=True)
-class AxisRow:
+class AxisRow(NamedTuple):
     """One value of one line of an axis; ``step``: the change of a90 from the value before."""
 
     group: AxisGroup
@@ -387,9 +329,7 @@ AXES = Table(
         Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
         Column("", "value", lambda one: axis_value(one.group.path, one.value)),
         replace(SET_UP_OF, label=""),
-        Column(
-            "a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with its 95 % interval", interval=True
-        ),
+        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
         Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, likewise", interval=True),
         Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one.limit, one.limit.a90_95), BOUND, bound_text),
         Column("", "a90 over that above", _step_text),
@@ -444,72 +384,40 @@ SURFACES = Table(
         Column("deepest_mm", "", lambda one: one.surface.depth_range_mm[1], "greatest depth inspected"),
         Column("a90_shallow_mm", "a90 at the least (mm)", lambda one: _at_depth(one, 0), "there", interval=True),
         Column("a90_deep_mm", "a90 at the most (mm)", lambda one: _at_depth(one, -1), "there", interval=True),
-        Column(
-            "exponent", "a90 ~ depth to the power of", _exponent, "exponent of depth that a90 goes with", **EXPONENT
-        ),
+        Column("exponent", "a90 ~ depth to the power of", _exponent, "exponent of depth in a90", **EXPONENT),
         Column("interaction_p", "interaction, p", "surface.interaction_p", "p-value, of diameter and depth"),
     ),
 )
 
 
-@dataclass(frozen=True)
-class KnownSize:
-    """POD of one set-up at a known hole; ``number`` of the hole."""
+class KnownSize(NamedTuple):
+    """POD of one set-up at a known hole: its number, its row, the bounds of its POD."""
 
     limit: SetUpLimit
     number: int
     row: SizeRow
-
-    @property
-    def ends(self) -> Interval:
-        """The bounds of its POD."""
-        return Interval(self.row.lower, self.row.upper)
+    ends: Interval
 
 
-def known_sizes(results: Sequence[SetUpResult]) -> list[KnownSize]:
-    """Return POD at the sizes asked for, set-up by set-up."""
-    return [KnownSize(one.limit, k + 1, row) for one in results for k, row in enumerate(one.sizes)]
+def _pod_text(pod: Estimate) -> str:
+    ends = f" ({text.percent(pod.low)} to {text.percent(pod.high)})"
+    return text.UNKNOWN_TEXT if np.isnan(pod.value) else f"{text.percent(pod.value)} %{ends}"
 
 
-POD_OF_SIZE = ("row.pod", "ends")
 SIZES = Table(
     "known_sizes",
     "one row per set-up, number of frames and hole of the thesis' board: probability of detection at its diameter",
     (
         SET_UP_OF,
-        Column("hole", "", "number", "number of the hole"),
-        Column("diameter_mm", "", "row.diameter_mm", "its diameter"),
-        Column("pod", "", POD_OF_SIZE, "from the curve, with one-sided 95 % bounds by the likelihood ratio"),
-        Column("extrapolated", "", "row.extrapolated", "outside the sizes inspected"),
-        Column("near", "", "row.near", "targets within 10 % of the diameter"),
-        Column("near_rate", "", ("row.near_rate", "row.near_interval"), "share of them found (Clopper and Pearson)"),
+        Column("hole", "hole", "number", "number of the hole"),
+        Column("", "drill", lambda one: text.inches(one.row.diameter_mm)),
+        Column("diameter_mm", "mm", "row.diameter_mm", "its diameter"),
+        Column("pod", "POD (95 %)", ("row.pod", "ends"), "from the curve, with one-sided 95 % bounds", _pod_text),
+        Column("extrapolated", "outside", "row.extrapolated", "outside the sizes inspected"),
+        Column("near", "targets near", "row.near", "targets within 10 % of the diameter"),
+        Column("near_rate", "found", ("row.near_rate", "row.near_interval"), "share of them found", _pod_text),
     ),
 )
-
-
-def size_grids(results: Sequence[SetUpResult]) -> Iterator[Grid]:
-    """Yield POD at known sizes, holes down and at most `MOST_COLUMNS` set-ups across; nothing without sizes."""
-    shown = [one for one in results if one.sizes]
-    for first in range(0, len(shown), MOST_COLUMNS):
-        part = shown[first : first + MOST_COLUMNS]
-        rows = []
-        for number, line in enumerate(zip(*(one.sizes for one in part), strict=True), 1):
-            size_mm = line[0].diameter_mm
-            rows.append(
-                (str(number), text.inches(size_mm) or "–", f"{size_mm:.2f}", *(_size_text(one) for one in line))
-            )
-        yield Grid.of(("hole", "drill", "mm", *(name_of(one.limit) for one in part)), rows)
-
-
-def _size_text(row: SizeRow) -> str:
-    near = f"{100 * row.near_rate:.0f} % of {row.near} near" if row.near else "none near"
-    if np.isnan(row.pod):
-        return f"no curve ({near})"
-    outside = " outside" if row.extrapolated else ""
-    ends = f"{text.percent(row.lower)} to {text.percent(row.upper)}"
-    return f"{text.percent(row.pod)} % ({ends}){outside}; {near}"
-
-
 STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, SIZES)
 
 
@@ -522,8 +430,16 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
         SET_BY: set_by(limits),
         CHANCE: [one for one in set_ups if one.chance is not None],
         SIGNALS: [one for one in limits if one.signals is not None],
-        OPERATING: operating_rows(set_ups),
+        OPERATING: [
+            OperatingRow(one.limit, roc, None if k else one.pixels)
+            for one in set_ups
+            for k, roc in enumerate(one.roc or (None,))
+        ],
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         SURFACES: [one for one in set_ups if one.surface is not None],
-        SIZES: known_sizes(set_ups),
+        SIZES: [
+            KnownSize(one.limit, number, row, Interval(row.lower, row.upper))
+            for one in set_ups
+            for number, row in enumerate(one.sizes, 1)
+        ],
     }

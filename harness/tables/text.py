@@ -1,16 +1,22 @@
-"""Numbers as text, for all tables, pages and terminals: sizes in mm, shares, intervals, p-values, dashes."""
+"""Numbers and tables as text: for a terminal with colours, for plain lines and for a page."""
 
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from markupsafe import Markup
+    from rich.table import Table as RichTable
+
 UNKNOWN_TEXT = "–"
 INCHES = {n: str(Fraction(n, 16)) for n in (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)}
-"""Drills by sixteenths of an inch."""
 
 
 def plain(value: Any) -> str:
@@ -27,30 +33,24 @@ def mm(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else UNKNOWN_TEXT
 
 
-def plus_minus(mean: float, std: float) -> str:
-    """Return ``3.20 ± 0.10``, or a dash where the mean is unknown."""
-    return UNKNOWN_TEXT if np.isnan(mean) else f"{mean:.2f}\u00a0±\u00a0{std:.2f}"
+def plus_minus(mean: float, std: float, sign: str = "") -> str:
+    """Return ``3.20 ± 0.10``, or a dash where the mean is unknown; ``sign``: "+" for differences."""
+    text = f"{mean:{sign}.2f}".replace("-", "−") + ("" if np.isnan(std) else f"\u00a0±\u00a0{std:.2f}")
+    return UNKNOWN_TEXT if np.isnan(mean) else text
 
 
 def size(value: float, most: float = np.inf) -> str:
-    """Return a size in mm: two decimals below 100 mm, as many as a drill's size has; ``> 15.9`` beyond ``most``, the
-    largest size inspected; ``none`` for NaN."""
-    if np.isnan(value):
-        return "none"
-    if value > most:
-        return f">\u00a0{most:.3g}"
-    if np.isinf(value):
-        return "∞"
-    return f"{value:.2f}" if abs(value) < 100 else f"{value:.3g}"
+    """Return a size in mm; ``> 15.9`` beyond ``most``, the largest size inspected; ``none`` for NaN."""
+    if np.isnan(value) or value > most:
+        return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
+    return "∞" if np.isinf(value) else f"{value:.2f}" if abs(value) < 100 else f"{value:.3g}"
 
 
 def percent(share: float) -> str:
     """Return ``93`` for 0.93; near 0 and 1 with a decimal, since a whole number would say impossible or certain."""
     value = 100 * share
-    if np.isnan(value):
-        return UNKNOWN_TEXT
-    if 1 <= value <= 99:
-        return f"{value:.0f}"
+    if np.isnan(value) or 1 <= value <= 99:
+        return UNKNOWN_TEXT if np.isnan(value) else f"{value:.0f}"
     return "< 0.1" if value < 0.05 else "> 99.9" if value > 99.95 else f"{value:.1f}"
 
 
@@ -72,11 +72,6 @@ def with_interval(value: float, low: float, high: float, digits: int = 2, most: 
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
         return text
     return f"{text} ({interval(low, high, digits, most)})"
-
-
-def bounded(value: float, low: float, high: float, digits: int = 2) -> str:
-    """Return ``0.50 (0.37 to 0.63)``; a dash where the estimate is unknown."""
-    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})" if np.isfinite(value) else UNKNOWN_TEXT
 
 
 def many(count: int, what: str) -> str:
@@ -103,3 +98,122 @@ def inches(diameter_mm: float) -> str:
 
 def _number(value: float, digits: int, most: float) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) and not value > most else size(value, most)
+
+
+Tone = Literal["", "good", "key", "bad", "open", "changed"]
+COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
+"""Colours of a terminal; the text says the same without them."""
+MOST_WIDE = 14
+CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell's text, and how it is meant. On a page ``share`` (0 to 1) shades it, and what follows a line's end or, in
+    columns of numbers, `` (`` stands below in small letters."""
+
+    text: str
+    tone: Tone = ""
+    share: float | None = None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Rows of cells below their ``heads``; the first ``left`` columns are flush left. ``kind``: its class on a page."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    left: int = 1
+    title: str = ""
+    kind: str = "limits"
+
+    @staticmethod
+    def of(
+        heads: Iterable[str], rows: Iterable[Iterable[object]], left: int = 1, title: str = "", kind: str = "limits"
+    ) -> Grid:
+        """Make a grid of cells, or of what stands in them as text."""
+        cells = tuple(tuple(one if isinstance(one, Cell) else Cell(str(one)) for one in row) for row in rows)
+        return Grid(tuple(heads), cells, left, title, kind)
+
+    def lines(self) -> list[str]:
+        """Return plain lines, columns below each other."""
+        lines = [self.heads, *([cell.text for cell in row] for row in self.rows)]
+        widths = [max(len(line[place]) for line in lines) for place in range(len(self.heads))]
+        signs = "<" * self.left + ">" * len(self.heads)
+        return [
+            "  ".join(f"{text:{sign}{width}}" for text, sign, width in zip(line, signs, widths, strict=False)).rstrip()
+            for line in lines
+        ]
+
+    def rich(self) -> RichTable:
+        """Return the table for a terminal; without a box, so that many columns fit 80 characters."""
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(title=self.title or None, box=None, pad_edge=False, collapse_padding=True)
+        for place, head in enumerate(self.heads):
+            justify: Literal["left", "right"] = "left" if place < self.left else "right"
+            table.add_column(head, justify=justify, no_wrap=place > 0, overflow="fold")
+        for row in self.rows:
+            table.add_row(*(Text(cell.text, style=COLOURS.get(cell.tone, "")) for cell in row))
+        return table
+
+    def html(self) -> Markup:
+        """Return the table for a page: the first cell of a row is its head, an interval stands below its estimate."""
+        from markupsafe import Markup
+
+        number = [Markup("" if place < self.left else ' class="n"') for place in range(len(self.heads))]
+        heads = Markup("").join(
+            Markup("<th{}>{}</th>").format(kind, head) for kind, head in zip(number, self.heads, strict=True)
+        )
+        rows = []
+        for row in self.rows:
+            cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]
+            cells += [_data_cell(cell, place >= self.left) for place, cell in enumerate(row[1:], 1)]
+            rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
+        kind = f"{self.kind} dense" if len(self.heads) > MOST_WIDE else self.kind
+        table = '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
+        return Markup(table).format(kind, heads, Markup("\n").join(rows))
+
+
+def _data_cell(cell: Cell, is_number: bool) -> Markup:
+    from markupsafe import Markup, escape
+
+    large, newline, small = cell.text.partition("\n")
+    bracket = ""
+    if is_number and not newline:
+        large, bracket, small = cell.text.partition(" (")
+    below = Markup(" <small>{}{}</small>").format(bracket.strip(), small) if small else Markup("")
+    style = Markup("")
+    if cell.share is not None:
+        weight = 0.06 + 0.94 * cell.share
+        red, green, blue = (round(255 + (channel - 255) * weight) for channel in (0, 94, 156))
+        ink = "#fff" if cell.share > 0.72 else "#1d2530"
+        style = Markup(' style="background:rgb({},{},{});color:{}"').format(red, green, blue, ink)
+    kinds = ("n" if is_number else "", CLASSES.get(cell.tone, ""), "" if cell.share is None else "rate")
+    kind = " ".join(filter(None, kinds))
+    named = Markup(' class="{}"').format(kind) if kind else Markup("")
+    return Markup("<td{}{}>{}{}</td>").format(named, style, escape(large), below)
+
+
+def text_of(parts: Iterable[str | Grid]) -> str:
+    """Return tables and sentences as plain lines."""
+    return "\n".join(line for part in parts for line in (part.lines() if isinstance(part, Grid) else [part]))
+
+
+def show(parts: Sequence[str | Grid]) -> None:
+    """Print tables and sentences: in colour at a terminal that is wide enough, else as plain lines."""
+    if not sys.stdout.isatty():
+        print(text_of(parts))
+        return
+    from rich.console import Console
+
+    console = Console()
+    for part in parts:
+        if isinstance(part, str):
+            console.print(part, markup=False, highlight=False)
+            continue
+        table = part.rich()
+        # rich would cut the numbers on a narrow terminal; wrapped lines can still be read
+        fits = console.measure(table, options=console.options.update(max_width=1000)).maximum <= console.width
+        console.print(table) if fits else print(text_of([part]))

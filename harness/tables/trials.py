@@ -1,16 +1,19 @@
 """Tables of trials: what each trial measured, and the summaries of experiments that are no study.
 
-Columns are declared by name and note alone; their values come from the rows that trials leave
-(`harness.engine.trial`), and from `harness.evaluation`. Every table but those of a study may have a further column for
-each axis of the experiment other than the number of frames, named by its dotted path.
+Columns are declared by name and note alone; their values come from `harness.engine.trial` and `harness.evaluation`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
+from harness.tables import outputs, text
 from harness.tables.schema import Column, Table
+from harness.tables.text import Cell, Tone
+from harness.vocabulary.provenance import RESULTS_VERSION
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,6 +21,18 @@ if TYPE_CHECKING:
 
 def _columns(**notes: str) -> tuple[Column, ...]:
     return tuple(Column(name, note=note) for name, note in notes.items())
+
+
+def _fine(value: float | None) -> str:
+    return text.UNKNOWN_TEXT if value is None else text.mm(value, 3)
+
+
+def _percent(share: float | None) -> str:
+    return text.UNKNOWN_TEXT if share is None or math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def _word(name: str | None) -> str:
+    return name or "as declared"
 
 
 COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat="number of the draw of noise")
@@ -45,6 +60,28 @@ SIZES = _columns(
     model_error_mm="distance from the true centre by the model",
     model_note="what the fit says of itself",
 )
+STATISTICS = {
+    "measured": "trials with a finite diameter",
+    "diameter_mean_mm": "mean diameter",
+    "diameter_std_mm": "its standard deviation",
+    "offset_mean_mm": "mean distance from the largest hole",
+    "offset_std_mm": "its standard deviation",
+    "offset_bias_mm": "mean less the true distance",
+    "offset_measured": "trials with a distance",
+}
+BY = (("extent", "the thesis' measure"), ("model", "the model"))
+ERRORS = {
+    "extent": "size, extent (mm)",
+    "model": "size, model (mm)",
+    "extent_place": "position, extent (mm)",
+    "model_place": "position, model (mm)",
+}
+COVERED = "share of fits within 1.96 of their own standard errors of the truth"
+MARKS: dict[str, tuple[str, Tone]] = {
+    "borne out": ("✓", "good"),
+    "not borne out": ("✗", "bad"),
+    "undecided": ("?", "open"),
+}
 LAGS = tuple(f"correlation_{way}{lag}" for way in "uv" for lag in (1, 2, 3))
 
 TRIALS = Table(
@@ -210,38 +247,61 @@ PIXELS = Table(
     ("variant", "frames", "board", "repeat"),
     ("parquet",),
 )
+
+
+def _mean(of: str, label: str) -> Column:
+    """Return a page's column of a mean with its standard deviation."""
+    return Column("", label, lambda row: text.plus_minus(row[f"{of}_mean_mm"], row[f"{of}_std_mm"]))
+
+
+def _error(of: str, label: str) -> Column:
+    """Return a page's column of a mean error with its standard deviation and number."""
+
+    def error(row: Mapping[str, Any]) -> str:
+        count = int(row[f"{of}_n"])
+        return f"{text.plus_minus(row[f'{of}_bias_mm'], row[f'{of}_std_mm'], '+')} ({count})" if count else "–"
+
+    return Column("", label, error)
+
+
+def _pitch(row: Mapping[str, Any]) -> str:
+    return " × ".join(text.mm(row.get(f"pitch_{way}_mm", math.nan)) for way in "uv")
+
+
+def _found(row: Mapping[str, Any]) -> Cell:
+    """Return the number of holes found, and their names where there are few enough to read."""
+    from harness.evaluation.summary import hole_list
+
+    names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
+    undecided = hole_list(row["undecided"]) if row["holes"] <= MOST_NAMES else str(len(row["undecided"]))
+    said = "; ".join(part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part)
+    return Cell(f"{len(row['found'])} of {row['holes']}\n{said}".strip(), share=len(row["found"]) / row["holes"])
+
+
+MOST_NAMES = 15
+"""Holes up to which a cell lists them by name; beyond it their number and the limit say more."""
+CALLS_OF = Column(
+    "", "false calls", lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–"
+)
 SUMMARY = Table(
     "summary",
     "one row per set-up, number of frames and hole, with 95 % intervals; means are over the trials that detected it",
     (
-        *(*COMMON[:2], *_columns(hole="number of the hole"), *TRUTH),
+        *COMMON[:2],
+        Column("hole", "hole", note="number of the hole"),
+        *(replace(one, label={"true_diameter_mm": "true (mm)"}.get(one.name, "")) for one in TRUTH),
+        *_columns(n="trials", detected="trials that detected it"),
+        Column("rate", note="their share, with Wilson's interval", interval=True),
+        *_columns(status="found, missed or undecided: the interval lies above, below or about 0.5"),
+        _mean("extent_diameter", "extent (mm)"),
+        _mean("model_diameter", "model (mm)"),
+        *(Column(f"{of}_{name}", note=f"{note} ({by})") for of, by in BY for name, note in STATISTICS.items()),
+        *(Column(f"{of}_bias_mm", note=f"mean diameter less the true ({by})", interval=True) for of, by in BY),
+        *(Column(f"{of}_error_mean_mm", f"centre off, {of} (mm)", note="mean distance from it") for of, _ in BY),
+        Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error as the fits state it"),
+        Column("model_diameter_covered", "truth within 1.96 of it", None, COVERED, _percent),
+        Column("model_depth_mean_mm", "depth (mm)", note="mean depth of the model"),
         *_columns(
-            n="trials",
-            detected="trials that detected it",
-            rate="their share, with Wilson's interval (rate_low, rate_high)",
-            rate_low="lower end",
-            rate_high="upper end",
-            status="found, missed or undecided: the interval lies above, below or about 0.5",
-            **{
-                f"{measure}_{name}": f"{note} ({by})"
-                for measure, by in (("extent", "the thesis' measure"), ("model", "the model"))
-                for name, note in (
-                    ("measured", "trials with a finite diameter"),
-                    ("diameter_mean_mm", "mean diameter"),
-                    ("diameter_std_mm", "its standard deviation"),
-                    ("bias_mm", "mean diameter less the true diameter"),
-                    ("bias_low_mm", "lower end of Student's interval"),
-                    ("bias_high_mm", "upper end"),
-                    ("offset_mean_mm", "mean distance from the largest hole"),
-                    ("offset_std_mm", "its standard deviation"),
-                    ("offset_bias_mm", "mean less the true distance"),
-                    ("offset_measured", "trials with a distance"),
-                    ("error_mean_mm", "mean distance from the true centre"),
-                )
-            },
-            model_diameter_se_mean_mm="mean standard error as the fits state it",
-            model_diameter_covered="share of fits within 1.96 of their own standard errors of the truth",
-            model_depth_mean_mm="mean depth of the model",
             model_depth_std_mm="its standard deviation",
             model_depth_se_mean_mm="mean standard error as the fits state it",
             model_depth_bias_mm="mean depth less the depth seen",
@@ -261,17 +321,17 @@ NOISE_BY_FRAMES = Table(
     "noise_by_frames",
     "one row per set-up and number of frames: parts of the error over the sample pixels",
     (
-        *COMMON[:2],
-        *_columns(
-            pixels="pixels",
-            repeats="repeats",
-            temporal_rms_mm="root mean square of the standard deviation over repeats",
-            offset_mm="mean error",
-            pattern_mm="standard deviation over pixels of the mean error",
-            systematic_mm="offset and pattern together",
-            total_rms_mm="temporal and systematic together",
-            displacement_mm="standard deviation of whole clouds, in no other column",
-            guide_mm="the shortest average's noise falling as 1/sqrt(N)",
+        COMMON[0],
+        Column("frames", "frames", note="frames averaged"),
+        *_columns(pixels="pixels", repeats="repeats"),
+        Column("temporal_rms_mm", "temporal noise (mm)", None, "root mean square of the deviation over repeats", _fine),
+        Column("guide_mm", "1/√N guide (mm)", None, "the shortest average's noise falling as 1/sqrt(N)", _fine),
+        Column("offset_mm", "offset (mm)", None, "mean error", lambda mm: f"{mm:+.3f}"),
+        Column("pattern_mm", "pattern (mm)", None, "standard deviation over pixels of the mean error", _fine),
+        Column("systematic_mm", "systematic (mm)", None, "offset and pattern together", _fine),
+        Column("total_rms_mm", "total (mm)", None, "temporal and systematic together", _fine),
+        Column(
+            "displacement_mm", "whole cloud displaced (mm)", None, "deviation of whole clouds, not in others", _fine
         ),
     ),
 )
@@ -279,116 +339,123 @@ FALSE_CALLS = Table(
     "false_calls",
     "one row per set-up, number of frames and role of the board",
     (
-        *(*COMMON[:2], *ROLE),
-        *_columns(
-            runs="runs judged at a threshold",
-            false_calls="false calls",
-            threshold="mean threshold",
-            threshold_mm="mean of threshold times scale",
-            surface_noise_mm="mean deviation from the fitted surface",
-            quiet_runs="hole-free runs",
-            quiet_highest="highest of their quiet thresholds",
-            per_run="false calls a run, with Garwood's interval (per_run_low, per_run_high)",
-            per_run_low="lower end",
-            per_run_high="upper end",
-        ),
+        Column("variant", "set-up", note="name of the set-up"),
+        Column("frames", "frames", note="frames averaged"),
+        Column("role", "board", note=ROLE[0].note, text=lambda role: role.replace("_", "-")),
+        CALLS_OF,
+        *_columns(runs="runs judged at a threshold", false_calls="false calls"),
+        Column("per_run", "per run (95 %)", note="false calls a run, with Garwood's interval", interval=True),
+        Column("threshold", "threshold (k)", note="mean threshold"),
+        Column("threshold_mm", "threshold (mm)", note="mean of threshold times scale"),
+        Column("surface_noise_mm", "surface noise (mm)", None, "mean deviation from the fitted surface", _fine),
+        Column("quiet_runs", "hole-free runs", note="hole-free runs"),
+        Column("quiet_highest", "highest quiet k", note="highest of their quiet thresholds"),
     ),
 )
 SET_UPS = Table(
     "set_ups",
     "one row per set-up and number of frames: holes found, errors of size and place, noise, threshold",
     (
-        *COMMON[:2],
+        Column("variant", "set-up", note="name of the set-up"),
+        Column("registration", "registration", note="of maps: method of registration", text=_word),
+        Column("merge", "merge", note="of maps: how views are merged", text=_word),
+        Column("views", "views", note="of maps: number of views"),
+        Column("frames", "frames", note="frames averaged"),
+        *_columns(holes="holes", repeats="repeats", found="holes found", undecided="holes undecided"),
+        Column("", "found", _found),
+        Column("limit_mm", "from (mm)", note="smallest diameter from which on all are found"),
+        Column("half_mm", "50 % size (mm)", note="50 % size, with its interval", interval=True, brief=False),
+        *(_error(of, label) for of, label in ERRORS.items()),
+        *(
+            Column(f"{of}_{name}", note=f"{note} of errors over found holes: {label.removesuffix(' (mm)')}")
+            for of, label in ERRORS.items()
+            for name, note in (("bias_mm", "mean"), ("std_mm", "standard deviation"), ("n", "number"))
+        ),
+        Column("", "mm per pixel", _pitch),
+        Column("valid_share", "valid", note=NOISE.columns[3].note, text=_percent),
+        *NOISE.columns[4:6],
+        Column("single_frame_mm", "one frame (mm)", note=NOISE.columns[6].note),
+        Column("temporal_mm", "average (mm)", None, "temporal noise of the averaged z", _fine),
+        Column("offset_mm", "offset (mm)", None, "mean error of z", _fine),
+        Column("pattern_mm", "pattern (mm)", None, "standard deviation over pixels of the mean error", _fine),
+        *NOISE.columns[7:],
+        Column("surface_mm", "surface noise (mm)", None, "robust deviation from the fitted surface", _fine),
+        Column("threshold", "threshold (k)", note="mean threshold"),
+        Column("threshold_mm", "threshold (mm)", note="mean of threshold times scale"),
+        CALLS_OF,
         *_columns(
-            holes="holes",
-            repeats="repeats",
-            found="holes found",
-            undecided="holes undecided",
-            limit_mm="smallest diameter from which on all are found",
-            half_mm="50 % size, with its interval (half_low_mm, half_high_mm)",
-            temporal_mm="temporal noise of the averaged z",
-            offset_mm="mean error of z",
-            pattern_mm="standard deviation over pixels of the mean error",
-            surface_mm="robust deviation from the fitted surface",
-            threshold="mean threshold",
-            threshold_mm="mean of threshold times scale",
             false_calls="false calls on the damaged board",
             runs="runs on it",
-            half_low_mm="lower end of its interval",
-            half_high_mm="upper end",
-            **{
-                f"{measure}{of}_{name}": f"{note} of {what} of found holes ({by})"
-                for measure, by in (("extent", "the thesis' measure"), ("model", "the model"))
-                for of, what in (("", "diameters"), ("_place", "distances from the largest hole"))
-                for name, note in (("bias_mm", "mean error"), ("std_mm", "standard deviation"), ("n", "number"))
-            },
-        ),
-        *NOISE.columns[3:],
-        *_columns(
-            views="of maps: number of views",
-            registration="of maps: method of registration",
-            merge="of maps: how views are merged",
             place="of maps: values on the other axes",
             is_variation="whether it varies another set-up",
             reference="that set-up",
-            views_left_out="of maps: mean number of views left out",
-            seconds_map="of maps: median time of making the map",
             surface_std_mm="of maps: standard deviation over runs of the surface's deviation",
         ),
+        Column("views_left_out", "views left out", note="of maps: mean number of views left out"),
+        Column("seconds_map", "time (s)", note="of maps: median time of making the map"),
     ),
+    title="holes found, and the smallest diameter from which on all are",
 )
 REGISTRATION_ERRORS = Table(
     "registration_errors",
     "one row per method of registration, number of frames and number of views",
-    _columns(
-        method="method of registration",
-        frames="frames averaged",
-        views="views of the map",
-        n="registrations",
-        failed="registrations that failed",
-        failed_share="their share",
-        failed_low="lower end of Wilson's interval of the share",
-        failed_high="upper end",
-        reasons="commonest reasons",
-        converged_share="share that converged",
-        guess_mm="median error of the starting guess",
-        seconds="median time",
-        iterations="median number of iterations",
-        overlap="median share of points with a partner",
-        pairs="median number of pairs",
-        marks="median number of marks trusted",
-        **{
-            f"{part}_{name}": f"{note} {where}"
-            for part, where in (("in_plane", "in the board's plane"), ("across", "across the plane"))
-            for name, note in (
-                ("median_mm", "median error"),
-                ("q90_mm", "90 % quantile of the error"),
-                ("rms_mm", "root mean square error"),
-                ("predicted_mm", "error that the covariances predict"),
-                ("ratio", "actual over predicted error (1: honest, above: too sure)"),
-                ("ratio_low", "lower end of its interval"),
-                ("ratio_high", "upper end"),
+    (
+        Column("method", "method", note="method of registration"),
+        Column("frames", "frames", note="frames averaged"),
+        Column("views", "views", note="views of the map"),
+        Column("n", "number", note="registrations"),
+        Column("failed", "failed", note="registrations that failed"),
+        *_columns(
+            failed_share="their share",
+            failed_low="lower end of Wilson's interval of the share",
+            failed_high="upper end",
+            converged_share="share that converged",
+        ),
+        Column("guess_mm", "before (mm)", note="median error of the starting guess"),
+        *(
+            column
+            for part, label in (("in_plane", "in plane"), ("across", "across"))
+            for column in (
+                Column(f"{part}_median_mm", f"{label}: median", note="median error"),
+                Column(f"{part}_q90_mm", note="90 % quantile of the error"),
+                Column(f"{part}_rms_mm", "rms", note="root mean square error"),
+                Column(f"{part}_predicted_mm", "predicted", note="error that the covariances predict"),
+                Column(f"{part}_ratio", "ratio", note="actual over predicted error (1: honest)", interval=True),
             )
-        },
+        ),
+        *_columns(
+            iterations="median number of iterations",
+            overlap="median share of points with a partner",
+            pairs="median number of pairs",
+            marks="median number of marks trusted",
+        ),
+        Column("seconds", "time (s)", note="median time"),
+        Column("reasons", "why it failed", note="commonest reasons", text=lambda reasons: "; ".join(reasons) or "–"),
     ),
 )
 CLAIMS = Table(
     "claims",
     "one row per claim of the thesis",
-    _columns(
-        claim="number of the claim",
-        text="the claim",
-        verdict="borne out, not borne out or undecided",
-        evidence="numbers behind the verdict",
-        rule="criterion fixed beforehand",
+    (
+        Column("claim", "claim", note="number of the claim"),
+        Column("text", "says", note="the claim"),
+        Column(
+            "verdict",
+            "verdict",
+            note="borne out, not borne out or undecided",
+            text=lambda verdict: f"{MARKS[verdict][0]} {verdict}",
+            tone=lambda row: MARKS[row["verdict"]][1],
+        ),
+        Column("evidence", "evidence", note="numbers behind the verdict"),
+        Column("rule", "criterion", note="criterion fixed beforehand"),
     ),
     formats=("csv",),
+    left=5,
+    kind="claims",
 )
 STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, WALLS, SITES, FINDINGS, OPERATING, PIXELS)
-"""Tables of trials in the order in which a sweep writes them."""
 STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
 SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS)
-"""Tables of an experiment that is no study, made of those."""
 
 
 def _empty() -> pd.DataFrame:
@@ -400,11 +467,8 @@ def _empty() -> pd.DataFrame:
 @dataclass(frozen=True)
 class ResultTables:
     """Tables of trials as declared above, ``holes`` being `TRIALS`; a table that an experiment lacks is empty.
-
-    ``variants``: one row per set-up, then per variation: variant, reason, settings (JSON text), is_variation, reference
-    (the set-up to compare with, or empty), switches (JSON text, or empty), and the axes. ``axes``: path, name, unit of
-    what tells set-ups apart, in their order.
-    """
+    ``variants``: per set-up, then per variation: variant, reason, settings, is_variation, reference, switches, and the
+    axes. ``axes``: path, name, unit of what tells set-ups apart, in their order."""
 
     holes: pd.DataFrame
     runs: pd.DataFrame
@@ -422,3 +486,48 @@ class ResultTables:
     def stored(self) -> dict[Table, pd.DataFrame]:
         """Return the tables that are written, in their order."""
         return {table: getattr(self, "holes" if table is TRIALS else table.name) for table in STORED}
+
+
+# ---------------------------------------------------------------- real captures
+
+FINDINGS_VERSION = 2
+"""Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
+FINDINGS_OF_CAPTURE = Table(
+    outputs.FINDINGS.name.removesuffix(".csv"),
+    outputs.FINDINGS.note,
+    (
+        Column("id", "", "id", "number, strongest first"),
+        Column("kind", "", "kind", "hole (behind the surface), bump (before it) or no return"),
+        Column("u_px", "", "u_px", "column of its middle"),
+        Column("v_px", "", "v_px", "row of its middle"),
+        Column("x_mm", "", "x_mm", "centre in the camera's frame, to the right"),
+        Column("y_mm", "", "y_mm", "likewise, down"),
+        Column("z_mm", "", "z_mm", "likewise, away"),
+        Column("diameter_mm", "", "diameter_mm", "diameter, of the model where it fits"),
+        Column("depth_mm", "", "depth_mm", "depth, negative of a bump"),
+        Column("volume_mm3", "", "volume_mm3", "volume behind the surface"),
+        Column("points", "", "points", "points of the cluster"),
+        Column("score", "", "score", "the detector's score"),
+        Column("findings_version", "", lambda finding: FINDINGS_VERSION, "version of the table's meaning"),
+    ),
+    formats=("csv",),
+    always=True,
+    digits="%.4f",
+)
+POINTS_OF_CAPTURES = Table(
+    outputs.CAPTURES.name.removesuffix(".csv"),
+    outputs.CAPTURES.note,
+    (
+        Column("point", note="folder of its findings"),
+        Column("variant", note="name of the set-up"),
+        Column("what", note="the set-up with its frames"),
+        Column("frames_used", note="frames in the average"),
+        Column("frames_left_out", note="frames left out as disturbed"),
+        Column("threshold_k", note="threshold in the detector's units"),
+        Column("threshold_mm", note="the same in mm"),
+        Column("findings", note="findings"),
+        Column("results_version", "", lambda row: RESULTS_VERSION, "version of the results"),
+    ),
+    formats=("csv",),
+    always=True,
+)

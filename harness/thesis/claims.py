@@ -1,23 +1,74 @@
-"""The claims on one view (C1 to C6, C9): one rule each, the same for every run, and their verdicts by variant."""
+"""The claims on one view (C1 to C6, C9) and on cameras (C11): one rule each, the same for every run.
+
+A verdict needs certainty in either direction: where an interval leaves room for both, it is "undecided". No rule is a
+parameter of the experiment, and none is chosen to make a claim come out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
-from harness.evaluation.maps import span
-from harness.evaluation.noise import noise_law
-from harness.evaluation.profile import AveragedCloud, hole_shapes
-from harness.evaluation.summary import MAIN, Measure, found_holes, hole_list, summarise_holes, with_columns
+from harness.evaluation.maps import MANY, span
+from harness.evaluation.profile import hole_shapes
+from harness.evaluation.summary import MAIN, found_holes, hole_list, noise_law, summarise_holes, with_columns
 from harness.tables.trials import ResultTables
-from harness.thesis.verdicts import FEW, MANY, Answer, Rules, Verdict, decide, is_above_zero, rule_of
+from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:
     import pandas as pd
+
+Answer = Literal["borne out", "not borne out", "undecided"]
+FEW = 1
+"""The smaller of the numbers of frames that the thesis' claims speak of; `harness.evaluation.maps.MANY` the greater."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim, what the data say about it, the numbers behind that, and the criterion fixed beforehand."""
+
+    claim: str
+    text: str
+    verdict: Answer
+    evidence: str
+    rule: str
+
+
+Rules = dict[str, Callable[[Any], Verdict]]
+
+
+def rule_of(rules: Rules, claim: str, text: str, rule: str) -> Callable[[Callable[[Any], tuple[Answer, str]]], None]:
+    """Enter a function from a case to (answer, evidence) among ``rules``, as one from a case to a verdict."""
+
+    def enter(judge: Callable[[Any], tuple[Answer, str]]) -> None:
+        rules[claim] = lambda case: Verdict(claim, text, *judge(case), rule)
+
+    return enter
+
+
+def decide(parts: Iterable[bool | None]) -> Answer:
+    """All parts hold: borne out. One fails: not borne out. Else undecided."""
+    values = list(parts)
+    if any(value is False for value in values):
+        return "not borne out"
+    return "borne out" if values and all(value is True for value in values) else "undecided"
+
+
+def is_above_zero(interval: Interval) -> bool | None:
+    """Return whether a difference is surely above zero; None where its interval has room for both."""
+    return True if interval.above(0) else (False if interval.high <= 0 else None)
+
+
+def claims_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """The table of claims.csv: one row for each verdict with the fields of `Verdict`."""
+    import pandas as pd
+
+    return pd.DataFrame([asdict(verdict) for verdict in verdicts], columns=[one.name for one in fields(Verdict)])
+
 
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
 FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_HOLES[4:])
@@ -31,32 +82,23 @@ FEWEST_RANKED = 4
 """Holes below which even a perfect order has a chance above 1 in 20."""
 
 
-class Example(AveragedCloud, Protocol):
-    """An averaged cloud that knows which variant and how many frames it shows."""
-
-    @property
-    def frames(self) -> int: ...
-    @property
-    def variant(self) -> str: ...
-
-
 @dataclass(frozen=True)
 class Case:
-    """The tables of one variant that rules judge by; every table holds this variant's rows only."""
+    """The tables of one variant that rules judge by, and its averaged clouds."""
 
     variant: str
     summary: pd.DataFrame
     holes: pd.DataFrame
     runs: pd.DataFrame
     probes: pd.DataFrame
-    examples: Sequence[Example] = ()
+    examples: Sequence[Any] = ()
 
     def found_with_many(self) -> pd.DataFrame:
         """Summary rows of the holes found with `MANY` frames."""
         return self.summary[(self.summary["frames"] == MANY) & (self.summary["status"] == "found")]
 
 
-RULES: Rules[Case] = {}
+RULES: Rules = {}
 
 
 @rule_of(
@@ -65,8 +107,7 @@ RULES: Rules[Case] = {}
     "With 50 averaged frames the holes of 1/4 in and larger (4 to 11) are found.",
     "Borne out when, with 50 frames, holes 4 to 11 are found and 1 to 3 missed; one hole on the wrong side refutes.",
 )
-def claim_c1(case: Case) -> tuple[Answer, str]:
-    """Judge whether averaging 50 frames finds holes 4 to 11 and no smaller one."""
+def _c1(case: Case) -> tuple[Answer, str]:
     return _exact_set(case, MANY, FOUND_WITH_MANY)
 
 
@@ -77,8 +118,7 @@ def claim_c1(case: Case) -> tuple[Answer, str]:
     "Borne out when, with 1 frame, holes 5 to 11 are found and 1 to 4 missed, and the calibrated threshold in mm "
     "(k times scale) is higher than with 50 frames (95 % Welch interval of the difference above 0).",
 )
-def claim_c2(case: Case) -> tuple[Answer, str]:
-    """Judge whether one frame finds holes 5 to 11 only, because noise forces a higher threshold."""
+def _c2(case: Case) -> tuple[Answer, str]:
     answer, evidence = _exact_set(case, FEW, FOUND_WITH_FEW)
     set_agrees = {"borne out": True, "not borne out": False, "undecided": None}[answer]
     damaged = case.runs[case.runs["role"] == "damaged"]
@@ -87,11 +127,8 @@ def claim_c2(case: Case) -> tuple[Answer, str]:
     interval = mean_difference(few, many)
     if not interval.known:
         return decide([set_agrees, None]), f"{evidence} The thresholds cannot be compared: too few runs."
-    threshold = (
-        f"Threshold {few.mean():.2f} mm with 1 frame, {many.mean():.2f} mm with 50 "
-        f"(difference {span(interval)} mm, {len(few)} and {len(many)} runs)."
-    )
-    return decide([set_agrees, is_above_zero(interval)]), f"{evidence} {threshold}"
+    threshold = f"Threshold {few.mean():.2f} mm with 1 frame, {many.mean():.2f} mm with 50"
+    return decide([set_agrees, is_above_zero(interval)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
 
 
 @rule_of(
@@ -102,38 +139,22 @@ def claim_c2(case: Case) -> tuple[Answer, str]:
     "the repeats. Borne out when every hole's 95 % interval of (mean - true)/std lies within -1 to 1; refuted when "
     "one hole's lies outside.",
 )
-def claim_c3(case: Case) -> tuple[Answer, str]:
-    """Judge whether each hole's mean size lies within one standard deviation of the true one."""
+def _c3(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     if rows.empty:
         none = "No hole is found with 50 frames." if (case.summary["frames"] == MANY).any() else ""
         return "undecided", none or "No trial has 50 frames."
 
-    def spread(row: pd.Series, measure: Measure) -> tuple[float, Interval]:
-        bias, std = float(row[f"{measure}_bias_mm"]), float(row[f"{measure}_diameter_std_mm"])
-        interval = standardised_bias(bias, std, int(row[f"{measure}_measured"]))
-        return (bias / std if std > 0 else interval.low), interval
-
-    def per_hole(measure: Measure, *, with_intervals: bool) -> str:
-        return ", ".join(
-            f"hole {row['hole']} {ratio:+.1f}{f' ({span(interval, 1)})' if with_intervals else ''}"
-            if interval.known
-            else f"hole {row['hole']} –"
-            for _, row in rows.iterrows()
-            for ratio, interval in [spread(row, measure)]
-        )
-
-    def share(measure: Measure) -> str:
-        inside = rows[f"{measure}_bias_mm"].abs() <= rows[f"{measure}_diameter_std_mm"]
-        return f"{int(inside.sum())} of {len(rows)} holes"
-
-    intervals = [spread(row, "extent")[1] for _, row in rows.iterrows()]
-    parts = [True if i.within(-1, 1) else False if i.above(1) or i.below(-1) else None for i in intervals]
-    evidence = (
-        f"(mean - true)/std by the thesis' measure: {per_hole('extent', with_intervals=True)}. "
-        f"By the model of the blurred hole: {per_hole('model', with_intervals=False)}. "
-        f"Within one std: {share('extent')} (thesis' measure), {share('model')} (model)."
-    )
+    parts: list[bool | None] = []
+    said = []
+    for _, row in rows.iterrows():
+        bias, std = float(row["extent_bias_mm"]), float(row["extent_diameter_std_mm"])
+        interval = standardised_bias(bias, std, int(row["extent_measured"]))
+        ratio = bias / std if std > 0 else interval.low
+        within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
+        parts.append(True if within else False if outside else None)
+        said.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
+    evidence = f"(mean - true)/std by the thesis' measure: {', '.join(said)}."
     return decide(parts), evidence
 
 
@@ -145,8 +166,7 @@ def claim_c3(case: Case) -> tuple[Answer, str]:
     "holes found with 50 frames. Borne out when it is negative with a one-sided permutation p below 0.05; refuted "
     f"when it is zero or positive; undecided between, or with fewer than {FEWEST_RANKED} holes.",
 )
-def claim_c4(case: Case) -> tuple[Answer, str]:
-    """Judge whether the size error grows as the hole shrinks."""
+def _c4(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[rows["extent_bias_mm"].notna()]
     if len(rows) < FEWEST_RANKED:
@@ -154,15 +174,10 @@ def claim_c4(case: Case) -> tuple[Answer, str]:
     diameter = rows["true_diameter_mm"].to_numpy(float)
     error = rows["extent_bias_mm"].abs().to_numpy(float)
     rho, p = falling_rank(diameter, error)
-    relative, p_relative = falling_rank(diameter, error / diameter)
-    chance, chance_relative = ("p < 0.001" if one < 0.001 else f"p = {one:.3f}" for one in (p, p_relative))
     smallest, largest = rows.iloc[diameter.argmin()], rows.iloc[diameter.argmax()]
-    evidence = (
-        f"Rank correlation {rho:+.2f} ({chance}) over {len(rows)} holes; of the error relative to the size "
-        f"{relative:+.2f} ({chance_relative}). Error {abs(smallest['extent_bias_mm']):.2f} mm at "
-        f"{smallest['true_diameter_mm']:.2f} mm, {abs(largest['extent_bias_mm']):.2f} mm at "
-        f"{largest['true_diameter_mm']:.2f} mm."
-    )
+    errors = (f"{abs(at['extent_bias_mm']):.2f} mm at {at['true_diameter_mm']:.2f} mm" for at in (smallest, largest))
+    p_said = "< 0.001" if p < 0.001 else f"= {p:.3f}"
+    evidence = f"Rank correlation {rho:+.2f} (p {p_said}) over {len(rows)} holes. Error {', '.join(errors)}."
     return ("not borne out" if not rho < 0 else "borne out" if p < 0.05 else "undecided"), evidence
 
 
@@ -175,8 +190,7 @@ def claim_c4(case: Case) -> tuple[Answer, str]:
     "holes of var(position)/var(size) is above 1 with its 95 % bootstrap interval over repeats; refuted when a "
     "hole disagrees or the interval lies below 1.",
 )
-def claim_c5(case: Case) -> tuple[Answer, str]:
-    """Judge whether mean positions agree with the ruler and scatter more than the sizes."""
+def _c5(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
     if rows.empty:
@@ -191,8 +205,7 @@ def claim_c5(case: Case) -> tuple[Answer, str]:
         f"{int(agrees.sum())} of {len(rows)} mean positions agree"
         f"{'' if agrees.all() else ' (not: ' + hole_list(rows['hole'][~agrees]) + ')'}; the largest difference is "
         f"{worst['extent_offset_bias_mm']:+.2f} mm, std {worst['extent_offset_std_mm']:.2f} mm (hole {worst['hole']}). "
-        f"Median variance ratio position to size {ratio:.2f} ({span(interval)}). Median std of positions "
-        f"{rows['extent_offset_std_mm'].median():.2f} mm, of sizes {rows['extent_diameter_std_mm'].median():.2f} mm."
+        f"Median variance ratio position to size {ratio:.2f} ({span(interval)})."
     )
     return decide([bool(agrees.all()), larger]), evidence
 
@@ -206,8 +219,7 @@ def claim_c5(case: Case) -> tuple[Answer, str]:
     "rms misfit is at most 0.8 of the other's. Borne out when most holes look like bowls and none like a cylinder; "
     "refuted when most look like cylinders and none like a bowl.",
 )
-def claim_c6(case: Case) -> tuple[Answer, str]:
-    """Judge whether a cylindrical hole looks nearly hemispherical."""
+def _c6(case: Case) -> tuple[Answer, str]:
     clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
     shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
     if not shapes:
@@ -215,22 +227,18 @@ def claim_c6(case: Case) -> tuple[Answer, str]:
         return "undecided", f"Not judged: {why}."
     looks = {look: [s.hole for s in shapes if s.looks == look] for look in ("bowl", "cylinder", "neither")}
     bowls, cylinders = len(looks["bowl"]), len(looks["cylinder"])
-    answer: Answer = "undecided"
-    if bowls > len(shapes) / 2 and not cylinders:
-        answer = "borne out"
-    elif cylinders > len(shapes) / 2 and not bowls:
-        answer = "not borne out"
+    most = len(shapes) / 2
+    bowl, cylinder = bowls > most and not cylinders, cylinders > most and not bowls
+    answer: Answer = "borne out" if bowl else "not borne out" if cylinder else "undecided"
     reached = np.array([shape.reached for shape in shapes])
     known = reached[np.isfinite(reached).all(axis=1)]
     depths = ", ".join(f"{100 * share:.0f} %" for share in np.median(known, axis=0)) if len(known) else "unknown"
     ratio = float(np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
-    seen = float(np.median([shape.seen_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
     control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
     evidence = (
         f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
         f"{hole_list(looks['cylinder'])}; neither clearly: {hole_list(looks['neither'])}. Median misfit of the bowl "
-        f"{ratio:.2f} of the cylinder's, of the true hole as seen from the camera {seen:.2f}. "
-        f"Median share of the true depth reached at 1/4, 1/2 and 3/4 of the radius: "
+        f"{ratio:.2f} of the cylinder's. Median share of the true depth reached at 1/4, 1/2 and 3/4 of the radius: "
         f"{depths} (a hemisphere as deep: 97, 87 and 66 %). Control: the true geometry at the same pixels is nearer "
         f"to a bowl in {control} of {len(shapes)} holes."
     )
@@ -246,8 +254,7 @@ def claim_c6(case: Case) -> tuple[Answer, str]:
     "(whole 95 % interval, bootstrap over blocks of pixels); refuted when either interval lies wholly on the "
     "other side.",
 )
-def claim_c9(case: Case) -> tuple[Answer, str]:
-    """Judge whether averaging lowers the noise but not the systematic error."""
+def _c9(case: Case) -> tuple[Answer, str]:
     law = noise_law(case.probes, case.variant)
     if law is None:
         return "undecided", "Too few probe pixels or numbers of frames to tell."
@@ -266,7 +273,7 @@ def claim_c9(case: Case) -> tuple[Answer, str]:
 def score_claims(
     tables: ResultTables,
     variant: str = MAIN,
-    examples: Sequence[Example] = (),
+    examples: Sequence[Any] = (),
     summary: pd.DataFrame | None = None,
 ) -> list[Verdict]:
     """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
@@ -283,25 +290,9 @@ def score_claims(
     return [rule(case) for rule in RULES.values()]
 
 
-def verdicts_by_variant(
-    tables: ResultTables, examples: Sequence[Example] = (), summary: pd.DataFrame | None = None
-) -> pd.DataFrame:
-    """One row per variant: ``variant`` and a column per claim with its verdict, in the table's order."""
-    import pandas as pd
-
-    summary = summarise_holes(tables.holes) if summary is None else summary
-    rows = [
-        {"variant": name} | {v.claim: v.verdict for v in score_claims(tables, name, examples, summary)}
-        for name in tables.variants["variant"]
-    ]
-    return pd.DataFrame(rows, columns=["variant", *RULES])
-
-
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows".
-
-    Exact permutation test up to 8 pairs, 20000 fixed random permutations beyond. A constant input has rho 0, p 1.
-    """
+    """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows", by permutation: exact up to 8 pairs, 20000
+    fixed random ones beyond. A constant input has rho 0, p 1."""
     from scipy.stats import permutation_test, rankdata
 
     ranks, other = rankdata(x), rankdata(y)
@@ -323,11 +314,8 @@ def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, Interval]:
-    """Median over holes of var(first) / var(second) over repeats, with its interval by bootstrap over repeats.
-
-    ``holes``: one row per repeat and hole. Repeats in which a hole lacks either value are left out of that hole's two
-    variances; infinite where no hole's second column varies.
-    """
+    """Median over holes of var(first) / var(second) over repeats that have both, with its interval by bootstrap over
+    repeats; infinite where no hole's second column varies. ``holes``: one row per repeat and hole."""
     top, bottom = (holes.pivot(index="repeat", columns="hole", values=c).to_numpy(float) for c in (first, second))
     both = np.isfinite(top) & np.isfinite(bottom)
 
@@ -353,18 +341,71 @@ def _exact_set(case: Case, frames: int, expected: frozenset[str]) -> tuple[Answe
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"
         return "undecided", f"Not judged: {why}."
-    more = [hole for hole, state in status.items() if state == "found" and hole not in expected]
-    fewer = [hole for hole, state in status.items() if state == "missed" and hole in expected]
-    open_ = [hole for hole, state in status.items() if state == "undecided"]
+    by_state = {of: [hole for hole, state in status.items() if state == of] for of in ("found", "missed", "undecided")}
+    more = [hole for hole in by_state["found"] if hole not in expected]
+    fewer = [hole for hole in by_state["missed"] if hole in expected]
+    open_ = by_state["undecided"]
     rows = case.summary[case.summary["frames"] == frames]
     alike: dict[str, list[str]] = {}
     for _, row in rows.sort_values("detected", kind="stable").iterrows():
         alike.setdefault(f"{row['detected']} of {row['n']}", []).append(row["hole"])
     counts = ", ".join(f"{count} ({hole_list(names)})" for count, names in alike.items())
-    found = [hole for hole, state in status.items() if state == "found"]
-    parts = [f"With {frames} frame{'s' if frames > 1 else ''} found: {hole_list(found)}."]
-    parts += [f"More than the thesis: {hole_list(more)}."] if more else []
-    parts += [f"Fewer than the thesis: {hole_list(fewer)}."] if fewer else []
-    parts += [f"Undecided: {hole_list(open_)}."] if open_ else []
+    parts = [f"With {frames} frame{'s' if frames > 1 else ''} found: {hole_list(by_state['found'])}."]
+    for what, holes in (("More than the thesis", more), ("Fewer than the thesis", fewer), ("Undecided", open_)):
+        parts += [f"{what}: {hole_list(holes)}."] if holes else []
     answer = decide([not (more or fewer), None if open_ else True])
     return answer, " ".join([*parts, f"Detections of trials (holes): {counts}."])
+
+
+CAMERA = "source.camera.name"
+BEST = "azure_kinect_nfov"
+OTHERS = ("kinect_v2", "realsense_l515")
+TEXT = "Of the three cameras, Azure Kinect resolves damage best."
+RULE = (
+    f"At each place (distance) the holes found with {MANY} frames are counted; undecided holes leave room for either "
+    "count. Azure Kinect is ahead of another camera where it finds more whatever becomes of the undecided holes, and "
+    "behind where it finds fewer. Borne out when it is ahead of each other camera at one place at least and behind at "
+    "none; refuted when it is behind at any place, or surely ahead of some camera at none."
+)
+
+
+def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
+    """The verdict from summary rows of all set-ups; None where none of the ``axes`` holds the three cameras."""
+    if CAMERA not in axes or not {BEST, *OTHERS} <= set(summary[CAMERA]):
+        return None
+    rows = summary[summary["frames"] == MANY]
+    if rows.empty:
+        return Verdict("C11", TEXT, "undecided", f"Not judged: no trial has {MANY} frames.", RULE)
+    others = [path for path in axes if path != CAMERA]
+    found = {
+        " and ".join(map(value_text, others, values)) or "its one place": {
+            camera: _bounds(status) for camera, status in part.groupby(CAMERA)["status"]
+        }
+        for values, part in (rows.groupby(others, sort=False, dropna=False) if others else [((), rows)])
+    }
+    counts = [
+        f"{place} {' / '.join(' to '.join(map(str, sorted(set(of.get(one, ()))))) or '–' for one in (BEST, *OTHERS))}"
+        for place, of in found.items()
+    ]
+    evidence = [f"Holes found with {MANY} frames by {BEST} / {' / '.join(OTHERS)}: {'; '.join(counts)}."]
+    answers: list[bool | None] = []
+    for camera in OTHERS:
+        standings: dict[str, list[str]] = {word: [] for word in ("ahead", "level", "behind", "open")}
+        for place, of in found.items():
+            if {BEST, camera} <= set(of):
+                (low, high), (other_low, other_high) = of[BEST], of[camera]
+                sure = low == high and other_low == other_high
+                word = "ahead" if low > other_high else "behind" if high < other_low else "level" if sure else "open"
+                standings[word].append(place)
+        judged = any(standings.values())
+        answer = False if standings["behind"] else None if standings["open"] else bool(standings["ahead"])
+        answers.append(answer if judged else None)
+        said = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
+        evidence += [f"Against {camera}: {said}."] if judged else []
+    return Verdict("C11", TEXT, decide(answers), " ".join(evidence), RULE)
+
+
+def _bounds(status: pd.Series) -> tuple[int, int]:
+    """Fewest and most holes that a camera finds at a place."""
+    found = int((status == "found").sum())
+    return found, found + int((status == "undecided").sum())

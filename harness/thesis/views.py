@@ -6,20 +6,12 @@ Repeats vary the noise and the error of the nominal poses; the poses, the board 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from harness.evaluation.intervals import (
-    CONFIDENCE,
-    RESAMPLES,
-    UNKNOWN,
-    Interval,
-    bootstrap,
-    mean_difference,
-    wilson,
-)
+from harness.evaluation import intervals
 from harness.evaluation.maps import (
     FEWEST_BOTH,
     THESIS_MERGE,
@@ -29,14 +21,18 @@ from harness.evaluation.maps import (
     against_one,
     change_text,
     frames_text,
+    of_map,
+    paired_ratio,
+    per_unit,
     ratio_text,
     run_ratio,
     size_errors,
     span,
+    trusted,
 )
-from harness.evaluation.registration import of_map, paired_ratio, per_unit, trusted
 from harness.evaluation.summary import hole_list
-from harness.thesis.verdicts import Answer, Rules, Verdict, decide, is_above_zero, rule_of
+from harness.tables.text import many
+from harness.thesis.claims import Answer, Rules, Verdict, decide, is_above_zero, rule_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,19 +43,16 @@ SLAM = ("odometry", "volume")
 """Registration and merge of the map that stands in for a SLAM system: no marks, no closing of loops."""
 NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
-"""The registrations of H1's map, the first that was tried."""
-VIEW_CLAIMS: Rules[MapCase] = {}
+RESPECTS = ("holes", "size", "noise")
+VIEW_CLAIMS: Rules = {}
 
 
 def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
     """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
-    verdicts = []
-    for rule in VIEW_CLAIMS.values():
-        for case in cases:
-            verdict = rule(case)
-            where = f"{case.place}: " if len(cases) > 1 else ""
-            verdicts.append(replace(verdict, evidence=where + verdict.evidence))
-    return verdicts
+    verdicts = [(case, rule(case)) for rule in VIEW_CLAIMS.values() for case in cases]
+    if len(cases) == 1:
+        return [verdict for _, verdict in verdicts]
+    return [replace(verdict, evidence=f"{case.place}: {verdict.evidence}") for case, verdict in verdicts]
 
 
 @rule_of(
@@ -72,8 +65,7 @@ def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
     "and does not where most of its registrations failed. CPD aligns better when its error in the plane, over ICP's in "
     "the same repeat, has a geometric mean below 1 (95 % Student interval of the logarithm); above 1 refutes.",
 )
-def claim_c7(case: MapCase) -> tuple[Answer, str]:
-    """Judge whether both methods bring the fiducials into one plane, and whether CPD aligns better within it."""
+def _c7(case: MapCase) -> tuple[Answer, str]:
     alone = case.single()
     if alone is None:
         return "undecided", "Not judged: no single view stands beside the registrations."
@@ -94,24 +86,19 @@ def claim_c7(case: MapCase) -> tuple[Answer, str]:
     evidence = (
         f"With {frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
         f"{'; '.join(said)}. A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} "
-        f"times the error of ICP ({span(Interval(low, high))}, {n} pairs). "
+        f"times the error of ICP ({span(intervals.Interval(low, high))}, {n} pairs)."
     )
-    views = rows["view"].nunique()
-    if views > 1:  # said but not judged: the thesis had one pair
-        errors = {name: trusted(rows[rows["method"] == name])["tre_in_plane_mm"].median() for name in ("icp", "cpd")}
-        medians = ", ".join(f"{method} {median:.2f}" for method, median in errors.items())
-        evidence += f"Over all {views} further views (not judged): {medians} mm in the plane."
     return decide([*planes, better]), evidence
 
 
 def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     """Return whether a method's error across the board is at most the noise of a surface."""
-    if wilson(len(rows) - len(trusted(rows)), len(rows))[0] > 0.5:
+    if intervals.wilson(len(rows) - len(trusted(rows)), len(rows))[0] > 0.5:
         return False
     across = per_unit(rows, "tre_across_mm").to_numpy(float)
     if not len(across):
         return None
-    interval = bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
+    interval = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
     if interval.known and interval.high <= noise_mm:
         return True
     return False if interval.above(noise_mm) else None
@@ -128,22 +115,15 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     "measure it twice at least; where no smaller hole is compared, the second part holds if one view finds a hole that "
     "two views miss. One part on the wrong side refutes.",
 )
-def claim_c8(case: MapCase) -> tuple[Answer, str]:
-    """Judge two views against one: better sizes of large holes, worse of small ones, a higher threshold."""
+def _c8(case: MapCase) -> tuple[Answer, str]:
     found = against_one(case, THESIS_REGISTRATION, THESIS_MERGE)
     if found is None:
         why = "one and two views, registered by CPD and merged on the grid, were not both finished"
         return "undecided", f"Not judged: {why}."
     small = True if not found.small.n and found.lost else found.small.is_above
-    sizes = found.sizes
-    holes = [f"{hole} {change.mean:+.2f}" for hole, change in zip(sizes.holes, sizes.by_hole(), strict=True)]
-    turn = "The change has no crossing."
-    if np.isfinite(sizes.crossing_mm):
-        turn = f"It turns at {sizes.crossing_mm:.1f} mm ({span(sizes.crossing_interval, 1)})."
     parts = [
-        f"With {frames_text(found.one.frames)}, two views less one, |size error| of holes from 3/8 in on "
+        f"With {frames_text(found.frames)}, two views less one, |size error| of holes from 3/8 in on "
         f"{change_text(found.large)}, of smaller ones {change_text(found.small)}.",
-        f"By hole (mm): {', '.join(holes)}. {turn}",
         f"Threshold {change_text(found.threshold)}, surface noise {ratio_text(found.noise)}.",
     ]
     parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
@@ -162,8 +142,7 @@ def claim_c8(case: MapCase) -> tuple[Answer, str]:
     "measure are larger (95 % bootstrap intervals over repeats). Where it finds no hole and the others do, its "
     "precision counts as worse. One comparison on the wrong side refutes.",
 )
-def claim_c10(case: MapCase) -> tuple[Answer, str]:
-    """Judge whether the SLAM map is noisier and less precise than one view and than two merged ones."""
+def _c10(case: MapCase) -> tuple[Answer, str]:
     chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
     chosen.sort(key=lambda one: (not one.is_variation, -one.views))
     finished = (Map(one.variant, case.frames(one.variant)[-1], one.views) for one in chosen if case.frames(one.variant))
@@ -190,7 +169,7 @@ def claim_c10(case: MapCase) -> tuple[Answer, str]:
 
     parts, said = [], []
     for what, values, size, gap in (
-        ("surface noise", [noise(each) for each in maps], lambda v: float(v.mean()), mean_difference),
+        ("surface noise", [noise(each) for each in maps], lambda v: float(v.mean()), intervals.mean_difference),
         ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in maps], _rms, rms_gap),
         ("position error", [errors(each, "extent_offset_mm", "true_offset_mm") for each in maps], _rms, rms_gap),
     ):
@@ -205,43 +184,32 @@ def claim_c10(case: MapCase) -> tuple[Answer, str]:
         parts.append(True if most == 0 and all(least > 0 for least, _ in others) else None)
         said.append("no hole is measured by all three")
     evidence = (
-        f"{slam.views} views of {_frames(slam)} against one and two of {_frames(alone)}: {'; '.join(said)}. Holes "
-        f"measured by all: {hole_list(common)}. Found: {', '.join(_found_text(case, each) for each in maps)}."
+        f"{slam.views} views of {many(slam.frames, 'frame')} against one and two of {many(alone.frames, 'frame')}: "
+        f"{'; '.join(said)}. Found: {', '.join(_found_text(case, each) for each in maps)}."
     )
     return decide(parts), evidence
 
 
-def rms_gap(first: np.ndarray, second: np.ndarray) -> Interval:
-    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap over the repeats of each,
-    which are independent; unknown below two repeats of either."""
+def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
+    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap over the repeats of each;
+    unknown below two repeats of either."""
     if min(len(first), len(second)) < 2 or not (np.isfinite(first).any() and np.isfinite(second).any()):
-        return UNKNOWN
+        return intervals.UNKNOWN
     rng = np.random.default_rng(0)
     draws = []
     for errors in (first, second):
-        weights = rng.multinomial(len(errors), np.full(len(errors), 1 / len(errors)), RESAMPLES)
+        weights = rng.multinomial(len(errors), np.full(len(errors), 1 / len(errors)), intervals.RESAMPLES)
         there = np.isfinite(errors)
         squares = np.where(there, errors, 0.0) ** 2
         with np.errstate(invalid="ignore"):
             draws.append(np.sqrt(weights @ squares.sum(axis=1) / (weights @ there.sum(axis=1))))
-    tail = (1 - CONFIDENCE) / 2
+    tail = (1 - intervals.CONFIDENCE) / 2
     low, high = np.nanquantile(draws[0] - draws[1], [tail, 1 - tail])
-    return Interval(float(low), float(high))
+    return intervals.Interval(float(low), float(high))
 
 
 def _rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(errors**2)))
-
-
-@dataclass(frozen=True)
-class Duel:
-    """A fused map, registered as ``registration`` says, against one view: its standing in each respect, and numbers."""
-
-    mapped: Map
-    registration: str
-    rival: Map
-    standings: dict[str, Standing]
-    text: str
 
 
 @rule_of(
@@ -255,22 +223,20 @@ class Duel:
     "measure) and noise of the fitted surface (95 % Student intervals over repeats). Borne out when the map is ahead "
     "of each rival in one respect at least and behind in none; refuted when it is behind any of them in any.",
 )
-def claim_h1(case: MapCase) -> tuple[Answer, str]:
-    """Judge whether a fused map beats one view, with as many frames and with as many exposures in all."""
+def _h1(case: MapCase) -> tuple[Answer, str]:
     duels = duels_of(case)
     if not duels:
         return "undecided", "Not judged: no fused map stands beside a single view."
-    standings = [list(duel.standings.values()) for duel in duels]
-    answers = [False if "behind" in each else True if "ahead" in each else None for each in standings]
-    evidence = " ".join(duel.text for duel in duels)
+    answers = [False if "behind" in each else True if "ahead" in each else None for each, _ in duels]
+    evidence = " ".join(text for _, text in duels)
     if len(duels) == 1:
         evidence += " No single view has as many exposures in all: judged without."
     return decide(answers), evidence
 
 
-def duels_of(case: MapCase) -> list[Duel]:
-    """H1's map against one view with as many frames as each of its views, then against one view with as many exposures
-    in all (see the rule for which); those of the two that the experiment has."""
+def duels_of(case: MapCase) -> list[tuple[tuple[Standing, ...], str]]:
+    """H1's map against one view with as many frames as each of its views, and against one with as many exposures in
+    all, where the experiment has them: the standing in each respect, and numbers."""
     fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
     registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
     fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
@@ -295,27 +261,22 @@ def duels_of(case: MapCase) -> list[Duel]:
     return [_duel(case, *pair, registration or "") for pair in pairs if pair is not None]
 
 
-def _duel(case: MapCase, mapped: Map, rival: Map, registration: str) -> Duel:
+def _duel(case: MapCase, mapped: Map, rival: Map, registration: str) -> tuple[tuple[Standing, ...], str]:
     sizes = size_errors(case.holes(rival), case.holes(mapped)).change()
     noise = run_ratio(case.runs(rival), case.runs(mapped), "surface_noise_mm")
     (low, high), (rival_low, rival_high) = _bounds(case, mapped), _bounds(case, rival)
     sure = low == high == rival_low == rival_high
-    standings: dict[str, Standing] = {
-        "holes": "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
-        "size": "ahead" if sizes.is_below else "behind" if sizes.is_above else "open",
-        "noise": "ahead" if noise.is_below else "behind" if noise.is_above else "open",
-    }
-    said = ", ".join(f"{respect} {standing}" for respect, standing in standings.items())
-    text = (
-        f"{mapped.views} views ({registration}, fusion) of {_frames(mapped)} against one of {_frames(rival)}: {said}. "
-        f"Found {_found_text(case, mapped)} against {_found_text(case, rival)}; |size error| {change_text(sizes)}; "
-        f"surface noise {ratio_text(noise)}."
+    standings: tuple[Standing, ...] = (
+        "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
+        *("ahead" if one.is_below else "behind" if one.is_above else "open" for one in (sizes, noise)),
     )
-    return Duel(mapped, registration, rival, standings, text)
-
-
-def _frames(mapped: Map) -> str:
-    return f"{mapped.frames} frame{'s' if mapped.frames > 1 else ''}"
+    said = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
+    text = (
+        f"{mapped.views} views ({registration}, fusion) of {many(mapped.frames, 'frame')} against one of "
+        f"{many(rival.frames, 'frame')}: {said}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
+        f"|size error| {change_text(sizes)}; surface noise {ratio_text(noise)}."
+    )
+    return standings, text
 
 
 def _bounds(case: MapCase, mapped: Map) -> tuple[int, int]:

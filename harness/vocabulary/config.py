@@ -8,10 +8,8 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Config(BaseModel):
-    """A declaration. Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused.
-
-    Fields carry their unit in their name (``width_mm``).
-    """
+    """A declaration. Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused. Fields carry
+    their unit in their name (``width_mm``)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -19,16 +17,12 @@ class Config(BaseModel):
     @classmethod
     def _lists_are_tuples(cls, data: Any) -> Any:
         # Strict mode takes no list for a tuple, and YAML and JSON have nothing but lists.
-        if not isinstance(data, dict):
-            return data
-        return {key: _as_tuple(value) for key, value in data.items()}
+        return {key: _as_tuple(value) for key, value in data.items()} if isinstance(data, dict) else data
 
     @classmethod
     def from_data(cls, data: Any) -> Self:
-        """Validate plain data (dicts, lists, numbers, text: what YAML and JSON hold).
-
-        Raises pydantic.ValidationError, whose ``loc`` paths match the data's.
-        """
+        """Validate plain data (dicts, lists, numbers, text: what YAML and JSON hold). Raises pydantic.ValidationError,
+        whose ``loc`` paths match the data's."""
         return cls.model_validate(data)
 
     def to_data(self) -> dict[str, Any]:

@@ -9,17 +9,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any
 
 CLOSED_PIPE = 141
 """Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13."""
 
 
 class UserError(Exception):
-    """A mistake that the user can mend.
-
-    The message says what is wrong and where; ``legal`` what would be accepted; ``fix`` what to do next.
-    """
+    """A mistake that the user can mend: what is wrong and where; ``legal``: what would be; ``fix``: what to do next."""
 
     def __init__(self, message: str, *, legal: str | None = None, fix: str | None = None) -> None:
         super().__init__(message)
@@ -32,12 +28,8 @@ class UserError(Exception):
         return (_rebuild, (self.message, self.legal, self.fix))
 
     def __str__(self) -> str:
-        lines = [self.message]
-        if self.legal:
-            lines.append(f"  legal: {self.legal}")
-        if self.fix:
-            lines.append(f"  to do: {self.fix}")
-        return "\n".join(lines)
+        lines = [self.message] + ([f"  legal: {self.legal}"] if self.legal else [])
+        return "\n".join(lines + ([f"  to do: {self.fix}"] if self.fix else []))
 
 
 class DiskFull(UserError):
@@ -51,7 +43,15 @@ def _rebuild(message: str, legal: str | None, fix: str | None) -> UserError:
 def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
     that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C while it ends are not heard."""
-    before = _hear_interrupts_once()
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+    def interrupt(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    if ours:
+        signal.signal(signal.SIGINT, interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")  # a terminal without the sign for "plus or minus" shows "?"
@@ -70,34 +70,16 @@ def exit_code_of(program: Callable[[], int]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
-
-
-def _hear_interrupts_once() -> Any:
-    """Let the first Ctrl-C raise KeyboardInterrupt and the system drop those after it. Returns the handler to put back;
-    None where somebody else handles Ctrl-C, or in a thread, which cannot."""
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    ):
-        return None
-
-    def interrupt(number: int, frame: object) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    return signal.signal(signal.SIGINT, interrupt)
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _nobody_reads() -> bool:
-    """Return whether it is the standard output whose pipe is closed; if so, what is still to be written goes nowhere,
-    so that the interpreter does not complain when it ends."""
+    """Return whether it is the standard output whose pipe is closed."""
     try:
-        output = sys.stdout.fileno()
+        output, poll = sys.stdout.fileno(), select.poll()
     except (OSError, ValueError):
         return False
-    poll = select.poll()
     poll.register(output, 0)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
         return False

@@ -1,34 +1,140 @@
-"""Writing files: a reader never sees half of one; a full disk or a locked folder is a clear message."""
+"""Files: read within limits, as strict JSON; written so that a reader never sees half of one; locked.
+
+A file may be made to fill the memory: most are refused by what they state, unread; libraries that believe what a file
+states run within `limited_memory`. All limits stand here. Locks are the system's own, so a process that dies gives them
+back, and no clock is asked."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import stat
 import tempfile
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Literal
 
 from harness.vocabulary.errors import DiskFull, UserError
 
-NOT_WRITABLE = {
-    getattr(errno, name)
-    for name in ("EACCES", "EPERM", "EROFS", "ENOTDIR", "EEXIST", "EISDIR", "ENOENT", "ENAMETOOLONG", "EINVAL")
-}
+FRAME_PIXELS = 64_000_000
+"""Pixels of one frame or picture, points of one cloud: sixty times the largest depth sensor; 1.5 GB as points."""
+ARRAYS_BYTES = 4 << 30
+"""All arrays that are unpacked from one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits."""
+READING_BYTES = 5 << 30
+"""Memory that a library may take while it reads one file: `ARRAYS_BYTES`, and what unpacking them needs beside."""
+PICTURE_BYTES = 512 << 20
+"""A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more."""
+RECORD_BYTES = 256 << 20
+"""A study's record: three million inspections. As Python's values it is some 10 times as large."""
+TEXT_BYTES = 16 << 20
+"""A file of settings, poses, a calibration, or a bag's description: those written by programs have some kB."""
+TABLE_BYTES = 256 << 20
+"""A table of inspections: five million rows."""
+RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/files.py"
+
+
+def size_text(count: int) -> str:
+    """Return bytes as text in the unit that is easiest to read."""
+    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10)):
+        if count >= factor:
+            return f"{count / factor:.4g} {unit}"
+    return f"{count} bytes"
+
+
+def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
+    """Raise UserError where ``count`` bytes are more than ``at_most``."""
+    if count > at_most:
+        raise UserError(f"{name}: {what} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix)
+
+
+def refuse_pixels(name: str, width: int, height: int) -> None:
+    """Raise UserError where an image has no pixel, or more than `FRAME_PIXELS`."""
+    legal = f"1 to {FRAME_PIXELS // 10**6} million pixels"
+    if width < 1 or height < 1:
+        raise UserError(f"{name}: {width} x {height} pixels", legal=legal)
+    if width * height > FRAME_PIXELS:
+        raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=RAISE)
+
+
+def bounded_bytes(path: Path, at_most: int) -> bytes:
+    """Return a file's content. Raises UserError where it is larger than ``at_most``, whatever it says it is (a sparse
+    file, a device, a pipe); OSError as files do."""
+    with Path(path).open("rb") as stream:
+        content = stream.read(at_most + 1)
+    if len(content) > at_most:
+        raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
+    return content
+
+
+_LOCK, _BEFORE = threading.Lock(), list[tuple[int, int]]()
+"""The limits before `limited_memory`, once for each place that is inside."""
+
+
+@contextmanager
+def limited_memory() -> Iterator[None]:
+    """Limit the memory that the process may take inside to `READING_BYTES` more; beyond, MemoryError is raised. The
+    limit (RLIMIT_AS) holds for all threads, from the first that enters to the last that leaves. Systems without it or
+    without /proc (macOS, Windows) set none."""
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except (ImportError, OSError):
+        yield
+        return
+    with _LOCK:
+        before = _BEFORE[0] if _BEFORE else resource.getrlimit(resource.RLIMIT_AS)
+        if not _BEFORE:
+            wanted = pages * resource.getpagesize() + READING_BYTES
+            least = min(limit for limit in (wanted, *before) if limit != resource.RLIM_INFINITY)
+            resource.setrlimit(resource.RLIMIT_AS, (least, before[1]))
+        _BEFORE.append(before)
+    try:
+        yield
+    finally:
+        with _LOCK:
+            before = _BEFORE.pop()
+            if not _BEFORE:
+                resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
+    """Return the value of a JSON text (UTF-8). Raises ValueError, saying why, for what is no JSON: a key that stands
+    twice in an object, NaN and Infinity (unless ``nan``), too deep nesting, too long integers."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in found:
+                raise ValueError(f"the key {key[:60]} stands twice")
+            found[key] = value
+        return found
+
+    def no_number(word: str) -> Any:
+        raise ValueError(f"{word} is no number of JSON")
+
+    text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+    try:
+        return json.loads(text, object_pairs_hook=unique, parse_constant=None if nan else no_number)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+NOT_WRITABLE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENOENT}
+NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 """Errors of a place where no file can be made (ENOENT for one inside /proc)."""
 
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` (same suffix); rename it to ``path`` on success, delete it on failure.
-
     ``durable``: the content is on the disk before it has its name, so that a power failure leaves the old file or the
     new file; what can be made again at no cost may do without. Raises UserError where the folder cannot be written or
-    the disk is full.
-    """
+    the disk is full."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -51,10 +157,8 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder beside ``path``; rename it to ``path`` on success, delete it on failure.
-
-    Raises UserError where ``path`` exists and is no empty folder, cannot be written, or the disk is full.
-    """
+    """Yield an empty temporary folder beside ``path``; rename it to ``path`` on success, delete it on failure. Raises
+    UserError where ``path`` exists and is no empty folder, cannot be written, or the disk is full."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
         raise UserError(f"{path}: is not empty, and nothing is written over", fix="name a new folder with --out")
@@ -83,11 +187,9 @@ def _move_shared(temporary: Path, path: Path, mode: int) -> None:
 
 
 def inside(folder: Path, *parts: str) -> Path:
-    """``folder`` with ``parts`` below it, for names that somebody else may have chosen.
-
-    Raises UserError where a part is no plain name (empty, "..", with a separator or a zero byte), or where a link that
-    lies in ``folder`` leads out of it: what is written would land elsewhere. ``folder`` itself may be a link.
-    """
+    """``folder`` with ``parts`` below it, for names that somebody else may have chosen. Raises UserError where a part
+    is no plain name (empty, "..", with a separator or a zero byte), or where a link that lies in ``folder`` leads out
+    of it: what is written would land elsewhere. ``folder`` itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
             raise UserError(f"{part!r} is no name of a file or folder", legal="letters, digits, - and _")
@@ -113,9 +215,8 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 def open_plain(path: Path, flags: int) -> IO[bytes]:
     """Open a regular file, unbuffered where it is written: never through a link, and without waiting for a pipe.
-
-    ``flags`` as of `os.open`. Raises UserError where the path is a link, a pipe or a folder; OSError as `os.open` does.
-    """
+    ``flags`` as of `os.open`. Raises UserError where the path is a link, a pipe or a folder; OSError as `os.open`
+    does."""
     odd = UserError(f"{path}: is not a regular file, so nothing is read from it or written to it", fix="remove it")
     if path.is_symlink() or path.is_dir():
         raise odd
@@ -131,10 +232,51 @@ def open_plain(path: Path, flags: int) -> IO[bytes]:
 def explained(error: OSError, path: Path) -> Exception:
     """Return the user's mistake behind an OSError of writing, or the error itself where it is not a known one."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(
-            f"{path}: the disk is full", fix="free some space and run the same command again; finished work is kept"
-        )
+        fix = "free some space and run the same command again; finished work is kept"
+        return DiskFull(f"{path}: the disk is full", fix=fix)
     if error.errno is not None and error.errno in NOT_WRITABLE:
         reason = os.strerror(error.errno).lower()
         return UserError(f"{path}: cannot be written ({reason})", fix="name a folder that you may write to with --out")
     return error
+
+
+Answer = Literal["held", "busy", "no locks"]
+"""``busy``: another process holds it. ``no locks``: the system (Windows) or the file system knows none."""
+
+
+def opened_lock(path: Path) -> IO[str]:
+    """Open a lock file, made where there is none. Raises OSError, or UserError where it is no regular file."""
+    with open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND) as file:
+        return os.fdopen(os.dup(file.fileno()), "a+", encoding="utf-8")
+
+
+def lock(file: IO[str], *, shared: bool, wait: bool) -> Answer:
+    """Lock an open file until it is closed."""
+    try:
+        import fcntl
+    except ImportError:
+        return "no locks"
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return "busy"
+    except OSError:
+        return "no locks"
+    return "held"
+
+
+@contextmanager
+def one_at_a_time(path: Path, number: int) -> Iterator[None]:
+    """Wait for other processes that hold the same ``number`` of a lock file, and hold it: one byte of the file, so that
+    any number of things needs one file. Processes, not threads. Holds nothing where the system knows no locks."""
+    try:
+        import fcntl
+
+        file = opened_lock(path)
+    except (ImportError, OSError):
+        yield
+        return
+    with file:
+        with suppress(OSError):  # a file system without locks
+            fcntl.lockf(file, fcntl.LOCK_EX, 1, number)
+        yield

@@ -1,15 +1,32 @@
-"""Rigid transforms and pixel regions.
+"""Units, rigid transforms, regions of pixels, lenses, and what cameras capture: frames and their clouds.
+
+SI inside the program; millimetres, inches and degrees only in YAML, tables and reports.
 
 Frames. ``camera``: x right, y down, z along the optical axis, origin at the depth lens (OpenCV's convention), metres.
 ``board``: x along the row of holes, y up the face, z out of the face to the camera, origin at the centre, metres.
-``T_a_b`` maps co-ordinates in b to co-ordinates in a.
-"""
+``T_a_b`` maps co-ordinates in b to co-ordinates in a."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Literal, Protocol
 
 import numpy as np
+
+MM = 1e-3
+"""Metres in a millimetre."""
+INCH = 25.4e-3
+"""Metres in an inch (exact by definition)."""
+UW_CM2 = 1e-2
+"""Watts per square metre in a microwatt per square centimetre."""
+SPEED_OF_LIGHT_VACUUM = 299_792_458.0
+"""m/s, exact by definition."""
+REFRACTIVE_INDEX_AIR = 1.00027
+"""Air at 850 nm, 20 C, 101 kPa (Ciddor 1996, rounded): +-1e-5 over indoor weather, 10 um at 1 m."""
+SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR
+"""m/s in indoor air."""
 
 
 def transform_points(T_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
@@ -68,3 +85,189 @@ class Region:
             slice(self.row0 - outer.row0, self.row1 - outer.row0),
             slice(self.col0 - outer.col0, self.col1 - outer.col0),
         )
+
+
+UNDISTORT_STEPS = 200
+"""Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A central camera: pinhole with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2,
+    k3, k4, k5, k6); zeros mean none. Pixel (0, 0) is the centre of the first pixel. Not modelled: tilted sensors,
+    thin-prism terms, anything that is not a single centre of projection."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0,) * 8
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The 3x3 camera matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def whole(self) -> Region:
+        """The region of all pixels."""
+        return Region(0, self.height, 0, self.width)
+
+    def slopes(self, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
+        """Undistorted (x/z, y/z), shape (..., 2), of the rays through pixel positions (sub-pixel allowed)."""
+        import cv2
+
+        u, v = np.broadcast_arrays(np.asarray(u_px, float), np.asarray(v_px, float))
+        if not any(self.distortion):
+            return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
+        pixels = np.stack([u.ravel(), v.ravel()], axis=-1)[:, None, :]
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_STEPS, 1e-10)
+        flat = cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop)
+        return flat.reshape(*u.shape, 2)
+
+    def region_slopes(self, region: Region) -> np.ndarray:
+        """(x/z, y/z) through the pixel centres of a region, shape (h, w, 2)."""
+        v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
+        return self.slopes(u, v)
+
+    def project(self, points_camera_m: np.ndarray) -> np.ndarray:
+        """Pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the camera (z > 0)."""
+        import cv2
+
+        flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
+        pixels, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
+        return pixels.reshape(*points_camera_m.shape[:-1], 2)
+
+
+@dataclass(frozen=True)
+class OtherLens(Lens):
+    """A lens that was not measured for the images themselves, with what to say of it: ``note`` and ``warning``, "" for
+    none. ``mode``: of a camera's nominal lens, its depth mode by name; ``unit_m``: metres in a stored number there;
+    ``others``: the lenses of the same camera's other modes."""
+
+    note: str = ""
+    warning: str = ""
+    mode: str = ""
+    unit_m: float | None = None
+    others: tuple[OtherLens, ...] = ()
+
+    @property
+    def plain(self) -> Lens:
+        """The lens alone."""
+        return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+
+class Reason(IntEnum):
+    """The reason why a pixel has no range; a recording says NO_RETURN or NOT_FINITE only, a simulated camera all."""
+
+    VALID = 0
+    NO_RETURN = 1
+    """The file holds the code for 'no depth' (0), or the ray met nothing."""
+    SATURATED = 2
+    LOW_AMPLITUDE = 3
+    AMPLITUDE_RATIO = 4
+    """The amplitudes of the modulation frequencies disagree (a mixed pixel)."""
+    UNWRAP = 5
+    """The phases of the modulation frequencies fit no single distance."""
+    EDGE = 6
+    """The neighbourhood's phases differ too much."""
+    OUT_OF_RANGE = 7
+    OUTSIDE_MASK = 8
+    """Outside the illuminated field."""
+    LOW_REFLECTIVITY = 9
+    """Amplitude times distance squared too small."""
+    NOT_FINITE = 10
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure. ``z_m`` (h, w) float32: distance along the optical axis, NaN where invalid. ``reason`` (h, w) uint8
+    of `Reason`. ``xy_m`` (h, w, 2) only where the source has no lens (a stored point cloud). ``rgb`` (h, w, 3) uint8
+    and ``amplitude`` (h, w) float32 where known. ``name`` says in messages which frame it is. ``notes``: how its stored
+    numbers were understood, where that was not plain."""
+
+    name: str
+    z_m: np.ndarray
+    reason: np.ndarray
+    xy_m: np.ndarray | None = None
+    rgb: np.ndarray | None = None
+    amplitude: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+
+class FrameSource(Protocol):
+    """A source of frames: a simulated camera or a recording. Frames are streamed, never all held. ``slopes`` (h, w, 2)
+    are x/z and y/z per pixel, None where each frame carries ``xy_m``. ``organised`` is False for a cloud without a
+    pixel grid (then h == 1). ``z_step_m`` is the rounding step of the stored distance (0 if none)."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def region(self) -> Region: ...
+    @property
+    def lens(self) -> Lens | None: ...
+    @property
+    def slopes(self) -> np.ndarray | None: ...
+    @property
+    def organised(self) -> bool: ...
+    @property
+    def z_step_m(self) -> float: ...
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames in order; each call starts again from the first."""
+        ...
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that averaging did not use, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class MapViews:
+    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4): their camera frames to the map's; ``shares``
+    (k,): their weights in it, which sum to 1. ``pixel_m``: along x and y the sides of a rectangle that spreads as far
+    as their pixels do on its surface."""
+
+    T_cloud_cameras: np.ndarray
+    shares: np.ndarray
+    pixel_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The average of frames as points in the camera's frame: what a detector sees. ``points_m`` (h, w, 3) float64, NaN
+    where invalid; ``reason`` (h, w) uint8 of `Reason` (the commonest among the frames where no sample was valid);
+    ``count`` (h, w) valid samples; ``variance_m2`` (h, w) sample variance of one frame's z, NaN below two samples. An
+    unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor; ``z_step_m`` is the
+    rounding step of one frame's z. A map of several views is a cloud too: its frame is its maker's, with z away from
+    the viewer. ``projection``: the grid's samples are "central" (rays through the origin, a camera) or "parallel"
+    (equal cells in x and y, a map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts
+    included, where its maker states it. ``noise_reach_px``: the side of the square over which filter and interpolation
+    blur noise; 0: not measured."""
+
+    points_m: np.ndarray
+    reason: np.ndarray
+    count: np.ndarray
+    variance_m2: np.ndarray
+    region: Region
+    z_step_m: float
+    n_frames: int
+    organised: bool = True
+    lens: Lens | None = None
+    rgb: np.ndarray | None = None
+    amplitude: np.ndarray | None = None
+    left_out: tuple[LeftOut, ...] = field(default=())
+    projection: Literal["central", "parallel"] = "central"
+    mean_variance_m2: np.ndarray | None = None
+    map_views: MapViews | None = None
+    noise_reach_px: float = 0.0
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(h, w) bool: pixels with a point."""
+        return np.isfinite(self.points_m[..., 2])

@@ -15,8 +15,8 @@ LONGEST = 60
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """A name for each path, without its unit: the last key (of ``camera.name`` and the like the one before); the whole
-    path where that would be the same for two."""
+    """Return a name for each path, without its unit: the last key (of ``camera.name`` and the like the key before); the
+    whole path where that would be the same for two."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 
@@ -42,5 +42,5 @@ def on_one_line(value: Any) -> str:
 def _split(path: str) -> tuple[str, str]:
     keys = path.split(".")
     key = keys[-2] if keys[-1] in CHOICES and len(keys) > 1 else keys[-1]
-    ending = next((one for one in UNITS if key.endswith(one) and len(key) > len(one)), "")
+    ending = next((unit for unit in UNITS if key.endswith(unit) and len(key) > len(unit)), "")
     return key.removesuffix(ending).replace("_", " "), UNITS.get(ending, "")

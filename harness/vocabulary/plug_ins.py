@@ -1,7 +1,4 @@
-"""Detectors, cameras and others by name: tofpod's own, and those of installed packages' entry points.
-
-Names are looked up without importing anything; only what is asked for is imported.
-"""
+"""Detectors, cameras and others by name: tofpod's own and those of entry points; looked up without an import."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
 from harness.vocabulary.errors import UserError
@@ -52,10 +49,13 @@ class PlugIns:
     fix: str = ""
 
     def offers(self) -> tuple[Offer, ...]:
-        """Every offer, by name; a name that two packages claim stands there twice."""
-        own = [Offer(name, target, OWN, _own_version()) for name, target in self.built_in().items()]
-        others = [_offer(entry) for entry in _installed(self.group, _search_path())]
-        once = dict.fromkeys((*own, *others))
+        """Return every offer, by name; a name that two packages claim stands there twice."""
+        from harness import __version__
+
+        # the folders in which packages are looked for, with the times of their last changes: installing changes them
+        places = tuple((place, _changed_ns(place or os.curdir)) for place in sys.path)
+        own = (Offer(name, target, OWN, __version__) for name, target in self.built_in().items())
+        once = dict.fromkeys((*own, *_installed(self.group, places)))
         return tuple(sorted(once, key=lambda offer: (offer.name, not offer.built_in, offer.package)))
 
     def names(self) -> tuple[str, ...]:
@@ -63,27 +63,19 @@ class PlugIns:
         return tuple(sorted({offer.name for offer in self.offers()}))
 
     def offer(self, name: str) -> Offer:
-        """Find the offer of a name.
-
-        Raises UserError on an unknown name, with the nearest one, and on a name that is taken twice, with both.
-        """
+        """Find the offer of a name. Raises UserError where it is unknown, with the nearest one, or taken twice."""
         found = [offer for offer in self.offers() if offer.name == name]
         if not found:
             from harness.vocabulary.declaration.diagnose import nearest
 
-            names = self.names()
-            near = nearest(name, names)
-            raise UserError(
-                f"there is no {self.noun} {name!r}" + (f"; did you mean {near!r}?" if near else ""),
-                legal=", ".join(names),
-                fix=self.fix or f"install the package that offers it through the entry point group {self.group!r}",
-            )
+            near = nearest(name, self.names())
+            message = f"there is no {self.noun} {name!r}" + (f"; did you mean {near!r}?" if near else "")
+            fix = self.fix or f"install the package that offers it through the entry point group {self.group!r}"
+            raise UserError(message, legal=", ".join(self.names()), fix=fix)
         if len({offer.target for offer in found}) > 1:
             both = " and ".join(f"{offer.target} ({offer.origin})" for offer in found)
-            raise UserError(
-                f"{len(found)} {self.noun}s are called {name!r}: {both}",
-                fix="uninstall all of these packages but one, or rename an entry point",
-            )
+            fix = "uninstall all of these packages but one, or rename an entry point"
+            raise UserError(f"{len(found)} {self.noun}s are called {name!r}: {both}", fix=fix)
         return found[0]
 
     def load(self, offer: Offer) -> Any:
@@ -110,23 +102,6 @@ class PlugIns:
         )
 
 
-def _offer(entry: EntryPoint) -> Offer:
-    if entry.dist is None:
-        return Offer(entry.name, entry.value, entry.module, "")
-    return Offer(entry.name, entry.value, entry.dist.name, entry.dist.version)
-
-
-def _own_version() -> str:
-    from harness import __version__
-
-    return __version__
-
-
-def _search_path() -> tuple[tuple[str, int], ...]:
-    """The folders in which packages are looked for, with the times of their last changes: installing changes them."""
-    return tuple((folder, _changed_ns(folder or os.curdir)) for folder in sys.path)
-
-
 def _changed_ns(folder: str) -> int:
     try:
         return os.stat(folder).st_mtime_ns
@@ -135,6 +110,9 @@ def _changed_ns(folder: str) -> int:
 
 
 @lru_cache(maxsize=8)
-def _installed(group: str, _search_path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
-    """The group's entry points. Remembered, because finding them reads every installed package: 7 ms each time."""
-    return tuple(entry_points(group=group))
+def _installed(group: str, _places: tuple[tuple[str, int], ...]) -> tuple[Offer, ...]:
+    """Return the group's offers. Remembered, because finding them reads every installed package: 7 ms each time."""
+    return tuple(
+        Offer(entry.name, entry.value, *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")))
+        for entry in entry_points(group=group)
+    )

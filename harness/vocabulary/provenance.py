@@ -1,13 +1,25 @@
-"""The origin of a result: code, versions, machine."""
+"""The origin of a result: code and its digest, versions of packages and of stored files, machine.
+
+Every stored file says of which version it is: a newer one is refused, an older one is read or made anew. Each kind has
+its number beside the code that writes it. It stands in JSON and Parquet by a key, in CSV by a column, which every
+reader keeps, in YAML by a comment on the first line, in HTML by ``<meta name="generator">``."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib.metadata
+import importlib.util
 import os
 import platform
+import re
 import subprocess
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+from harness.vocabulary.errors import UserError
 
 PACKAGES = ("mitsuba", "drjit", "trimesh", "numpy", "scipy", "numba", "pandas", "open3d-cpu", "opencv-python-headless")
 
@@ -17,13 +29,11 @@ def commit_and_dirty() -> tuple[str | None, bool | None]:
     here = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str | None:
+        command = ["git", "-C", str(here), *arguments]
         try:
-            done = subprocess.run(
-                ["git", "-C", str(here), *arguments], capture_output=True, text=True, timeout=10, check=True
-            )
+            return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
         except (OSError, subprocess.SubprocessError):
             return None
-        return done.stdout.strip()
 
     top = git("rev-parse", "--show-toplevel")
     if top is None or Path(top) != here:
@@ -38,19 +48,128 @@ def versions() -> dict[str, str]:
 
     found = {"tofpod": __version__, "python": platform.python_version()}
     for name in PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
 
 
-def machine() -> dict[str, Any]:
-    """Facts that a run's times depend on; no host or user name."""
-    return {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
-
-
 def record(command: str) -> dict[str, Any]:
-    """The origin that every stored result states: command, commit, dirty flag, versions, machine."""
+    """Return the origin that every stored result states: command, commit, dirty flag, versions, and what a run's times
+    depend on; no host or user name."""
     commit, dirty = commit_and_dirty()
-    return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine()}
+    machine = {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
+    return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
+
+
+RESULTS_VERSION = 1
+"""Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
+GENERATOR = f"tofpod results {RESULTS_VERSION}"
+"""Stands in pages."""
+STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
+
+
+def check_version(
+    found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
+) -> int:
+    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is,
+    with its article ("a record"). ``again``: what makes an older one anew, for the message. Raises UserError where it
+    is newer, older, missing or no version at all."""
+    first = known if oldest is None else oldest
+    legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
+    if isinstance(found, bool) or not isinstance(found, int) or found < 0:
+        said = "states no version" if found is None else f"states the version {str(found)[:40]!r}, which is none"
+        message = f"{said} of {what}"
+    elif found > known:
+        message = f"was written by a newer tofpod: it is {what} of version {found}"
+        fix = "upgrade tofpod, or use the one that wrote it"
+    elif found < first:
+        message = f"is {what} of version {found}"
+    else:
+        return found
+    raise UserError(f"{path}: {message}", legal=legal, fix=fix)
+
+
+def stamped(kind: str, version: int) -> str:
+    """The first line of a text file of ours, with its end."""
+    return f"# tofpod {kind} {version}\n"
+
+
+def stamp_of(text: str, kind: str) -> object:
+    """Return the version that a text's first line states: an int; the text after the kind where it is no number; None
+    where the line is no stamp of this kind, as in a file that somebody wrote by hand."""
+    match = STAMP.match(text.partition("\n")[0].removeprefix("\ufeff").strip())
+    number = match[2].strip() if match and match[1] == kind else None
+    return int(number) if number and re.fullmatch(r"[0-9]{1,9}", number) else number
+
+
+ROOT = Path(__file__).resolve().parents[2]
+OWN = ("detectors", "harness", "scenes")
+"""The project's packages."""
+IMPORT = re.compile(
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
+)
+"""An import statement: a hundred times faster than parsing; a sentence that looks like one only adds a file."""
+
+
+@lru_cache
+def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
+    """Digest of the project's sources that ``modules`` reach by imports, and of the versions of installed ``packages``.
+    A module of another project counts with every Python source of the package that it belongs to. Taken once a process:
+    files that change later are not what this process runs."""
+    state = hashlib.blake2b(digest_size=8)
+    own = tuple(name for name in modules if name.partition(".")[0] in OWN)
+    files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own)}
+    for name in sorted(set(modules) - set(own)):
+        files |= {f"{name}/{relative}": path for relative, path in _foreign_sources(name)}
+    for shown, path in sorted(files.items()):
+        content = path.read_bytes()
+        state.update(f"{shown} {len(content)}\n".encode())
+        state.update(content)
+    for package in packages:
+        state.update(f"{package} {importlib.metadata.version(package)}\n".encode())
+    return state.hexdigest()
+
+
+@lru_cache
+def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
+    """Source files of the project that modules reach by import statements, those inside functions included, sorted.
+    Imports that exist for type checking only count too. A module that is loaded by a name in a variable is not seen:
+    name it among ``modules``."""
+    found: dict[str, Path] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        path = None if name in found else _source_of(name)
+        if path is None:
+            continue
+        found[name] = path
+        waiting.append(name.rpartition(".")[0])  # a package runs before its modules
+        waiting += _imported(path.read_text(encoding="utf-8"))
+    return tuple(sorted(found.values()))
+
+
+def _source_of(name: str) -> Path | None:
+    """Return the file of a module of the project; None where there is no such module."""
+    place = ROOT.joinpath(*name.split("."))
+    files = (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
+    return next((path for path in files if path.is_file()), None)
+
+
+def _imported(text: str) -> Iterator[str]:
+    """Every dotted name that absolute imports may mean: of ``from a import b`` both ``a`` and ``a.b``."""
+    for start, names, plain in IMPORT.findall(text):
+        words = [name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()]
+        yield from ([start, *(f"{start}.{word}" for word in words)] if start else words)
+
+
+def _foreign_sources(module: str) -> Iterable[tuple[str, Path]]:
+    """(name to show, file) of the sources of the package that a module of another project belongs to."""
+    try:
+        spec = importlib.util.find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        for path in sorted(Path(folder).rglob("*.py")):
+            yield path.relative_to(folder).as_posix(), path
+    if spec and not spec.submodule_search_locations and spec.origin and Path(spec.origin).is_file():
+        yield Path(spec.origin).name, Path(spec.origin)

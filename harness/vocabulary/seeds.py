@@ -20,9 +20,7 @@ def digest(value: Any, length: int = 16) -> str:
 
 
 def random_stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """The random stream of (seed, labels): equal labels give equal numbers in any process, in any order.
-
-    SFC64 is the fastest of NumPy's generators that passes PractRand; streams are separated by a 128-bit hash.
-    """
+    """The random stream of (seed, labels): equal labels give equal numbers in any process, in any order. SFC64 is the
+    fastest of NumPy's generators that passes PractRand; streams are separated by a 128-bit hash."""
     key = hashlib.blake2b(canonical_json([seed, *labels]).encode(), digest_size=16).digest()
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(int.from_bytes(key, "little"))))

@@ -1,15 +1,100 @@
-"""A target as a Mitsuba scene in the camera's frame, and the questions that light transport asks of it."""
+"""Mitsuba: how it runs, a target as its scene in the camera's frame, and what light transport asks of it."""
 
 from __future__ import annotations
 
+import os
+import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from harness.vocabulary.errors import UserError
 from scenes.optics import Optics
 from scenes.target.mesh import TargetPart
+
+VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
+LEGAL = "LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)"
+FIX = "pip install karellen-llvm-core (Linux x86-64), or apt install libllvm19, or set DRJIT_LIBLLVM_PATH"
+
+
+def load_mitsuba() -> Any:
+    """Return the mitsuba module with a variant set. Raises UserError that names what to install where none works.
+    Dr.Jit 1.5 aborts the process at the first kernel with LLVM 14 to 16, so the LLVM of the wheel karellen-llvm-core is
+    preferred to the system's; a path in DRJIT_LIBLLVM_PATH has the last word."""
+    # Dr.Jit looks for LLVM when it is imported, so the path comes first; that there is none matters without a GPU only.
+    missing = _point_to_llvm()
+    import mitsuba as mi
+
+    if mi.variant() in VARIANTS or _works(mi, "cuda_ad_mono"):
+        return mi
+    if missing is not None:
+        raise missing
+    if _works(mi, "llvm_ad_mono"):
+        return mi
+    if "open3d" in sys.modules:
+        # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
+        raise UserError(
+            "Mitsuba cannot run: Open3D was imported before it, and its C++ library stands in for the one of LLVM",
+            fix="call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own",
+        )
+    raise UserError("Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found", legal=LEGAL, fix=FIX)
+
+
+def _works(mi: Any, name: str) -> bool:
+    """Tell whether a small kernel runs in the variant."""
+    if name not in mi.variants() or (name.startswith("cuda") and not _has_nvidia_driver()):
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            mi.set_variant(name)
+            import drjit as dr
+
+            return bool(dr.sum(mi.Float(1.0, 2.0) * 2.0)[0] == 6.0)
+        except Exception:
+            # Dr.Jit reports a missing backend by exceptions of several types; any of them means "not this one".
+            return False
+
+
+def _has_nvidia_driver() -> bool:
+    """Tell whether there is a driver: without it Dr.Jit prints warnings that a user would take for a fault."""
+    return Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
+
+
+def _point_to_llvm() -> UserError | None:
+    """Set DRJIT_LIBLLVM_PATH where it is not set, to the wheel's LLVM or the newest of the system, because Dr.Jit's own
+    search may pick an older one. Returns the mistake to raise where no LLVM can be used."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if named:
+        message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
+        return None if Path(named).exists() else UserError(message, legal=legal, fix="mend or unset DRJIT_LIBLLVM_PATH")
+    for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
+        found = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
+        if found:
+            os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
+            return None
+    recent = _system_llvm() if sys.platform == "linux" else None
+    if recent is not None:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(recent)
+    elif sys.platform == "linux":
+        return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
+    return None
+
+
+def _system_llvm() -> Path | None:
+    """Return the newest LLVM where distributions put it."""
+    for version in range(30, 16, -1):
+        for pattern in (f"*/libLLVM-{version}.so*", f"*/libLLVM.so.{version}*", f"llvm-{version}/lib/libLLVM*.so*"):
+            for root in (Path("/usr/lib"), Path("/usr/lib64")):
+                found = sorted(root.glob(pattern))
+                if found:
+                    return found[0]
+    return None
+
 
 LIFT_M = 1e-5
 """Distance from a surface at which a ray starts. float32 places hits within 1e-6 m in a room of metres; Mitsuba's own
@@ -26,10 +111,8 @@ def facing(interaction: Any) -> Any:
 @dataclass(frozen=True)
 class LitScene:
     """A Mitsuba scene with the emitter described beside it: a point with uniform intensity in a soft-edged cone.
-
     ``names`` are the surfaces in order; `surface_index` maps a hit to them. Mitsuba supplies geometry, textures and
-    visibility; the emitter stays outside so that its phase and its connection to each vertex are ours.
-    """
+    visibility; the emitter stays outside so that its phase and its connection to each vertex are ours."""
 
     mi: Any
     scene: Any
@@ -42,7 +125,7 @@ class LitScene:
     _on_face: Any
 
     def surface_index(self, interaction: Any) -> Any:
-        """Index into ``names`` of each hit; meaningless where the ray met nothing."""
+        """Return the index into ``names`` of each hit; meaningless where the ray met nothing."""
         import drjit as dr
 
         number: Any = dr.reinterpret_array(self.mi.UInt32, interaction.shape)
@@ -52,19 +135,17 @@ class LitScene:
         """Tell whether each hit lies on a triangle that was said to belong to the undamaged face."""
         import drjit as dr
 
-        mi = self.mi
-        first = dr.gather(mi.UInt32, self._first_triangle, self.surface_index(interaction), active)
-        return dr.gather(mi.Bool, self._on_face, first + interaction.prim_index, active)
+        first = dr.gather(self.mi.UInt32, self._first_triangle, self.surface_index(interaction), active)
+        return dr.gather(self.mi.Bool, self._on_face, first + interaction.prim_index, active)
 
     def arriving(self, interaction: Any, active: Any) -> tuple[Any, Any]:
         """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
-
-        irradiance = cone(direction) cos(incidence) / d^2, and 0 behind an occluder.
-        """
+        irradiance = cone(direction) cos(incidence) / d^2, and 0 behind an occluder."""
         import drjit as dr
 
         mi = self.mi
-        towards = mi.Point3f(*self.emitter_m.tolist()) - interaction.p
+        emitter = mi.Point3f(*self.emitter_m.tolist())
+        towards = emitter - interaction.p
         squared = dr.squared_norm(towards)
         distance = dr.sqrt(squared)
         towards /= distance
@@ -72,85 +153,52 @@ class LitScene:
         on_axis = -towards.z
         cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
         lit = active & (cosine > 0) & (cone > 0)
-        lit &= ~self.blocked(interaction.p, facing(interaction), mi.Point3f(*self.emitter_m.tolist()), lit)
+        # what stands between the surface, on the side from which the ray came, and the emitter
+        origin = interaction.p + LIFT_M * facing(interaction)
+        way = emitter - origin
+        reach = dr.norm(way)
+        ray = mi.Ray3f(origin, way / reach)
+        ray.maxt = reach - 2 * LIFT_M
+        lit &= ~self.scene.ray_test(ray, lit)
         return dr.select(lit, cone * cosine / squared, 0), distance
-
-    def blocked(self, point: Any, normal: Any, target: Any, active: Any) -> Any:
-        """Tell whether something stands between a surface's point, on the side of ``normal``, and a point in front of
-        it."""
-        import drjit as dr
-
-        mi = self.mi
-        origin = point + LIFT_M * normal
-        towards = target - origin
-        distance = dr.norm(towards)
-        ray = mi.Ray3f(origin, towards / distance)
-        ray.maxt = distance - 2 * LIFT_M
-        return self.scene.ray_test(ray, active)
 
 
 def lit_scene(
     mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
 ) -> LitScene:
-    """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo.
-
-    ``on_face``: for each part which of its triangles (n,) lie on the undamaged face; None means none.
-    """
+    """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo. ``on_face``: for each
+    part which of its triangles (n,) lie on the undamaged face; None means none."""
     import drjit as dr
 
-    description: dict[str, Any] = {"type": "scene"}
     names = tuple(part.name for part in parts)
-    for part in parts:
-        description[part.name] = _mesh(mi, part)
+    description = {"type": "scene", **{part.name: _mesh(mi, part) for part in parts}}
     scene = mi.load_dict(description)
-    shapes = scene.shapes()
     registered: np.ndarray = mi.UInt32(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).numpy()
     identity = np.zeros(int(registered.max()) + 1, np.uint32)
-    for shape, number in zip(shapes, registered, strict=True):
+    for shape, number in zip(scene.shapes(), registered, strict=True):
         identity[number] = names.index(shape.id())
     triangles = [np.zeros(len(part.mesh.faces), bool) for part in parts] if on_face is None else list(on_face)
-    first = np.cumsum([0, *(len(flags) for flags in triangles[:-1])])
-    return LitScene(
-        mi=mi,
-        scene=scene,
-        names=names,
-        emitter_m=optics.emitter_m,
-        cos_full=float(np.cos(np.deg2rad(optics.full_half_angle_deg))),
-        cos_cutoff=float(np.cos(np.deg2rad(optics.cutoff_half_angle_deg))),
-        _identity=mi.UInt32(identity),
-        _first_triangle=mi.UInt32(first.astype(np.uint32)),
-        _on_face=mi.Bool(np.concatenate(triangles)),
-    )
+    first = np.cumsum([0, *(len(flags) for flags in triangles[:-1])]).astype(np.uint32)
+    full, cutoff = (float(np.cos(np.deg2rad(a))) for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg))
+    faces = mi.UInt32(identity), mi.UInt32(first), mi.Bool(np.concatenate(triangles))
+    return LitScene(mi, scene, names, optics.emitter_m, full, cutoff, *faces)
 
 
 def _mesh(mi: Any, part: TargetPart) -> Any:
-    """One part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
-    material = mi.load_dict(
-        {"type": "twosided", "material": {"type": "diffuse", "reflectance": _reflectance(mi, part)}}
-    )
-    properties = mi.Properties()
-    properties["material"] = material
-    vertices = np.asarray(part.mesh.vertices, np.float32)
-    faces = np.asarray(part.mesh.faces, np.uint32)
-    mesh = mi.Mesh(
-        part.name,
-        vertex_count=len(vertices),
-        face_count=len(faces),
-        has_vertex_texcoords=part.uv is not None,
-        props=properties,
-    )
+    """Return one part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
+    reflectance: dict[str, Any] = {"type": "uniform", "value": float(part.albedo_850)}
+    if part.texture_850 is not None:
+        bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
+        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+    properties, textured = mi.Properties(), part.uv is not None
+    material = {"type": "diffuse", "reflectance": reflectance}
+    properties["material"] = mi.load_dict({"type": "twosided", "material": material})
+    vertices, faces = np.asarray(part.mesh.vertices, np.float32), np.asarray(part.mesh.faces, np.uint32)
+    mesh = mi.Mesh(part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties)
     mesh.set_id(part.name)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = vertices.ravel()
-    parameters["faces"] = faces.ravel()
+    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
     if part.uv is not None:
         parameters["vertex_texcoords"] = np.asarray(part.uv, np.float32).ravel()
     parameters.update()
     return mesh
-
-
-def _reflectance(mi: Any, part: TargetPart) -> dict[str, Any]:
-    if part.texture_850 is None:
-        return {"type": "uniform", "value": float(part.albedo_850)}
-    bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
-    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}

@@ -1,32 +1,288 @@
-"""Rendering a view: region, direct light, indirect light and its noise, put together."""
+"""Rendering a view: region, direct light, indirect light and its noise, put together.
+
+Indirect light met at least two surfaces; it is gathered by walking paths backwards. The spread between batches of
+low-discrepancy points (Sobol, scrambled anew for each) gives the noise that is left. On the board's undamaged face the
+light is smooth, so it is gathered at the nodes of a coarse grid and interpolated. One compiled loop walks all paths,
+each lane those of one place and batch one after another."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from scipy import sparse
+from scipy.stats import qmc
 
-from harness.vocabulary.geometry import Region, transform_points
-from harness.vocabulary.units import MM
-from scenes.field_of_view import seen_region
-from scenes.optics import Optics
-from scenes.render.direct import DirectLight, OffFace, direct_light, footprint_of, surface_rgb
-from scenes.render.indirect import (
-    Gathered,
-    PathWork,
-    face_light,
-    face_triangles,
-    gather_in_pixels,
-    noise_lines,
-    range_noise_m,
-)
-from scenes.render.scene import LitScene, lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
+from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
+from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
+from scenes.perspectives import seen_region
+from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light, wave_numbers
+from scenes.render.scene import LIFT_M, LitScene, facing, lit_scene, load_mitsuba
 from scenes.target.mesh import Target
-from scenes.view import NoiseFreeView
+
+BATCHES = 8
+PATHS_A_LANE = 64
+"""Enough that lanes end together although paths differ in length, few enough that a small job fills the machine."""
+NOISE_LINES = 4
+"""Lines of a comb of many that tell what noise does to range: paths are the same for all lines."""
+PER_VERTEX = 2
+"""Low-discrepancy dimensions at each vertex: a direction."""
+START_DIMENSIONS = 2
+FLOATS_AT_ONCE = 1 << 26
+"""Results held on the device at once: 0.25 GB."""
+FACE_WITHIN_M = 0.001 * MM
+"""The board's vertices so near its undamaged face lie on it: Booleans in double precision leave them within 1 nm."""
+ABOVE_FACE_M = 1 * MM
+"""Height of the nodes, so that tape does not bury them."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Indirect light at n places: ``sums`` (BATCHES, f + 1, n) complex64, per batch; frequency 0 (intensity) last.
+    Phase counts from the place of gathering on. Units as in `scenes.optics.NoiseFreeView`, without the place's albedo
+    where the start was a surface point, with it where the start was the lens."""
+
+    sums: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(f + 1, n) mean over batches."""
+        return np.asarray(self.sums.mean(axis=0, dtype=complex))
+
+
+@dataclass(frozen=True)
+class PathWork:
+    """Settings of the walk: at which frequencies, with how many reflections beyond the first, and from which seed."""
+
+    frequencies_hz: tuple[float, ...]
+    bounces: int
+    seed: int
+
+
+def gather_at_points(
+    lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int
+) -> Gathered:
+    """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
+    albedo. All points share their low-discrepancy numbers, so that what noise is left is smooth from point to point."""
+    import drjit as dr
+
+    mi = lit.mi
+    columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
+
+    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+        x, y, z, nx, ny, nz = (dr.gather(mi.Float, column, place) for column in columns)
+        point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        return point, point + LIFT_M * normal, direction
+
+    return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True)
+
+
+def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> Gathered:
+    """Gather indirect light (mean over the listed sub-rays of each pixel, its share of the footprint left out) with
+    ``samples`` paths each, a number or (p,)."""
+    import drjit as dr
+
+    mi = lit.mi
+    across, down = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in rays.slopes.T)
+    firsts = mi.UInt32((np.cumsum(rays.count) - rays.count).astype(np.uint32))
+    counts = mi.UInt32(rays.count.astype(np.uint32))
+
+    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+        first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
+        which = first + dr.minimum(mi.UInt32(u1 * mi.Float(count)), count - 1)
+        slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
+        return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0))
+
+    return _gather(lit, start, np.broadcast_to(np.asarray(samples), rays.pixel.shape), work, on_surface=False)
+
+
+def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return one standard deviation of range, (n,), from phasors (B, l, n) of B independent batches at the frequencies
+    of `noise_lines`, added to light ``total`` (f, n). The mean over B batches has their deviation over sqrt(B)."""
+    few = noise_lines(frequencies_hz)
+    chosen = tuple(frequencies_hz[k] for k in few)
+    per_batch = range_change_m(batches - batches.mean(axis=0), total[few], chosen)
+    return np.asarray(per_batch.std(axis=0, ddof=1) / np.sqrt(len(batches)))
+
+
+def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return what a small change (..., f, n) of phasors ``total`` (f, n) does to range, (..., n); 0 without light. A
+    change dH turns the phase by Im(dH / H); frequencies are fused with the least-squares weights c f_k / (4 pi sum
+    f^2)."""
+    f = np.array(frequencies_hz)[:, None]
+    turn = np.imag(np.divide(change, total, out=np.zeros(change.shape, complex), where=np.abs(total) > 0))
+    return np.asarray((SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turn).sum(axis=-2))
+
+
+def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
+    """Return the frequencies that tell noise: all, or NOISE_LINES spread over the list where there are more."""
+    count = len(frequencies_hz)
+    return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
+
+
+def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, on_surface: bool) -> Gathered:
+    """Walk ``samples`` (n,) paths from each place, in BATCHES batches. ``start`` (place, u1, u2): point from which the
+    path's length counts, origin of the first ray and its direction. ``on_surface``: light that reaches the first hit
+    directly counts (for a start at the lens it is the direct part), and all places share one rotation of the
+    low-discrepancy points (modulo 1). Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce
+    multiplies by its albedo only."""
+    import drjit as dr
+
+    mi, bounces, seed = lit.mi, work.bounces, work.seed
+    waves, step_hz = wave_numbers(work.frequencies_hz), comb_step(work.frequencies_hz)
+    lines, per_batch = len(waves), np.maximum(samples // BATCHES, 1)
+    rng = np.random.default_rng([seed, 0x1D1EC7])
+    dimensions, longest = START_DIMENSIONS + PER_VERTEX * (bounces + 1), int(per_batch.max())
+    points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
+    table = mi.Float(np.ascontiguousarray(points, np.float32).ravel())
+
+    # lanes for so many paths a batch at each place, and where those of each place and batch begin
+    per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
+    begins = np.cumsum(per_pair) - per_pair
+    pair = np.repeat(np.arange(len(per_pair)), per_pair)
+    of_place, of_batch = np.divmod(pair, BATCHES)
+    begin_at = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
+    lanes = of_place, of_batch, begin_at, np.minimum(per_batch[of_place] - begin_at, PATHS_A_LANE)
+
+    def added(totals: list[Any], light: Any, length: Any) -> list[Any]:
+        """Add light of a path length to sums of real and imaginary parts, one pair a frequency, intensity last. A comb
+        is followed by multiplying with the phasor of its spacing: 1e-7 a line."""
+        out = []
+        if step_hz is None:
+            for number in waves:
+                sine, cosine = dr.sincos(float(number) * length)
+                out += [light * cosine, light * sine]
+        else:
+            sine, cosine = dr.sincos(float(waves[0]) * length)
+            turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
+            re, im = light * cosine, light * sine
+            for _ in waves:
+                out += [re, im]
+                re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
+        return [total + part for total, part in zip(totals, [*out, light], strict=True)]
+
+    def walk(here: slice) -> np.ndarray:
+        """Return sums over the paths of some lanes: (f + 1, n) complex64, intensity last."""
+        place, batch, first, count = (mi.UInt32(np.ascontiguousarray(each[here], np.uint32)) for each in lanes)
+        rotation_of = batch + BATCHES * (0 if on_surface else place)
+
+        def uniform(sample: Any, dimension: Any) -> Any:
+            u = dr.gather(mi.Float, table, (batch * longest + first + sample) * dimensions + dimension)
+            u += mi.sample_tea_float32(rotation_of, dimension + seed * 1024, 4)
+            return u - dr.floor(u)
+
+        def vertex_of(*state: Any) -> tuple[Any, ...]:
+            """Go on by a vertex; a lane whose path ends begins its next one. ``before``: the point from which the ray
+            comes; ``length``: of the path up to there."""
+            sample, vertex, before, before_normal, direction, length, throughput, totals = state
+            fresh = vertex == 0
+            start_point, origin, start_direction = start(place, uniform(sample, 0), uniform(sample, 1))
+            before = dr.select(fresh, start_point, before)
+            origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
+            direction = dr.select(fresh, start_direction, direction)
+            length, throughput = dr.select(fresh, 0, length), dr.select(fresh, 1, throughput)
+
+            hit = lit.scene.ray_intersect(mi.Ray3f(origin, direction))
+            met, normal = hit.is_valid(), facing(hit)
+            length = length + dr.select(met, dr.norm(hit.p - before), 0)
+            throughput = throughput * dr.select(met, hit.bsdf().eval_diffuse_reflectance(hit, met)[0], 0)
+            arriving, leg = lit.arriving(hit, met if on_surface else met & ~fresh)
+            light = throughput * arriving
+            totals = added(totals, dr.select(met, light, 0), length + leg)
+
+            more = met & (vertex < bounces) & (throughput > 0)
+            dimension = START_DIMENSIONS + PER_VERTEX * vertex
+            chosen = mi.Point2f(uniform(sample, dimension), uniform(sample, dimension + 1))
+            direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(chosen))
+            sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
+            return sample, vertex, hit.p, normal, direction, length, throughput, totals
+
+        n, kinds = dr.width(place), (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
+        zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
+        state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
+        totals = dr.while_loop(state, lambda sample, *_: sample < count, vertex_of, label="walk")[-1]
+        dr.eval(totals)
+        values = [total.numpy() for total in totals]
+        return np.stack([*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]])
+
+    at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
+    sums = np.empty((lines + 1, len(of_place)), np.complex64)
+    for begin in range(0, len(of_place), at_once):
+        here = slice(begin, begin + at_once)
+        sums[:, here] = walk(here)
+    by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
+    return Gathered(np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64))
+
+
+def face_triangles(target: Target) -> list[np.ndarray]:
+    """Return for each part which of its triangles (n,) lie on the undamaged face: the board's there, all of tapes."""
+    found = []
+    for part in target.parts:
+        on_face = np.full(len(part.mesh.faces), part.name.startswith("tape"))
+        if part.name == "board":
+            board = transform_points(invert(target.T_camera_board), part.mesh.vertices)
+            near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < FACE_WITHIN_M
+            on_face = np.asarray(near[part.mesh.faces].all(axis=1))
+        found.append(on_face)
+    return found
+
+
+def face_light(
+    lit: LitScene,
+    target: Target,
+    direct: DirectLight,
+    slopes: np.ndarray,
+    work: PathWork,
+    spacing_m: float,
+    samples: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return indirect light by way of the face in the pixels that see any of it: mean (f + 1, n), and batches (B, l, n)
+    at the frequencies of `noise_lines`. Pixels in the order of `numpy.nonzero` of ``direct.face[-1]``. What a node
+    would see of a hole is taken as if the face were whole: on a flat face it sees none."""
+    seen = direct.face[-1].real > 0
+    rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
+    rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
+    x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
+    ends = ((each.min(), each.max()) for each in (x_seen, y_seen))
+    xs, ys = (np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3)) for low, high in ends)
+    # points above the face, and its unit normals, in the camera's frame
+    x, y = (each.ravel() for each in np.meshgrid(xs, ys))
+    step, height_m = 1e-5, target.face_height_m
+    slope_x = (height_m(x + step, y) - height_m(x - step, y)) / (2 * step)
+    slope_y = (height_m(x, y + step) - height_m(x, y - step)) / (2 * step)
+    normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    point = np.stack([x, y, height_m(x, y)], axis=-1) + ABOVE_FACE_M * normal
+    T_camera_board = target.T_camera_board
+    position, normals = transform_points(T_camera_board, point), rotate_vectors(T_camera_board, normal)
+    light = gather_at_points(lit, position, normals, work, samples)
+    weights = between_nodes(xs, ys, x_seen, y_seen)
+    share = direct.face[:, seen]
+    few = noise_lines(work.frequencies_hz)
+    batches = np.stack([share[few] * (weights @ batch[few].T).T for batch in light.sums])
+    return share * (weights @ light.mean.T).T, batches
+
+
+def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
+    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places between
+    them. Light that left its last surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 2e-3 at 80
+    mm and 0.7 m, of a part that is itself some per cent of the whole."""
+    columns, parts = len(nodes_x), []
+    for nodes, values in ((nodes_x, x), (nodes_y, y)):
+        place = (values - nodes[0]) / (nodes[1] - nodes[0])
+        cell = np.clip(place.astype(np.int64), 0, len(nodes) - 2)
+        parts.append((cell, place - cell))
+    (i, right), (j, down) = parts
+    index = np.stack([(j + b) * columns + i + a for b in (0, 1) for a in (0, 1)], axis=1)
+    weight = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
+    starts = np.arange(len(x) + 1) * 4
+    return sparse.csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), columns * len(nodes_y)))
+
 
 RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
@@ -54,6 +310,10 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     footprint = footprint_of(lens, region, optics.footprint)
     direct = direct_light(lit, slopes, footprint, optics.frequencies_hz, _at_holes(target, optics, slopes))
     phasor, intensity, noise_m = direct.phasor, direct.intensity, np.zeros(region.shape)
+    rgb = np.zeros((*region.shape, 3), np.float32)
+    for index, part in enumerate(target.parts):
+        here = direct.surface == index
+        rgb[here] = part.rgb_at(direct.uv[here])
     if config.bounces > 0:
         # pixels within the face's outline as the camera sees it
         uv = lens.project(transform_points(target.T_camera_board, target.outline_board_m))
@@ -73,7 +333,7 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
         surface=direct.surface,
         surface_names=lit.names,
         coverage=direct.coverage,
-        rgb=surface_rgb(target.parts, direct.surface, direct.uv),
+        rgb=rgb,
         slopes=slopes,
         seconds=time.perf_counter() - began,
         variant=mi.variant(),
@@ -89,11 +349,9 @@ def indirect_light(
     inside: np.ndarray,
     config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w).
-
-    By way of the face from its nodes; by way of all else by paths through the pixel's own sub-rays, ``inside`` (h, w)
-    the board's outline with as many as their noise asks for.
-    """
+    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w). By way of the face from its
+    nodes; by way of all else by paths through the pixel's own sub-rays, ``inside`` (h, w) the board's outline with as
+    many as their noise asks for."""
     frequencies, shape = optics.frequencies_hz, direct.range_m.shape
     indirect = np.zeros((len(frequencies) + 1, direct.range_m.size), complex)
     variance = np.zeros(direct.range_m.size)
@@ -108,34 +366,32 @@ def indirect_light(
         variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2
     work = PathWork(frequencies, config.bounces, config.seed)
     off_face, within = direct.off_face, inside.ravel()[direct.off_face.pixel]
-    for rays, inner in ((off_face.chosen(within), True), (off_face.chosen(~within), False)):
-        if rays.pixel.size:
-            if inner:
-                light = _gather_inside(lit, rays, total[:, rays.pixel], work, config)
-            else:
-                light = gather_in_pixels(lit, rays, work, config.rest_samples)
-            indirect[:, rays.pixel] += rays.share * light.mean
-            total[:, rays.pixel] += rays.share * light.mean[:-1]
-            batches = rays.share * light.sums[:, noise_lines(frequencies)]
-            variance[rays.pixel] += range_noise_m(batches, total[:, rays.pixel], frequencies) ** 2
+    for inner in (True, False):
+        rays = off_face.chosen(within == inner)
+        here, share = rays.pixel, rays.share
+        if here.size:
+            many = _samples_inside(lit, rays, total[:, here], work, config) if inner else config.rest_samples
+            light = gather_in_pixels(lit, rays, work, many)
+            indirect[:, here] += share * light.mean
+            total[:, here] += share * light.mean[:-1]
+            batches = share * light.sums[:, noise_lines(frequencies)]
+            variance[here] += range_noise_m(batches, total[:, here], frequencies) ** 2
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
-def _gather_inside(lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig) -> Gathered:
-    """Gather inside the outline: a few paths a pixel tell its noise, then as many as bring it down to
-    ``hole_noise_mm``.
-
-    The few are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean.
-    """
+def _samples_inside(
+    lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
+) -> int | np.ndarray:
+    """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell. The few
+    are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean."""
     if config.hole_samples <= PILOT_SAMPLES:
-        return gather_in_pixels(lit, rays, work, config.hole_samples)
+        return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
-    total = total + rays.share * pilot.mean[:-1]
-    noise_m = range_noise_m(rays.share * pilot.sums[:, noise_lines(work.frequencies_hz)], total, work.frequencies_hz)
+    batches = rays.share * pilot.sums[:, noise_lines(work.frequencies_hz)]
+    noise_m = range_noise_m(batches, total + rays.share * pilot.mean[:-1], work.frequencies_hz)
     wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
     doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
-    samples = np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples)
-    return gather_in_pixels(lit, rays, work, samples.astype(np.int64))
+    return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:

@@ -1,10 +1,8 @@
 """Fitted numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
 
-Run ``python -m scenes.sensor.calibration azure_kinect_nfov`` (or another camera) after a change to the sensor model and
-write the numbers into the camera's file; a test compares the two. The gain is the signal electrons with which the
-output's temporal deviation is the published one: of single pixels of a real unit, so with the small jitter of whole
-frames, which is taken off in squares; frames that jump are left out, as whoever measures a deviation leaves them out.
-Ambient light is that of `CameraConfig`'s default, indoors. The threshold gives the published reach.
+Run ``python -m scenes.sensor.calibration NAME`` after a change to the sensor model and write the numbers into the
+camera's file; a test compares the two. The gain gives the published temporal deviation of single pixels, without the
+jitter of whole frames (taken off in squares) and jumps; ambient light is that of `CameraConfig`'s default.
 """
 
 from __future__ import annotations
@@ -16,11 +14,9 @@ from typing import TypeVar
 import numpy as np
 from scipy import optimize
 
-from harness.vocabulary.capture import Reason
 from harness.vocabulary.errors import exit_code_of
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, load_camera
@@ -45,10 +41,7 @@ def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
 
 
 def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> SimulatedUnit:
-    """Return a unit with noise only before a plane near the axis; its tilt of 3 degrees meets every phase of rounding.
-
-    Without what a frame's pixels have in common (jitter, jumps).
-    """
+    """Return a unit with noise only, without jitter, before a plane tilted to meet all phases of rounding."""
     lens, (half_h, half_w) = camera.nominal_lens, HALF_PX[camera.kind]
     row, col = int(lens.cy), int(lens.cx)
     region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
@@ -57,10 +50,8 @@ def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> Si
 
 
 def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int) -> float:
-    """Return the temporal standard deviation of the output's z (rms over pixels) on a plane near the axis, metres.
-
-    NaN where an imager's pixel is invalid in any frame; a lidar's invalid samples are left out.
-    """
+    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres; NaN where an imager's pixel is
+    invalid in any frame; a lidar's invalid samples are left out."""
     unit = unit_before_plane(camera, distance_m, albedo)
     z = np.stack([frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]).astype(float)
     variance = np.nanvar(z, axis=0, ddof=1) if isinstance(camera, ScannedLidar) else z.var(axis=0, ddof=1)
@@ -87,23 +78,18 @@ def calibrated_signal_electrons(camera: AnyCamera, frames: int | None = None, se
     return float(np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3)))
 
 
-def calibrated_confidence_electrons(camera: ScannedLidar, frames: int = 100, seed: int = 1) -> float:
-    """Return the confidence threshold at which half of the pixels are valid at the published reach."""
-    photons = camera.photons
-    open_gate = with_number(camera, "engine", "confidence_electrons", 0.0)
-    unit = unit_before_plane(open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value)
-    rng = random_stream(seed, "calibration")
-    decoded = [unit.model.frame(unit.exposure, rng) for _ in range(frames)]
-    return float(np.median([np.where(d.reason == Reason.VALID, d.amplitude, 0.0)[unit.cut] for d in decoded]))
-
-
 def calibrated_numbers(camera: AnyCamera) -> dict[str, float]:
-    """Return the fitted numbers by their keys in the camera's file: the gain first, then the threshold with it."""
-    electrons = calibrated_signal_electrons(camera)
-    numbers = {"photons.signal_electrons": electrons}
+    """Return the fitted numbers by their keys in the camera's file: the gain, then of a lidar the confidence threshold
+    at which half of the pixels are valid at the published reach."""
+    numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
     if isinstance(camera, ScannedLidar):
-        fitted = with_number(camera, "photons", "signal_electrons", electrons)
-        numbers["engine.confidence_electrons"] = calibrated_confidence_electrons(fitted)
+        fitted = with_number(camera, "photons", "signal_electrons", numbers["photons.signal_electrons"])
+        open_gate, photons = with_number(fitted, "engine", "confidence_electrons", 0.0), camera.photons
+        unit = unit_before_plane(open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value)
+        rng = random_stream(1, "calibration")
+        decoded = [unit.model.frame(unit.exposure, rng) for _ in range(100)]
+        strength = [np.where(frame.reason == Reason.VALID, frame.amplitude, 0.0)[unit.cut] for frame in decoded]
+        numbers["engine.confidence_electrons"] = float(np.median(strength))
     return numbers
 
 

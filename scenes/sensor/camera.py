@@ -1,8 +1,4 @@
-"""Cameras as data: a YAML file in which every number has a tag and a source, checked against the model of its kind.
-
-tofpod's own are the files of ``scenes/cameras/``; packages offer others through the entry point group
-``tofpod.cameras``.
-"""
+"""Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an installed package."""
 
 from __future__ import annotations
 
@@ -17,10 +13,9 @@ from pydantic import Field, ValidationError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as
-from harness.vocabulary.declaration.problems import DeclarationError, Problem
-from harness.vocabulary.declaration.yaml_source import read_yaml
+from harness.vocabulary.declaration.yaml_source import DeclarationError, Problem, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.lens import OtherLens
+from harness.vocabulary.geometry import OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -28,19 +23,11 @@ from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 
-GROUP = "tofpod.cameras"
-"""Entry points of this group name an attribute that is the path of a camera's file, called as the entry point is."""
-
-
-@lru_cache
-def _own_files() -> dict[str, str]:
-    return {path.stem: str(path) for path in CAMERA_FOLDER.glob("*.yaml") if not path.name.startswith(".")}
-
-
+GROUP = "tofpod.cameras"  # its entry points name the path of a camera's file, called as the entry point is
 CAMERAS = PlugIns(
     GROUP,
     "camera",
-    _own_files,
+    lru_cache(lambda: {path.stem: str(path) for path in CAMERA_FOLDER.glob("[!.]*.yaml")}),
     fix=f"to add one, write its file in scenes/cameras/, or install a package that offers it by {GROUP!r}",
 )
 
@@ -51,11 +38,7 @@ KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar]] = {"amcw_imager": AmcwCa
 
 
 class EffectsConfig(Config):
-    """Effects of a real unit, as switches. All on is the camera as it is; all off is a noise-free camera that sees
-    direct light only.
-
-    Albedo and wood grain are no effects: they act through the photons.
-    """
+    """Effects of a real unit, as switches; all off is a noise-free camera that sees direct light only."""
 
     noise: bool = Field(True, description="shot and read noise on what the camera samples")
     multipath: bool = Field(True, description="light that met more than one surface")
@@ -72,8 +55,7 @@ class EffectsConfig(Config):
     frame_jumps: bool = Field(True, description="whole frames displaced: rare jumps, and a small jitter")
 
 
-NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))
-"""Every effect off."""
+NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  # every effect off
 
 
 class CameraConfig(Config):
@@ -116,10 +98,7 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the file of the camera of that name.
-
-    Raises UserError for an unknown name, for one that is taken twice, and where a package offers no file.
-    """
+    """Return the file of that camera. Raises UserError for a name that is unknown or taken twice, or has no file."""
     offer = CAMERAS.offer(name)
     if offer.built_in:
         return Path(offer.target)
@@ -127,22 +106,18 @@ def camera_file(name: str) -> Path:
     if not isinstance(offered, str | Path):
         raise CAMERAS.broken(offer, f"the path of a YAML file is wanted, not {type(offered).__name__}")
     path = Path(offered)
-    if path.stem != name:
-        raise CAMERAS.broken(offer, f"the file of the camera {name} must be called {name}.yaml, not {path.name}")
-    if not path.is_file():
-        raise CAMERAS.broken(offer, f"there is no file {path}")
+    if path.stem != name or not path.is_file():
+        raise CAMERAS.broken(offer, f"the camera {name} needs a file called {name}.yaml; there is no such file {path}")
     return path
 
 
 def load_camera(name: str) -> AnyCamera:
-    """Return the camera of that name. Raises UserError as `camera_file`, and for a file that does not describe a
-    camera."""
+    """Return the camera of that name. Raises UserError as `camera_file`, and for a file that describes no camera."""
     return _camera_at(camera_file(name))
 
 
 def lens_names() -> dict[str, str]:
-    """Return the names under which `lens_named` knows a lens: cameras and their further depth modes, each with its
-    camera."""
+    """Return the names under which `lens_named` knows a lens, cameras and further depth modes, each with its camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
         names |= dict.fromkeys((camera, *load_camera(camera).modes), camera)
@@ -150,8 +125,7 @@ def lens_names() -> dict[str, str]:
 
 
 def lens_named(name: str) -> OtherLens:
-    """Return the nominal lens of a camera or depth mode, with those of the camera's other modes; UserError for other
-    names."""
+    """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError for other names."""
     camera_name = lens_names().get(name, name)
     camera = load_camera(camera_name)
     plain = {camera_name: camera.nominal_lens}
@@ -164,10 +138,7 @@ def lens_named(name: str) -> OtherLens:
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
-    """Return the camera that an experiment declares: its file, with the numbers that the experiment replaces.
-
-    Raises UserError as `load_camera` does, and naming each replaced number that does not exist or is impossible.
-    """
+    """Return the camera that an experiment declares. Raises UserError where a replaced number is impossible."""
     return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
 
 
@@ -181,17 +152,10 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
         for key in path.split("."):
             at = at.get(key) if isinstance(at, dict) else None
         if not (isinstance(at, dict) and "value" in at):
-            known = number_paths(data)
-            near = [number for number in known if number.startswith(path)] or difflib.get_close_matches(
-                path, known, n=1
-            )
+            near = difflib.get_close_matches(path, number_paths(data), n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            file = camera_file(name)
-            told = f"scenes/cameras/{file.name}" if file.parent == CAMERA_FOLDER else str(file)
-            raise UserError(
-                f"source.camera.numbers: {name} has no number {path!r}{hint}",
-                legal=f"a number of {told}, such as lens.fx_px",
-            )
+            legal = f"a number of {camera_file(name)}, such as lens.fx_px"
+            raise UserError(f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal)
         at.update(value=value, tag="U", source="set by the experiment")
     try:
         return KINDS[data["kind"]].from_data(data)

@@ -10,24 +10,19 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Lens
 
 T = TypeVar("T")
 
-TERMS = (0, 4, 5, 8)
-"""Numbers of distortion terms that OpenCV's models have."""
-WORST_PX = 0.01
-"""Largest distance at which a pixel may come back from its direction; good lenses do to 1e-6."""
-STEEPEST = 6.0
-"""Slope from the axis up to which distortion is examined: 80 degrees."""
+TERMS = (0, 4, 5, 8)  # numbers of distortion terms that OpenCV's models have
+WORST_PX = 0.01  # largest distance at which a pixel may come back from its direction; good lenses do to 1e-6
+STEEPEST = 6.0  # slope from the axis up to which distortion is examined: 80 degrees
 
 
 class Fact(Config, Generic[T]):
-    """One number of a camera with where it comes from.
-
-    ``tag``: R read in the named public source, D derived from such, S one secondary source, W measured on public
-    captures of a real unit, C calibrated at the calibration point, M a guess, U set by the user of an experiment.
-    """
+    """One number of a camera with where it comes from. ``tag``: R read in the named public source, D derived from such,
+    S one secondary source, W measured on public captures, C calibrated, M a guess, U set by the user of an
+    experiment."""
 
     value: T
     tag: Literal["R", "D", "S", "W", "C", "M", "U"]
@@ -46,24 +41,13 @@ def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
     return AfterValidator(check)
 
 
-above_zero = checked("above 0", lambda value: value > 0)
-zero_or_more = checked("0 or more", lambda value: value >= 0)
-share = checked("from 0 to 1", lambda value: 0 <= value <= 1)
-half_angle = checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)
-
-PositiveInt = Annotated[Fact[int], above_zero]
-Positive = Annotated[Fact[float], above_zero]
-NonNegative = Annotated[Fact[float], zero_or_more]
-Share = Annotated[Fact[float], share]
+PositiveInt = Annotated[Fact[int], checked("above 0", lambda value: value > 0)]
+Positive = Annotated[Fact[float], checked("above 0", lambda value: value > 0)]
+NonNegative = Annotated[Fact[float], checked("0 or more", lambda value: value >= 0)]
+Share = Annotated[Fact[float], checked("from 0 to 1", lambda value: 0 <= value <= 1)]
 LengthPx = Annotated[Fact[float], checked("above 0 and at most 1000 pixels", lambda value: 0 < value <= 1000)]
-HalfAngle = Annotated[Fact[float], half_angle]
+HalfAngle = Annotated[Fact[float], checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)]
 Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)]
-
-
-def _known_number_of_terms(fact: Fact[tuple[float, ...]]) -> Fact[tuple[float, ...]]:
-    if len(fact.value) not in TERMS:
-        raise ValueError(f"there are {len(fact.value)} terms; OpenCV's models have {', '.join(map(str, TERMS))}")
-    return fact
 
 
 class LensFacts(Config):
@@ -75,50 +59,36 @@ class LensFacts(Config):
     fy_px: Positive
     cx_px: Fact[float]
     cy_px: Fact[float]
-    distortion: Annotated[Fact[tuple[float, ...]], AfterValidator(_known_number_of_terms)]
+    distortion: Fact[tuple[float, ...]]
 
     @model_validator(mode="after")
     def _sees_each_direction_once(self) -> LensFacts:
-        corner, limit = self._corner_slope(), unfolded_slope(self.lens().distortion)
+        if (count := len(self.distortion.value)) not in TERMS:
+            raise ValueError(f"distortion has {count} terms; OpenCV's models have {', '.join(map(str, TERMS))}")
+        lens = self.lens()
+        across, down = max(lens.cx, lens.width - 1 - lens.cx), max(lens.cy, lens.height - 1 - lens.cy)
+        corner, limit = float(np.hypot(across / lens.fx, down / lens.fy)), unfolded_slope(lens.distortion)
         if corner > limit:
             raise ValueError(
                 f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the corner "
                 f"of the sensor lies at {corner:.3g}"
             )
-        lens = self.lens()
         u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)))
-        slopes = lens.slopes(u, v)
-        again = lens.project(np.concatenate([slopes, np.ones((u.size, 1))], axis=-1))
+        again = lens.project(np.concatenate([lens.slopes(u, v), np.ones((u.size, 1))], axis=-1))
         if not (np.abs(again - np.stack([u, v], axis=-1)) < WORST_PX).all():
             raise ValueError("distortion folds the image: somewhere on the sensor no direction leads to a pixel")
         return self
 
-    def _corner_slope(self) -> float:
-        """Distance of the farthest corner from the principal point, in focal lengths."""
-        x = max(self.cx_px.value, self.width_px.value - 1 - self.cx_px.value) / self.fx_px.value
-        y = max(self.cy_px.value, self.height_px.value - 1 - self.cy_px.value) / self.fy_px.value
-        return float(np.hypot(x, y))
-
     def lens(self) -> Lens:
         """The lens in the program's own type."""
-        terms = self.distortion.value
-        return Lens(
-            self.width_px.value,
-            self.height_px.value,
-            self.fx_px.value,
-            self.fy_px.value,
-            self.cx_px.value,
-            self.cy_px.value,
-            (*terms, *(0.0,) * (8 - len(terms))),
-        )
+        width, height, terms = self.width_px.value, self.height_px.value, self.distortion.value
+        centre = self.cx_px.value, self.cy_px.value
+        return Lens(width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8])
 
 
 class ModeFacts(Config):
-    """Another depth mode of a camera: its image behind the same lens, a crop of larger or smaller pixels.
-
-    ``first_px``: column and row of its first pixel's corner, and ``side_px`` the side of its pixels, both in pixels of
-    the file's own mode.
-    """
+    """Another depth mode behind the same lens. ``first_px``: column and row of its first pixel's corner, and
+    ``side_px`` the side of its pixels, both in pixels of the file's own mode."""
 
     width_px: PositiveInt
     height_px: PositiveInt
@@ -133,13 +103,10 @@ class ModeFacts(Config):
 
 
 class UnitFacts(Config):
-    """Differences of a unit from the nominal camera as a whole, and of its frames from each other; any kind of camera.
-
-    ``offset_mm``: standard deviation between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``):
-    error of range after power-on, greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames
-    that are displaced as a whole by ``jump_mm`` (its sign by chance); ``jitter_mm``: standard deviation of a small
-    displacement that every frame has.
-    """
+    """Differences of a unit from the nominal camera as a whole, and of its frames from each other. ``offset_mm``:
+    deviation between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``): error of range after
+    power-on, greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames that are displaced as
+    a whole by ``jump_mm`` (its sign by chance); ``jitter_mm``: deviation of a small displacement of every frame."""
 
     frames_per_second: Positive
     offset_mm: NonNegative
@@ -169,8 +136,8 @@ class CameraFacts(Config):
 
 
 def unfolded_slope(distortion: tuple[float, ...]) -> float:
-    """The largest distorted slope up to which radial distortion grows with the true one; infinite where it always
-    does within `STEEPEST`. ``distortion``: k1 k2 p1 p2 k3 k4 k5 k6; the tangential part is left out."""
+    """Return the largest distorted slope up to which radial distortion (k1 k2 p1 p2 k3 k4 k5 k6, without the tangential
+    part) grows with the true one; infinite where it always does within `STEEPEST`."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
     slope = np.linspace(0.0, STEEPEST, 6001)
     s = slope**2

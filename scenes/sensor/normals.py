@@ -10,10 +10,8 @@ import numpy as np
 from numba.extending import intrinsic
 
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
-"""Options with which all kernels of the cameras are compiled: operations are neither reordered nor fused, so that every
-processor gives the same bits. With them a sample at the edge of a step of the output's rounding falls to either side: 3
-to 20 of 100,000 pixels of a frame moved by a whole step between processors. No assumption of finiteness: an unlit pixel
-may divide by zero and is gated out later."""
+"""Options of all kernels of the cameras: operations are neither reordered nor fused, so that every processor gives the
+same bits. No assumption of finiteness: an unlit pixel may divide by zero and is gated out later."""
 EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}
 """The same for sums of whole numbers that float32 holds, which are exact in any order and so may be vector code."""
 
@@ -25,11 +23,8 @@ TWO_PI = np.float32(2.0 * math.pi)
 
 @numba.njit(**FAST)
 def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
-    """Write standard normals (2 n,) float32 from uniform 32-bit words (2 n,), by Box and Muller's transform.
-
-    Elementary functions are short polynomials so that the loop becomes vector code: a third of the time of NumPy's
-    ziggurat. Relative error below 1e-5; 2^-25 as the least uniform number ends the tails at 5.9 deviations.
-    """
+    """Write standard normals (2 n,) float32 from uniform 32-bit words (2 n,) by Box and Muller's transform; relative
+    error below 1e-5, tails to 5.9 deviations."""
     n = np.uint64(out.size // 2)
     for i in range(n):
         # the upper 24 bits of a word fill a float32 exactly
@@ -58,8 +53,7 @@ def _log(u):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", **FAST)
 def _sincos_turns(v):  # type: ignore[no-untyped-def]
-    """Return sine and cosine of v turns, 0 <= v < 1: reduced to an eighth of a turn, Taylor to x^7 and x^8 (error
-    4e-7)."""
+    """Return sine and cosine of v turns, 0 <= v < 1."""
     quarter = np.floor(v * np.float32(4) + np.float32(0.5))
     x = (v - quarter * np.float32(0.25)) * TWO_PI
     x2 = x * x

@@ -10,18 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.vocabulary.capture import Frame
-from harness.vocabulary.geometry import Region
-from harness.vocabulary.lens import Lens
+from harness.vocabulary.geometry import Frame, Region
 from harness.vocabulary.seeds import random_stream
-from scenes.sensor.amcw.at_once import AtOnce
+from scenes.optics import NoiseFreeView
+from scenes.sensor.amcw.at_once import AtOnce, at_once
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera, CameraConfig
-from scenes.sensor.frames import FrameTotals
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.scanner import LidarScanner
-from scenes.sensor.unit import frame_errors_m
-from scenes.view import NoiseFreeView
+from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 
 @dataclass(frozen=True)
@@ -34,8 +31,7 @@ class SimulatedUnit:
 
     @cached_property
     def model(self) -> AmcwImager | LidarScanner:
-        """The model of the camera's kind on the view's region: `expose` once per view, `frame` for each exposure, and
-        `at_once` for what sums frames without drawing each."""
+        """The model of the camera's kind on the view's region, with its `expose` and `frame`."""
         kind = LidarScanner if isinstance(self.camera, ScannedLidar) else AmcwImager
         return kind(self.camera, self.config, self.view.region, self.view.slopes)  # type: ignore[arg-type]
 
@@ -46,10 +42,12 @@ class SimulatedUnit:
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of the view without drawing each; None where only frames will do."""
+        """Sums of frames of the view without drawing each; None where only frames will do, as of lidars."""
+        if not isinstance(self.model, AmcwImager):
+            return None
         asked = np.zeros(self.view.range_m.shape, bool)
         asked[self.cut] = True
-        return self.model.at_once(self.exposure, asked)
+        return at_once(self.model, self.exposure, asked)
 
     @cached_property
     def region(self) -> Region:
@@ -73,49 +71,29 @@ class SimulatedUnit:
         return self.region.within(self.view.region)
 
     def capture(self, frames: int, seed: int, *labels: str | int) -> SimulatedCapture:
-        """Return ``frames`` exposures whose noise is the stream of (seed, labels): prefixes of longer captures are
-        equal."""
+        """Return ``frames`` exposures with noise of the stream (seed, labels); prefixes of longer ones are equal."""
         return SimulatedCapture(self, frames, seed, labels)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class SimulatedCapture:
-    """Frames of one simulated unit; a `harness.vocabulary.capture.FrameSource`."""
+    """Frames of one simulated unit; a `harness.vocabulary.geometry.FrameSource`."""
 
     unit: SimulatedUnit
     n_frames: int
     seed: int
     labels: tuple[str | int, ...]
+    organised = True
 
-    @property
-    def name(self) -> str:
-        """Name of this source in messages."""
-        return f"simulated {self.unit.camera.name}"
-
-    @property
-    def region(self) -> Region:
-        """The pixels that frames cover."""
-        return self.unit.region
-
-    @property
-    def lens(self) -> Lens:
-        """The camera's nominal lens."""
-        return self.unit.camera.nominal_lens
+    def __post_init__(self) -> None:
+        camera = self.unit.camera
+        self.name, self.region = f"simulated {camera.name}", self.unit.region
+        self.lens, self.z_step_m = camera.nominal_lens, camera.z_step_m
 
     @property
     def slopes(self) -> np.ndarray:
         """Slopes (h, w, 2): x/z and y/z."""
         return self.unit.view.slopes[self.unit.cut]
-
-    @property
-    def organised(self) -> bool:
-        """True: an imager has a pixel grid."""
-        return True
-
-    @property
-    def z_step_m(self) -> float:
-        """The rounding step of the output."""
-        return self.unit.camera.z_step_m
 
     @cached_property
     def errors_m(self) -> np.ndarray:
@@ -126,9 +104,8 @@ class SimulatedCapture:
         return np.array(list(islice(errors_m, self.n_frames)))
 
     def totals(self, frames: np.ndarray) -> FrameTotals | None:
-        """Return sums over the frames of these numbers (t,), drawn at once: not those that `frames` yields, but equal
-        to them in distribution, and independent of the sums over other frames. The same frames give the same sums,
-        whichever others are asked for. None where only frames will do."""
+        """Return sums over the frames of these numbers (t,), drawn at once: equal in distribution to those of `frames`,
+        and the same whichever others are asked for. None where only frames will do."""
         summer, errors_m = self.unit.at_once, self.errors_m[frames]
         if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
             return None
@@ -144,10 +121,5 @@ class SimulatedCapture:
         cut = self.unit.cut
         for number in range(self.n_frames):
             decoded = self.unit.model.frame(self.unit.exposure, rng, self.errors_m[number])
-            yield Frame(
-                name=f"frame {number}",
-                z_m=decoded.z_m[cut],
-                reason=decoded.reason[cut],
-                rgb=self.unit.rgb,
-                amplitude=decoded.amplitude[cut],
-            )
+            z_m, reason, amplitude = (plane[cut] for plane in decoded)
+            yield Frame(f"frame {number}", z_m, reason, rgb=self.unit.rgb, amplitude=amplitude)

@@ -1,60 +1,97 @@
-"""Light that counts for a camera, and errors of range that belong to a unit as a whole or to a frame as a whole, the
-same for every kind of camera."""
+"""Frames and their sums, and light and errors of range that a unit or a frame has as a whole, for every kind of
+camera."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import count
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
+from harness.vocabulary.geometry import MM, Reason
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
+from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
 from scenes.sensor.facts import UnitFacts
-from scenes.view import NoiseFreeView
+
+N_REASONS = max(Reason) + 1
+SUMMED = ("count", "total", "squares", "amplitude")
+
+
+class DecodedFrame(NamedTuple):
+    """A frame: ``z_m`` (h, w) float32, NaN where ``reason`` (h, w) uint8 is not VALID; ``amplitude`` (h, w)."""
+
+    z_m: np.ndarray
+    reason: np.ndarray
+    amplitude: np.ndarray
+
+
+@dataclass(frozen=True)
+class FrameTotals:
+    """Sums over ``frames`` frames on (h, w) pixels, z in whole steps of ``step_m``, so that sums are exact. ``count``
+    of valid samples; ``total`` and ``squares`` of their z less ``base``, and ``amplitude`` in the camera's units;
+    ``reasons`` (r, h, w): how often each `Reason` was given."""
+
+    frames: int
+    step_m: float
+    base: np.ndarray
+    count: np.ndarray
+    total: np.ndarray
+    squares: np.ndarray
+    amplitude: np.ndarray
+    reasons: np.ndarray
+
+    def cut(self, at: tuple[slice, slice]) -> FrameTotals:
+        """Return the same on a part of the pixels."""
+        images = {name: getattr(self, name)[at] for name in ("base", *SUMMED)}
+        return replace(self, reasons=self.reasons[:, *at], **images)
+
+    def __add__(self, other: FrameTotals) -> FrameTotals:
+        """Add the sums over other frames of the same view; step and base are equal."""
+        sums = {name: getattr(self, name) + getattr(other, name) for name in ("frames", "reasons", *SUMMED)}
+        return replace(self, **sums)
+
+
+def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (h, w) each: an offset's (3,) component along each pixel's unit ray, and the ray's cosine to the axis."""
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    length = np.linalg.norm(rays, axis=-1)
+    return rays @ offset_m / length, 1 / length
 
 
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
-    """Smooth white noise (h, w) of unit variance: unit variance, autocorrelation exp(-k^2 / 2 length^2), periodic.
-
-    Through a Gaussian of s it has autocorrelation exp(-k^2 / 4 s^2), so s = length / sqrt 2; its variance falls to the
-    kernel's sum of squares, 1 / (4 pi s^2) where s is some pixels and far less than the field.
-    """
+    """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic: by a Gaussian of
+    length / sqrt 2, whose variance falls to the kernel's sum of squares."""
     s = length_px / np.sqrt(2)
     smooth, power = ndimage.gaussian_filter(white, s, mode="wrap"), []
     for size in white.shape:
-        impulse = np.zeros(size)
-        impulse[0] = 1.0
+        impulse = np.eye(1, size)[0]
         power.append(float((ndimage.gaussian_filter1d(impulse, s, mode="wrap") ** 2).sum()))
     return np.asarray(smooth / np.sqrt(np.prod(power)))
 
 
 def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return phasors (f, h, w) and intensity (h, w) of all light, or of direct light only where multipath is off.
-
-    The intensity of the direct part is taken as its longest phasor over the frequencies: exact where one surface fills
-    the pixel, too small where the phasors of two surfaces cancel at every frequency.
-    """
+    """Return phasors (f, h, w) and intensity (h, w) of all light, or of direct light only where multipath is off: then
+    the longest phasor over the frequencies, too small where two surfaces cancel at every frequency."""
     if effects.multipath:
         return view.phasor, view.intensity
     return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
 
 
 def unit_error_m(camera: AnyCamera, config: CameraConfig, slope_x: np.ndarray) -> np.ndarray:
-    """Return the error of range in metres that all frames of a unit share, for pixels with x/z = ``slope_x``: its drift
-    and its constant offset, drawn from its seed, as far as they are on."""
-    error = drift_m(camera.unit, config.effects, config.minutes_since_power_on, slope_x)
+    """Return the drift and constant offset in metres, of pixels with x/z = ``slope_x``, as far as they are on."""
+    error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, slope_x)
     if config.effects.unit_offset:
         deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
         error = error + deviation * camera.unit.offset_mm.value * MM
     return np.asarray(error)
 
 
-def drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:
-    """Return the error of range in metres ``minutes`` after power-on, for pixels with x/z = ``slope_x``; zeros where
-    off."""
+def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:
+    """Return the error of range ``minutes`` after power-on; zeros where off."""
     if not effects.warm_up_drift:
         return np.zeros(slope_x.shape)
     decayed = facts.drift_mm.value * MM * np.exp(-minutes / facts.drift_min.value)
@@ -64,15 +101,13 @@ def drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: n
 def frame_errors_m(
     facts: UnitFacts, effects: EffectsConfig, minutes: float, rng: np.random.Generator
 ) -> Iterator[float]:
-    """Yield endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few; 0 where off.
-
-    To them comes what the drift, on the axis, has changed since the first frame, ``minutes`` after power-on.
-    """
+    """Yield endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few, and what the
+    drift, on the axis, has changed since the first frame, ``minutes`` after power-on; 0 where off."""
     axis = np.zeros(1)
-    first = drift_m(facts, effects, minutes, axis)[0]
+    first = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
         now = minutes + frame / facts.frames_per_second.value / 60
-        drifted = float(drift_m(facts, effects, now, axis)[0] - first)
+        drifted = float(_drift_m(facts, effects, now, axis)[0] - first)
         jitter, sign, chance = rng.standard_normal(), rng.choice([-1.0, 1.0]), rng.random()
         jump = sign * facts.jump_mm.value if chance < facts.jump_rate.value else 0.0
         moved = float(jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0

@@ -7,8 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import transform_points
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, transform_points
 from scenes.target.custom import (
     BoardConfig,
     CylinderConfig,
@@ -18,8 +17,7 @@ from scenes.target.custom import (
     TapeConfig,
     TargetConfig,
 )
-from scenes.target.face import Face, backing_corners_board_m, face_grid_m, face_of
-from scenes.target.truth import widest_rim_m
+from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, widest_rim_m
 
 STEEPEST_SLOPE = 4 / 3
 """dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius. Steeper, the size in plan misleads."""
@@ -54,8 +52,7 @@ def check_target(config: TargetConfig) -> None:
 
 
 def _name(damage: HoleConfig | DentConfig) -> str:
-    kind = "dent" if damage.kind == "dent" else "hole"
-    x, y = damage.centre_mm
+    kind, (x, y) = "dent" if damage.kind == "dent" else "hole", damage.centre_mm
     return f"{kind} {damage.id} (diameter {damage.diameter_mm:g} mm at ({x:g}, {y:g}) mm)"
 
 
@@ -77,11 +74,10 @@ def _board_problems(board: BoardConfig) -> list[str]:
             ]
     face = face_of(board)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, 65) * MM, np.linspace(-half_y, half_y, 65) * MM)
-    steepest = float(np.abs(face.slope(x, y)).max())
+    steepest, tightest = (float(np.abs(of(x, y)).max()) for of in (face.slope, face.curvatures))
     # A sphere at 0.8 of its radius has this slope exactly, hence the allowance for rounding.
     if steepest > STEEPEST_SLOPE * (1 + 1e-9):
         return [f"board: its face is too steep: slope {steepest:.3g}, the limit is {STEEPEST_SLOPE:.3g}"]
-    tightest = float(np.abs(face.curvatures(x, y)).max())
     if board.thickness_mm * MM * tightest > THICKEST_BEND:
         return [
             f"board: radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of "
@@ -92,40 +88,39 @@ def _board_problems(board: BoardConfig) -> list[str]:
 
 def _damage_problems(damage: HoleConfig | DentConfig, board: BoardConfig, face: Face) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
-    name, problems = _name(damage), []
-    if not (abs(damage.centre_mm[0]) < board.width_mm / 2 and abs(damage.centre_mm[1]) < board.height_mm / 2):
+    name, (x, y), depth_mm, problems = _name(damage), damage.centre_m, damage.depth_mm, []
+    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
+    if not (abs(x) < half_x and abs(y) < half_y):
         return [f"{name}: its centre is off {_size(board)}"]
-    tightest = float(np.abs(face.curvatures(*damage.centre_m)).max())
-    if damage.diameter_mm / 2 * MM * tightest > WIDEST_BEND:
+    tightest = float(np.abs(face.curvatures(x, y)).max())
+    if damage.radius_m * tightest > WIDEST_BEND:
         return [f"{name}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
     if isinstance(damage, DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
-        return [
-            f"{name}: too shallow ({damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm) for a "
-            f"face bent to a radius of {1 / tightest / MM:.3g} mm there"
-        ]
-    if damage.depth_mm is not None and damage.depth_mm >= board.thickness_mm:
+        ball = f"{damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm"
+        return [f"{name}: too shallow ({ball}) for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
+    if depth_mm is not None and depth_mm >= board.thickness_mm:
         problems.append(
-            f"{name}: depth {damage.depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
+            f"{name}: depth {depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
         )
     if isinstance(damage, DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
-        problems.append(
-            f"{name}: depth {damage.depth_mm:g} mm is more than its radius {damage.diameter_mm / 2:g} mm, "
-            "which no spherical cap has"
-        )
+        radius = f"its radius {damage.diameter_mm / 2:g} mm"
+        problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, which no spherical cap has")
     # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
     # normals of the edge, so below the face the limits move by the depth times the normal there.
-    x, y = damage.centre_m
     centre, axis = face.point(x, y), face.normal(x, y)
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
     rim = widest_rim_m(damage, face) * (np.cos(angle) * across + np.sin(angle) * np.cross(axis, across))
-    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    edges = ((0, 1.0, (half_x, y)), (0, -1.0, (-half_x, y)), (1, 1.0, (x, half_y)), (1, -1.0, (x, -half_y)))
     over = []
     for depth_m in (0.0, _reach_m(damage, board)):
         points = centre - depth_m * axis + rim
-        for along, side, edge in edges:
+        for along, side, edge in (
+            (0, 1, (half_x, y)),
+            (0, -1, (-half_x, y)),
+            (1, 1, (x, half_y)),
+            (1, -1, (x, -half_y)),
+        ):
             limit = (face.point(*edge) - depth_m * face.normal(*edge))[along]
             over.append(float((side * (points[:, along] - limit)).max()) / MM)
     if max(over) > -LEAST_WEB_MM:
@@ -142,8 +137,8 @@ def _reach_m(damage: HoleConfig | DentConfig, board: BoardConfig) -> float:
 
 def _overlap_problems(damages: list[HoleConfig | DentConfig], board: BoardConfig, face: Face) -> list[str]:
     """Find pairs without a web between them, at the face or at the depth that both reach."""
-    places = np.array([damage.centre_mm for damage in damages]).reshape(-1, 2) * MM
-    centres, axes = face.point(places[:, 0], places[:, 1]), face.normal(places[:, 0], places[:, 1])
+    x, y = np.array([damage.centre_m for damage in damages]).reshape(-1, 2).T
+    centres, axes = face.point(x, y), face.normal(x, y)
     rims_m = np.array([widest_rim_m(damage, face) for damage in damages])
     reach_m = np.array([_reach_m(damage, board) for damage in damages])
     first, second = np.triu_indices(len(damages), k=1)
@@ -158,11 +153,15 @@ def _overlap_problems(damages: list[HoleConfig | DentConfig], board: BoardConfig
     ]
 
 
+def _turn(tape: TapeConfig) -> np.ndarray:
+    """Return the 2x2 matrix from a strip's own axes to the board's."""
+    angle = np.deg2rad(tape.angle_deg)
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
 def off_tape_mm(tape: TapeConfig, places_mm: np.ndarray) -> np.ndarray:
     """Return the distance in plan of places (n, 2) from a strip, mm; 0 on it."""
-    angle = np.deg2rad(tape.angle_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    beyond = np.abs((places_mm - tape.centre_mm) @ turn) - np.array(tape.size_mm) / 2
+    beyond = np.abs((places_mm - tape.centre_mm) @ _turn(tape)) - np.array(tape.size_mm) / 2
     return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=-1))
 
 
@@ -174,9 +173,7 @@ def _tape_problems(config: TargetConfig) -> list[str]:
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y) = tape.size_mm, tape.centre_mm
         name = f"tape {number} ({width:g} x {height:g} mm at ({x:g}, {y:g}) mm)"
-        angle = np.deg2rad(tape.angle_deg)
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2) @ turn.T + (x, y)
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2) @ _turn(tape).T + (x, y)
         over = float((np.abs(corners) - np.array([config.board.width_mm, config.board.height_mm]) / 2).max())
         if over > 0:
             problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")
@@ -185,8 +182,8 @@ def _tape_problems(config: TargetConfig) -> list[str]:
             if gap <= 0:
                 problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
     for (first, strip), (second, other) in combinations(enumerate(config.tapes, start=1), 2):
-        first_box, second_box = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (strip, other))
-        _, shared = cv2.rotatedRectangleIntersection(first_box, second_box)
+        one, two = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (strip, other))
+        _, shared = cv2.rotatedRectangleIntersection(one, two)
         shared_mm2 = 0.0 if shared is None else cv2.contourArea(cv2.convexHull(shared))
         if shared_mm2 > 1e-3:
             problems.append(f"tape {first} and tape {second} lie on each other over {shared_mm2:.3g} mm2")
@@ -195,20 +192,17 @@ def _tape_problems(config: TargetConfig) -> list[str]:
 
 def _pose_problems(config: TargetConfig) -> list[str]:
     """Find a board that reaches behind the lens, through the floor or, with its backing, into the wall."""
-    T_camera_board, board = config.pose.T_camera_board, config.board
-    solid = [face_grid_m(board, depth_m).reshape(-1, 3) for depth_m in (0.0, board.thickness_mm * MM)]
+    T_camera_board, room, problems = config.pose.T_camera_board, config.room, []
+    solid = [face_grid_m(config.board, depth_m).reshape(-1, 3) for depth_m in (0.0, config.board.thickness_mm * MM)]
     points = transform_points(T_camera_board, np.concatenate(solid))
     nearest_m, lowest_m, farthest_m = points[:, 2].min(), points[:, 1].max(), points[:, 2].max()
     if config.backing is not None:
         backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
         farthest_m = max(farthest_m, backing[:, 2].max())
-    problems = []
     if nearest_m < NEAREST_M:
-        problems.append(
-            f"pose: the board's nearest point is {nearest_m:.3g} m before the lens; the limit is {NEAREST_M} m"
-        )
-    floor_m = config.room.floor_below_lens_m if config.room else None
-    wall_m = config.room.back_wall_distance_m if config.room else None
+        said = f"nearest point is {nearest_m:.3g} m before the lens; the limit is {NEAREST_M} m"
+        problems.append(f"pose: the board's {said}")
+    floor_m, wall_m = (room.floor_below_lens_m, room.back_wall_distance_m) if room else (None, None)
     if floor_m is not None and lowest_m >= floor_m:
         problems.append(f"room: the board reaches {lowest_m:.3g} m below the lens, through the floor at {floor_m:g} m")
     if wall_m is not None and farthest_m >= wall_m:

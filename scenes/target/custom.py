@@ -3,8 +3,7 @@
 Frames. ``board``: x along the row, y up the face, z out of the face towards the camera, origin on the face's centre.
 ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
 +x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
-fields are checked here; what concerns several together (a hole that leaves the board) by `scenes.target.checks`.
-"""
+fields are checked here; what concerns several together (a hole that leaves the board) by `scenes.target.checks`."""
 
 from __future__ import annotations
 
@@ -15,13 +14,10 @@ from pydantic import Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import rotation_xyz_deg
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, rotation_xyz_deg
 
 NEAR_NM = 20.0
-"""An albedo holds this far around its wavelength: reflectances of wood and paint change by a per cent or two over it in
-the near infrared (a guess), less than what the albedo itself is known to."""
-
+"""An albedo holds this far around its wavelength: over it wood and paint change by a per cent or two (a guess)."""
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Coordinate = Annotated[float, Field(ge=-5e3, le=5e3)]
@@ -56,11 +52,7 @@ class SphereConfig(_RoundConfig):
 
 
 class TermConfig(Config):
-    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y / height)^power_y.
-
-    Co-ordinates count in half boards, so a coefficient is the term's height in millimetres at the edge. No constant
-    term: the face's centre is the frame's origin.
-    """
+    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y / height)^power_y."""
 
     power_x: Annotated[int, Field(ge=0, le=8)]
     power_y: Annotated[int, Field(ge=0, le=8)]
@@ -141,8 +133,7 @@ class DentConfig(DamageConfig):
     @property
     def ball_m(self) -> float:
         """Radius of the ball whose cap on a flat face has this rim and depth."""
-        depth_m = self.depth_mm * MM
-        return (self.radius_m**2 + depth_m**2) / (2 * depth_m)
+        return (self.radius_m**2 + (self.depth_mm * MM) ** 2) / (2 * self.depth_mm * MM)
 
 
 class TapeConfig(Config):
@@ -161,8 +152,8 @@ class MaterialConfig(Config):
 
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = Field(
-        default=0.05, description="standard deviation of the albedo over its mean, before clipping to 0..1"
+    grain_contrast: float = Field(
+        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean, before clipping to 0..1"
     )
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
@@ -171,14 +162,11 @@ class MaterialConfig(Config):
 class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
-    distance_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(
-        description="behind the deepest point of the back face"
-    )
+    distance_mm: float = Field(ge=0.0, le=5e3, description="behind the deepest point of the back face")
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
     size_mm: SizeMm | None = Field(
-        default=None,
-        description="none: the board's shadow as seen from the lens at zero tilt, so that it fills every hole",
+        None, description="none: the board's shadow as seen from the lens at zero tilt, so that it fills every hole"
     )
 
 
@@ -191,10 +179,8 @@ class RoomConfig(Config):
     back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = None
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
-    width_m: Annotated[float, Field(ge=0.5, le=40.0)] = Field(default=4.0, description="of floor and wall, centred")
-    height_m: Annotated[float, Field(ge=0.5, le=20.0)] = Field(
-        default=2.5, description="of the wall, up from the floor"
-    )
+    width_m: float = Field(4.0, ge=0.5, le=40.0, description="of floor and wall, centred")
+    height_m: float = Field(2.5, ge=0.5, le=20.0, description="of the wall, up from the floor")
 
 
 class WavelengthConfig(Config):
@@ -221,10 +207,8 @@ class PoseConfig(Config):
     @property
     def T_camera_board(self) -> np.ndarray:
         """4x4: board to camera. The board is turned in its own axes (x, then y, then z), then set before the lens.
-
         Positive ``tilt_x_deg`` brings the upper edge nearer, positive ``tilt_y_deg`` the -x edge, positive ``roll_deg``
-        lifts the +x edge.
-        """
+        lifts the +x edge."""
         T_camera_board = np.eye(4)
         turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
         T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
@@ -244,8 +228,8 @@ class TargetConfig(Config):
     backing: BackingConfig | None = None
     room: RoomConfig | None = None
     pose: PoseConfig = PoseConfig()
-    other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
-        default=(), description="for cameras that do not work near 850 nm"
+    other_wavelengths: tuple[WavelengthConfig, ...] = Field(
+        (), max_length=20, description="for cameras that do not work near 850 nm"
     )
 
     @model_validator(mode="after")
@@ -271,9 +255,7 @@ class TargetConfig(Config):
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
-
-        Raises UserError where the declaration has none for it, or lacks the albedo of one of its surfaces.
-        """
+        Raises UserError where the declaration has none for it, or lacks the albedo of one of its surfaces."""
         near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
         from_850 = abs(wavelength_nm - 850.0)
         if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):
@@ -286,25 +268,24 @@ class TargetConfig(Config):
                 fix=f"declare other_wavelengths: [{{wavelength_nm: {wavelength_nm:g}, board: ..., tape: ..., ...}}]",
             )
         albedos = min(near, key=lambda albedos: abs(albedos.wavelength_nm - wavelength_nm))
-        room, lacking = self.room, []
-        changed: dict[str, Any] = {
-            "other_wavelengths": (),
-            "material": self.material.model_copy(update={"albedo_850": albedos.board}),
+        room = self.room
+        surfaces = {
+            "tape": bool(self.tapes),
+            "backing": self.backing is not None,
+            "floor": room is not None and room.floor_below_lens_m is not None,
+            "back_wall": room is not None and room.back_wall_distance_m is not None,
         }
-        if self.tapes:
-            lacking += ["tape"] * (albedos.tape is None)
-            changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
-        if self.backing is not None:
-            lacking += ["backing"] * (albedos.backing is None)
-            changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
-        if room is not None:
-            lacking += ["floor"] * (room.floor_below_lens_m is not None and albedos.floor is None)
-            lacking += ["back_wall"] * (room.back_wall_distance_m is not None and albedos.back_wall is None)
-            named = {"floor_albedo_850": albedos.floor, "back_wall_albedo_850": albedos.back_wall}
-            changed["room"] = room.model_copy(update={key: value for key, value in named.items() if value is not None})
+        lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
         if lacking:
             raise UserError(
                 f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}",
                 legal="an albedo for every surface that the target has",
             )
-        return self.model_copy(update=changed)
+        changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": albedos.board})}
+        changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
+        if self.backing is not None:
+            changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
+        if room is not None:
+            named = {f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")}
+            changed["room"] = room.model_copy(update={key: value for key, value in named.items() if value is not None})
+        return self.model_copy(update={**changed, "other_wavelengths": ()})

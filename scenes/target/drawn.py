@@ -6,24 +6,22 @@ purpose and its number. So a board is the same however many others there are, an
 nothing else: at another distance, albedo, kind of hole or depth the boards keep their places, sizes and tilts, and
 their results are paired.
 
-Not modelled: damage that is not round, damage that is correlated (a row, a cluster), several kinds on one board.
-"""
+Not modelled: damage that is not round, damage that is correlated (a row, a cluster), several kinds on one board."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
 from itertools import product
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import invert
+from harness.vocabulary.geometry import MM, invert
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.custom import (
     Albedo,
@@ -40,7 +38,7 @@ from scenes.target.custom import (
     TargetConfig,
     WavelengthConfig,
 )
-from scenes.target.face import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
+from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
 Purpose = Literal["calibration", "hole_free", "damaged"]
 """Purpose of boards: to set a threshold, to count false calls, to be inspected; each has boards of its own."""
@@ -60,40 +58,23 @@ def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 Diameter = Annotated[float, Field(ge=0.2, le=1e3)]
-Diameters = Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
 Depth = Annotated[float, Field(ge=0.04, le=500.0)]
 Depths = Annotated[tuple[Depth, Depth], AfterValidator(_ascending)]
+Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
 class DrawnThrough(Config):
-    """Holes drilled through: number and sizes, as of every kind of drawn damage.
-
-    The range of sizes is parted into ``per_board`` equal parts, and every board has one size from each, uniform within
-    it: over all boards sizes are uniform, and each board covers the range evenly.
-    """
+    """Holes drilled through: number and sizes, as of every kind of drawn damage. The range of sizes is parted into
+    ``per_board`` equal parts, and every board has one size from each, uniform within it: over all boards sizes are
+    uniform, and each board covers the range evenly."""
 
     kind: Literal["through"]
     per_board: Annotated[int, Field(ge=1, le=100)]
-    diameter_mm: Diameters
+    diameter_mm: Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
     sizes: Literal["uniform", "log"] = Field(
         default="uniform",
         description="uniform in the diameter, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
     )
-
-    def diameters_mm(self, rng: np.random.Generator) -> list[float]:
-        """Draw a size from each part of the range, ascending."""
-        low, high = self.diameter_mm
-        quantiles = (np.arange(self.per_board) + rng.random(self.per_board)) / self.per_board
-        sizes = low * (high / low) ** quantiles if self.sizes == "log" else low + (high - low) * quantiles
-        drawn: list[float] = np.clip(sizes, low, high).tolist()
-        return drawn
-
-    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float] | None:
-        """Return the declared depths that damage of this size can have on a face of this curvature.
-
-        There is none if low > high; None for damage without a depth of its own.
-        """
-        return None
 
 
 class DrawnBlind(DrawnThrough):
@@ -103,10 +84,6 @@ class DrawnBlind(DrawnThrough):
     kind: Literal["blind"]  # type: ignore[assignment]
     depth_mm: Depths
 
-    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
-        """See `DrawnThrough`."""
-        return self.depth_mm
-
 
 class DrawnDents(DrawnThrough):
     """Spherical caps. Depths as of blind holes, but of that part of the range which is legal for the dent's size: no
@@ -115,32 +92,14 @@ class DrawnDents(DrawnThrough):
     kind: Literal["dent"]  # type: ignore[assignment]
     depth_mm: Depths
 
-    def legal_depths_mm(self, diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
-        """See `DrawnThrough`."""
-        return max(self.depth_mm[0], shallowest_mm(diameter_mm, bend_per_mm)), min(self.depth_mm[1], diameter_mm / 2)
-
-
-DrawnDamage = Annotated[DrawnThrough | DrawnBlind | DrawnDents, Field(discriminator="kind")]
-
-
-def shallowest_mm(diameter_mm: float, bend_per_mm: float) -> float:
-    """Return the depth of a dent whose ball's radius is `SHALLOWEST_BEND` of a face's radius of curvature; 0 on a flat
-    face."""
-    reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
-    if reach >= 1:
-        return diameter_mm / 2
-    return diameter_mm / 2 * reach / (1 + math.sqrt(1 - reach**2))
-
 
 class DrawnMaterialConfig(Config):
     """Reflectance of the boards, as in MaterialConfig, but every board has a grain of its own."""
 
     albedo_850: Albedo = Field(default=0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = Field(default=0.05, description="a guess: moderate")
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(
-        default=8.0, description="between the dark lines of a peeled softwood veneer; a guess"
-    )
+    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = 0.05
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = 8.0
 
 
 class DrawnTargetConfig(Config):
@@ -151,7 +110,7 @@ class DrawnTargetConfig(Config):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
         default=1, description="of the boards; an experiment's own seed draws the noise, and another keeps the boards"
     )
-    damage: DrawnDamage
+    damage: Annotated[DrawnThrough | DrawnBlind | DrawnDents, Field(discriminator="kind")]
     board: BoardConfig = Field(
         default_factory=lambda: BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=FlatConfig()),
         description="the thesis' half an inch of plywood, of 12 x 8 in: its face has as many pixels as the thesis' "
@@ -170,10 +129,8 @@ class DrawnTargetConfig(Config):
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = Field(
         default=(), description="the same on all boards; none: one view needs no marks"
     )
-    distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = Field(
-        default=0.7, description="as the thesis' board"
-    )
-    distance_jitter_mm: Annotated[float, Field(ge=0.0, le=1e3)] = Field(
+    distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = 0.7
+    distance_jitter_mm: Jitter = Field(
         default=10.0, description="ten of the camera's steps of 1 mm, so that a limit does not hang on one of them"
     )
     offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(
@@ -182,104 +139,68 @@ class DrawnTargetConfig(Config):
     tilt_deg: Annotated[float, Field(ge=0.0, le=70.0)] = Field(
         default=8.0, description="about x and about y: as far off frontal as is plausible for a sheet put up by hand"
     )
-    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(
-        default=2.0, description="a board is set down level, by eye"
-    )
+    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(default=2.0, description="a board is set down by eye")
     material: DrawnMaterialConfig = DrawnMaterialConfig()
     backing: BackingConfig | None = Field(
         default=BackingConfig(distance_mm=20.0),
         description="as behind the thesis' board. Without a size it fills every hole in every pose that can be drawn",
     )
-    room: RoomConfig | None = Field(
-        default=RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5), description="as the thesis' board's"
-    )
+    room: RoomConfig | None = RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5)
     other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
         default=(), description="for cameras that do not work near 850 nm"
     )
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        damage, board, bend_per_mm, problems = self.damage, self.board, self._bend_per_mm, []
-        if isinstance(damage, DrawnBlind | DrawnDents) and damage.depth_mm[1] >= board.thickness_mm:
-            problems.append(
-                f"damage.depth_mm: {damage.depth_mm[1]:g} mm is not less than the board's thickness, "
-                f"{board.thickness_mm:g} mm"
-            )
-        if isinstance(damage, DrawnDents):
-            # Both limits of a depth grow with the diameter, so the ends of the sizes tell for all.
-            for diameter_mm in sorted(set(damage.diameter_mm)):
-                least_mm, most_mm = damage.legal_depths_mm(diameter_mm, bend_per_mm)
-                if least_mm > most_mm:
-                    problems.append(
-                        f"damage.depth_mm: a dent {diameter_mm:g} mm wide on this face can be "
-                        f"{shallowest_mm(diameter_mm, bend_per_mm):.3g} to {diameter_mm / 2:g} mm deep, not "
-                        f"{damage.depth_mm[0]:g} to {damage.depth_mm[1]:g} mm"
-                    )
-        widest_mm = damage.diameter_mm[1]
+        damage, board, bend_per_mm, problems = self.damage, self.board, _tightest_per_mm(self.board), []
+        thick, (low_mm, widest_mm), jitter_mm = board.thickness_mm, damage.diameter_mm, self.distance_jitter_mm
+        if isinstance(damage, DrawnBlind | DrawnDents) and damage.depth_mm[1] >= thick:
+            deep = f"{damage.depth_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
+            problems.append(f"damage.depth_mm: {deep}")
+        # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
+        ends = {low_mm: _dent_depths_mm(low_mm, bend_per_mm), widest_mm: _dent_depths_mm(widest_mm, bend_per_mm)}
+        declared = damage.depth_mm if isinstance(damage, DrawnDents) else (0.0, math.inf)
+        for diameter_mm, (least_mm, most_mm) in ends.items():
+            if max(declared[0], least_mm) > min(declared[1], most_mm):
+                can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
+                problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
         if widest_mm / 2 * bend_per_mm > WIDEST_BEND:
-            problems.append(
-                f"damage.diameter_mm: {widest_mm:g} mm is too wide for a face bent to a radius of "
-                f"{1 / bend_per_mm:.3g} mm"
-            )
-        needed_mm = 2 * self._rim_mm * self._shrinkage + LEAST_WEB_MM
+            wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
+            problems.append(f"damage.diameter_mm: {wide}")
+        rim_mm, shrinkage, margin_mm = self._room_mm()
+        needed_mm = 2 * rim_mm * shrinkage + LEAST_WEB_MM
         if self.apart_mm < needed_mm:
-            problems.append(
-                f"apart_mm: {self.apart_mm:g} mm lets holes of {widest_mm:g} mm meet; it must be "
-                f"{needed_mm:.4g} mm or more"
-            )
-        if self._free_half_mm.min() < 0:
-            problems.append(
-                f"board: {board.width_mm:g} x {board.height_mm:g} mm leaves no place for a centre that is "
-                f"{self._margin_mm:.4g} mm off every edge"
-            )
-        jitter_m = self.distance_jitter_mm * MM
-        if self.distance_m - jitter_m < NEAREST_M or self.distance_m + jitter_m > FARTHEST_M:
-            problems.append(
-                f"distance_jitter_mm: {self.distance_jitter_mm:g} mm leads from {self.distance_m:g} m beyond "
-                f"{NEAREST_M:g} to {FARTHEST_M:g} m"
-            )
+            meet = f"{self.apart_mm:g} mm lets holes of {widest_mm:g} mm meet"
+            problems.append(f"apart_mm: {meet}; it must be {needed_mm:.4g} mm or more")
+        if min(board.width_mm, board.height_mm) / 2 < margin_mm:
+            off = f"no place for a centre that is {margin_mm:.4g} mm off every edge"
+            problems.append(f"board: {board.width_mm:g} x {board.height_mm:g} mm leaves {off}")
+        if not NEAREST_M <= self.distance_m - jitter_mm * MM <= self.distance_m + jitter_mm * MM <= FARTHEST_M:
+            limits = f"{NEAREST_M:g} to {FARTHEST_M:g} m"
+            problems.append(f"distance_jitter_mm: {jitter_mm:g} mm leads from {self.distance_m:g} m beyond {limits}")
         if problems:
             raise ValueError("; ".join(problems))
         return self
 
-    @property
-    def _bend_per_mm(self) -> float:
-        return _tightest_per_mm(self.board)
-
-    @property
-    def _shrinkage(self) -> float:
-        """Factor by which axes along a bent face's normals must start farther apart, in plan, so as not to meet within
-        the board: parallel surfaces at a depth t shrink by 1 - t / radius of curvature."""
-        return 1 / (1 - min(self.board.thickness_mm * self._bend_per_mm, 0.5))
-
-    @property
-    def _rim_mm(self) -> float:
-        """Largest radius of a rim. A dent's on a face that bends away is up to sqrt 2 larger than on a flat one;
-        allowed for with holes too, so that the kind of damage does not change its places."""
-        return self.damage.diameter_mm[1] / 2 * (math.sqrt(2) if self._bend_per_mm > 0 else 1.0)
-
-    @property
-    def _margin_mm(self) -> float:
-        """Least distance of centres from the edge: the same for all sizes, so that size and place are independent."""
-        return (self.edge_mm + self._rim_mm) * self._shrinkage
-
-    @property
-    def _free_half_mm(self) -> np.ndarray:
-        """Half the width and height (2,) of the rectangle in which centres may lie; negative where there is none."""
-        return np.array([self.board.width_mm, self.board.height_mm]) / 2 - self._margin_mm
-
-    # ---- boards -----------------------------------------------------------------------------------------------------
+    def _room_mm(self) -> tuple[float, float, float]:
+        """Return the largest radius of a rim; the factor by which axes along a bent face's normals start farther apart
+        in plan, so as not to meet within the board (parallel surfaces at a depth t shrink by 1 - t / radius of
+        curvature); and the least distance of centres from the edge, the same for all sizes, so that size and place are
+        independent. A dent's rim on a face that bends away is up to sqrt 2 larger than on a flat one; allowed for with
+        holes too, so that the kind of damage does not change its places."""
+        bend_per_mm = _tightest_per_mm(self.board)
+        rim_mm = self.damage.diameter_mm[1] / 2 * (math.sqrt(2) if bend_per_mm > 0 else 1.0)
+        shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
+        return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
 
     def declare(self) -> TargetConfig:
         """Return the first damaged board, for programs that look at one target."""
         return self.drawn("damaged", 0)
 
     def drawn(self, purpose: Purpose, number: int) -> TargetConfig:
-        """Return a board of the family, with its damage; ids count from 1 in the order of size.
-
-        Boards that are to be hole-free have damage too: call ``hole_free()`` on the answer, and what was left out
-        are unflawed sites, placed as damage is. Raises UserError where the board is too full for the damage.
-        """
+        """Return a board of the family, with its damage; ids count from 1 in the order of size. Boards that are to be
+        hole-free have damage too: call ``hole_free()`` on the answer, and what was left out are unflawed sites, placed
+        as damage is. Raises UserError where the board is too full for the damage."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
@@ -288,40 +209,30 @@ class DrawnTargetConfig(Config):
             drawn: list[float] = (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
             return drawn
 
-        count, depths = self.damage.per_board, stream("depths")
+        damage, count, depths = self.damage, self.damage.per_board, stream("depths")
+        made: list[HoleConfig | DentConfig] = []
+        (low, high), parts = damage.diameter_mm, (np.arange(count) + stream("diameters").random(count)) / count
+        sizes = low * (high / low) ** parts if damage.sizes == "log" else low + (high - low) * parts
         quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
         # What is placed first has the freest choice: which size that is, is drawn too.
         places_mm = stream("order of places").permutation(self._places_mm(stream("places"))).tolist()
-        holes: list[HoleConfig] = []
-        dents: list[DentConfig] = []
-        rows = zip(self.damage.diameters_mm(stream("diameters")), quantiles, places_mm, strict=True)
-        for place, (size, quantile, (x, y)) in enumerate(rows, start=1):
-            legal, depth = self.damage.legal_depths_mm(size, self._bend_per_mm), None
-            if legal is not None:
-                depth = float(min(legal[0] + (legal[1] - legal[0]) * quantile, legal[1]))
-            if self.damage.kind == "dent":
-                assert depth is not None
-                dents.append(DentConfig(id=place, diameter_mm=size, depth_mm=depth, centre_mm=(x, y)))
-            else:
-                holes.append(
-                    HoleConfig(id=place, diameter_mm=size, centre_mm=(x, y), kind=self.damage.kind, depth_mm=depth)
-                )
-        pose = (
-            *within("distance", self.distance_jitter_mm, 1),
-            *within("offset", self.offset_mm, 2),
-            *within("tilt", self.tilt_deg, 2),
-            *within("roll", self.roll_deg, 1),
-        )
+        for size, quantile, (x, y) in zip(np.clip(sizes, low, high).tolist(), quantiles, places_mm, strict=True):
+            facts: dict[str, Any] = {"id": len(made) + 1, "diameter_mm": size, "centre_mm": (x, y)}
+            if isinstance(damage, DrawnBlind | DrawnDents):
+                least, most = damage.depth_mm
+                if isinstance(damage, DrawnDents):
+                    legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
+                    least, most = max(least, legal[0]), min(most, legal[1])
+                facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
+            made.append(DentConfig(**facts) if damage.kind == "dent" else HoleConfig(**facts, kind=damage.kind))
+        common: dict[str, Any] = {key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")}
+        common["dents" if damage.kind == "dent" else "holes"] = tuple(made)
+        pose = within("offset", self.offset_mm, 2) + within("tilt", self.tilt_deg, 2) + within("roll", self.roll_deg, 1)
         config = TargetConfig(
             board=self.board,
-            holes=tuple(holes),
-            dents=tuple(dents),
-            tapes=self.tapes,
+            **common,
             material=MaterialConfig(**self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))),
-            backing=self.backing,
-            room=self.room,
-            pose=self._posed(*pose),
-            other_wavelengths=self.other_wavelengths,
+            pose=self._posed(*within("distance", self.distance_jitter_mm, 1), *pose),
         )
         if self.backing is None or self.backing.size_mm is not None:
             return config
@@ -335,18 +246,21 @@ class DrawnTargetConfig(Config):
         diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
         rolls = [self.roll_deg, *(roll for roll in (diagonal_deg, 90 - diagonal_deg) if roll < self.roll_deg)]
         limits = (self.distance_jitter_mm, self.offset_mm, self.offset_mm, self.tilt_deg, self.tilt_deg)
-        signed = [signed for roll in rolls for signed in _both_signs(roll)]
-        return tuple(self._posed(*corner) for corner in product(*map(_both_signs, limits), signed))
+        signed = ((-limit, limit) if limit else (0.0,) for limit in limits)
+        return tuple(
+            self._posed(*c) for c in product(*signed, dict.fromkeys(s * roll for roll in rolls for s in (-1, 1)))
+        )
 
     def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
         """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free: apart from one
         another, off the board's edge and off any tape."""
-        half, count, best = self._free_half_mm, self.damage.per_board, 0
+        board, count, best, (rim_mm, _, margin_mm) = self.board, self.damage.per_board, 0, self._room_mm()
+        half = np.array([board.width_mm, board.height_mm]) / 2 - margin_mm
         for _ in range(ATTEMPTS):
             places = np.empty((0, 2))
             while len(places) < count:
                 tried = half * rng.uniform(-1.0, 1.0, (TRIES, 2))
-                free = np.all([off_tape_mm(tape, tried) > self._rim_mm for tape in self.tapes], axis=0)
+                free = np.all([off_tape_mm(tape, tried) > rim_mm for tape in self.tapes], axis=0)
                 free = free & (np.linalg.norm(tried[:, None] - places, axis=-1) >= self.apart_mm).all(axis=1)
                 if not free.any():
                     break
@@ -355,24 +269,25 @@ class DrawnTargetConfig(Config):
             if best == count:
                 return places
         raise UserError(
-            f"a board of {self.board.width_mm:g} x {self.board.height_mm:g} mm is too full for {count} damages whose "
-            f"centres are {self.apart_mm:g} mm apart and {self._margin_mm:.4g} mm off its edge: {best} found a place "
-            f"on the {2 * half[0]:g} x {2 * half[1]:g} mm that are left",
+            f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too full for {count} damages whose centres are "
+            f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm off its edge: {best} found a place on the "
+            f"{2 * half[0]:g} x {2 * half[1]:g} mm that are left",
             legal=f"fewer than {best} damages on this board" if best > 1 else None,
             fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board",
         )
 
-    def _posed(
-        self, jitter_mm: float, x_mm: float, y_mm: float, tilt_x: float, tilt_y: float, roll: float
-    ) -> PoseConfig:
-        return PoseConfig(
-            distance_m=self.distance_m + jitter_mm * MM,
-            offset_x_mm=x_mm,
-            offset_y_mm=y_mm,
-            tilt_x_deg=tilt_x,
-            tilt_y_deg=tilt_y,
-            roll_deg=roll,
-        )
+    def _posed(self, jitter_mm: float, *others: float) -> PoseConfig:
+        """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a roll."""
+        names = ("offset_x_mm", "offset_y_mm", "tilt_x_deg", "tilt_y_deg", "roll_deg")
+        return PoseConfig(distance_m=self.distance_m + jitter_mm * MM, **dict(zip(names, others, strict=True)))
+
+
+def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
+    """Return the depths that a dent can have: that of a ball whose radius is `SHALLOWEST_BEND` of the face's radius of
+    curvature (0 on a flat face), and its own radius."""
+    reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
+    least = 1.0 if reach >= 1 else reach / (1 + math.sqrt(1 - reach**2))
+    return diameter_mm / 2 * least, diameter_mm / 2
 
 
 @lru_cache(maxsize=256)
@@ -393,7 +308,3 @@ def _backing_size_mm(family: DrawnTargetConfig, z_m: float) -> tuple[float, floa
         half_m = np.maximum(half_m, np.abs(lens + steps[:, None] * (outline - lens))[:, :2].max(axis=0))
     width, height = np.minimum(2 * half_m / MM, WIDEST_BACKING_MM).tolist()
     return width, height
-
-
-def _both_signs(limit: float) -> tuple[float, ...]:
-    return (-limit, limit) if limit else (0.0,)

@@ -9,19 +9,17 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
-from harness.vocabulary.versions import RESULTS_VERSION
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.target.mesh import Target
 
 MESH_SUFFIXES = (".glb", ".ply")
 
 
 def write_mesh(target: Target, path: Path) -> None:
-    """Write all parts, in metres, by the suffix of ``path``.
-
-    ``.ply``: one binary mesh in the camera's frame (z forward, y down), each part's mean colour at its vertices.
-    ``.glb``: one node a part, the grain as a texture, in glTF's frame (y up, the camera at the origin looks along -z).
-    Colours are sRGB. Raises UserError for another suffix or where the file cannot be written.
-    """
+    """Write all parts, in metres, by the suffix of ``path``; colours are sRGB. ``.ply``: one binary mesh in the
+    camera's frame (z forward, y down), each part's mean colour at its vertices. ``.glb``: one node a part, the grain as
+    a texture, in glTF's frame (y up, the camera at the origin looks along -z). Raises UserError for another suffix or
+    where the file cannot be written."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: no mesh format is called {suffix or 'nothing'!r}", legal=" or ".join(MESH_SUFFIXES))
@@ -29,14 +27,9 @@ def write_mesh(target: Target, path: Path) -> None:
 
 
 def write_truth(target: Target, path: Path) -> None:
-    """Write the truth as JSON: the version, the declaration, ``T_camera_board`` (metres) and one row in millimetres per
-    damage."""
-    data = {
-        "results_version": RESULTS_VERSION,
-        "target": target.config.to_data(),
-        "T_camera_board": target.T_camera_board.tolist(),
-        "damages": [damage.to_row() for damage in target.truth],
-    }
+    """Write as JSON: version, declaration, ``T_camera_board`` (metres) and one row in millimetres per damage."""
+    data = {"results_version": RESULTS_VERSION, "target": target.config.to_data()}
+    data |= {"T_camera_board": target.T_camera_board.tolist(), "damages": [each.to_row() for each in target.truth]}
     write_text(path, json.dumps(data, indent=2) + "\n")
 
 

@@ -1,9 +1,8 @@
-"""Built targets, a renderer's input: parts with meshes and reflectances, and the truth beside them.
+"""Built targets, a renderer's input: parts with meshes and reflectances (wood grain), and the truth beside them.
 
-Textures. A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x),
-v = 1/2 - y / height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is
-at u = (column + 1/2) / columns, v = (row + 1/2) / rows; between centres bilinear, beyond the outermost constant.
-"""
+A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x), v = 1/2 - y /
+height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is at u = (column
++ 1/2) / columns, v = (row + 1/2) / rows; between centres bilinear, beyond the outermost constant."""
 
 from __future__ import annotations
 
@@ -12,24 +11,81 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, zoom
+from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, transform_points
+from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
-from scenes.target.custom import DentConfig, HoleConfig, TargetConfig
-from scenes.target.face import (
+from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, TargetConfig
+from scenes.target.truth import (
+    Damage,
     Face,
     backing_corners_board_m,
     face_of,
     floor_corners_camera_m,
     outline_board_m,
+    truth_of,
     wall_corners_camera_m,
 )
-from scenes.target.texture import grain, look_up, reflectance
-from scenes.target.truth import Damage, truth_of
 
 if TYPE_CHECKING:
     import trimesh
+
+TEXEL_MM = 0.6
+"""Finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera in view), coarse enough to make in 40 ms."""
+MAX_TEXELS = 4096
+"""Most texels along a side: a board of metres gets coarser texels instead of gigabytes."""
+LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6
+"""Amplitudes of growth lines and fibres in the pattern (their squares add to 1). A guess, as are the lengths below."""
+WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0
+"""Wander of growth lines (standard deviation), and its lengths across and along x."""
+FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5
+"""Correlation lengths of the fibres along and across x."""
+
+
+def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
+    """Return the grain of a board's face: (rows, columns) float64 with mean 0 and standard deviation 1. Not modelled:
+    knots, seams of the veneer, gloss, a contrast that depends on the wavelength."""
+    texel_mm = max(TEXEL_MM, width_mm / MAX_TEXELS, height_mm / MAX_TEXELS)
+    shape = tuple(max(2, round(size / texel_mm)) for size in (height_mm, width_mm))
+    stream = random_stream(material.grain_seed, "grain")
+    # coarse noise through a cubic spline
+    knots = [2 + round(n * texel_mm / s) for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)]
+    coarse, finer = stream.standard_normal(knots), [n / k for n, k in zip(shape, knots, strict=True)]
+    wander = _normalised(zoom(coarse, finer, order=3, mode="nearest"))
+    across_mm = (np.arange(shape[0])[:, None] + 0.5) * texel_mm + WANDER_MM * wander
+    turns = across_mm / material.grain_period_mm + stream.uniform()
+    # late wood: a thin dark line at the end of each ring, after a slow fall
+    lines = _normalised(-((turns % 1.0) ** 3))
+    noise, lengths = stream.standard_normal(shape, dtype=np.float32), (FIBRE_WIDTH_MM, FIBRE_LENGTH_MM)
+    fibres = gaussian_filter(noise, [length / texel_mm for length in lengths], mode="reflect", truncate=3.0)
+    return _normalised(LINE_WEIGHT * lines + FIBRE_WEIGHT * _normalised(fibres))
+
+
+def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray:
+    """Return albedo (rows, columns) float32 with exactly this mean: mean (1 + contrast pattern), clipped to 0..1. Where
+    clipping would move the mean, the pattern is lifted to bring it back; the contrast then falls short."""
+    raw, lift = mean * (1 + contrast * pattern), 0.0
+    if raw.min() < 0.0 or raw.max() > 1.0:
+        lift = float(brentq(lambda up: float(np.clip(raw + up, 0.0, 1.0).mean()) - mean, -2.0, 2.0, xtol=1e-9))
+    return np.clip(raw + lift, 0.0, 1.0).astype(np.float32)
+
+
+def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Return bilinear values (...[, channels]) of a texture (rows, columns[, channels]) at ``uv`` (..., 2)."""
+    rows, columns = texture.shape[:2]
+    places = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
+    channels = texture.reshape(rows, columns, -1)
+    values = [map_coordinates(channels[..., i], places, order=1, mode="nearest") for i in range(channels.shape[2])]
+    return np.stack(values, axis=-1) if texture.ndim == 3 else values[0]
+
+
+def _normalised(values: np.ndarray) -> np.ndarray:
+    centred = np.asarray(values, float) - np.mean(values, dtype=float)
+    return centred / max(float(centred.std()), 1e-12)
+
 
 COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 """Largest distance of facets from a bent face: well under a camera's noise, finer below shallow dents (depth / 400)."""
@@ -46,11 +102,8 @@ MAX_CELLS = 1_000_000
 @dataclass(frozen=True)
 class TargetPart:
     """A surface. ``mesh``: camera frame, metres, normals outwards; sharp edges share vertices, so use face normals.
-
-    ``uv`` (n_vertices, 2) in 0..1 places the textures (see the module); None where the part is
-    plain. ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and ``texture_rgb`` (h, w, 3),
-    float32 linear reflectances, None where plain.
-    """
+    ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and ``texture_rgb`` (h, w, 3), float32
+    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None where the part is plain."""
 
     name: str
     mesh: trimesh.Trimesh
@@ -59,12 +112,6 @@ class TargetPart:
     texture_850: np.ndarray | None
     rgb: np.ndarray
     texture_rgb: np.ndarray | None
-
-    def albedo_850_at(self, uv: np.ndarray) -> np.ndarray:
-        """Return albedo (...) at ``uv`` (..., 2); the mean where the part is plain."""
-        if self.texture_850 is None:
-            return np.full(uv.shape[:-1], self.albedo_850, dtype=np.float32)
-        return look_up(self.texture_850, uv)
 
     def rgb_at(self, uv: np.ndarray) -> np.ndarray:
         """Return red, green and blue albedo (..., 3) at ``uv`` (..., 2); the mean where the part is plain."""
@@ -75,11 +122,9 @@ class TargetPart:
 
 @dataclass(frozen=True)
 class Target:
-    """A built target.
-
-    ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as declared. ``truth``: holes, then dents.
-    ``outline_board_m`` (n, 3): the rim of the face, counter-clockwise seen from the camera. ``T_camera_board`` (4, 4).
-    """
+    """A built target. ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as declared. ``truth``:
+    holes, then dents. ``outline_board_m`` (n, 3): the rim of the face, counter-clockwise seen from the camera.
+    ``T_camera_board`` (4, 4)."""
 
     config: TargetConfig
     parts: tuple[TargetPart, ...]
@@ -95,56 +140,47 @@ class Target:
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
     check_target(config)
-    T_camera_board, face = config.pose.T_camera_board, face_of(config.board)
+    T_camera_board, board, material = config.pose.T_camera_board, config.board, config.material
     truth, sagitta_m = truth_of(config, T_camera_board), _sagitta_m(config)
-    parts = [_board(config, truth, T_camera_board)]
-
-    def add(name: str, mesh: trimesh.Trimesh, albedo_850: float, rgb: tuple[float, float, float]) -> None:
-        parts.append(TargetPart(name, mesh, None, albedo_850, None, np.array(rgb), None))
-
-    for number, tape in enumerate(config.tapes, start=1):
-        strip = sheet(
-            face,
-            (tape.size_mm[0] * MM, tape.size_mm[1] * MM),
-            top_m=tape.thickness_mm * MM,
-            bottom_m=-TAPE_SINK_M,
-            sagitta_m=sagitta_m,
-            centre_m=(tape.centre_mm[0] * MM, tape.centre_mm[1] * MM),
-            angle_rad=float(np.deg2rad(tape.angle_deg)),
-        )
-        add(f"tape_{number}", strip.apply_transform(T_camera_board), tape.albedo_850, tape.rgb)
-    backing, room = config.backing, config.room
-    if backing is not None:
-        plane = _rectangle(backing_corners_board_m(config, backing)).apply_transform(T_camera_board)
-        add("backing", plane, backing.albedo_850, backing.rgb)
-    if room is not None and room.floor_below_lens_m is not None:
-        plane = _rectangle(floor_corners_camera_m(room, room.floor_below_lens_m))
-        add("floor", plane, room.floor_albedo_850, room.floor_rgb)
-    if room is not None and room.back_wall_distance_m is not None:
-        plane = _rectangle(wall_corners_camera_m(room, room.back_wall_distance_m))
-        add("back_wall", plane, room.back_wall_albedo_850, room.back_wall_rgb)
-    return Target(config, tuple(parts), truth, T_camera_board, outline_board_m(config.board))
-
-
-def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
-    """Return the board less its damage, watertight, board frame."""
-    size_m = config.board.width_mm * MM, config.board.height_mm * MM
-    thickness_m = config.board.thickness_mm * MM
-    body = sheet(face_of(config.board), size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=_sagitta_m(config))
-    return subtract(body, [cutter(damage, item) for damage, item in zip(truth, config.damages, strict=True)])
-
-
-def _board(config: TargetConfig, truth: tuple[Damage, ...], T_camera_board: np.ndarray) -> TargetPart:
-    mesh, material, board = board_solid(config, truth), config.material, config.board
+    mesh = board_solid(config, truth)
     plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
+    mesh.apply_transform(T_camera_board)
     uv = texture_850 = texture_rgb = None
     if material.grain_contrast != 0:
         uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
         pattern = grain(material, board.width_mm, board.height_mm)
         texture_850 = reflectance(pattern, material.albedo_850, material.grain_contrast)
         texture_rgb = np.stack([reflectance(pattern, mean, material.grain_contrast) for mean in material.rgb], axis=-1)
-    mesh.apply_transform(T_camera_board)
-    return TargetPart("board", mesh, uv, material.albedo_850, texture_850, np.array(material.rgb), texture_rgb)
+    rgb = np.array(material.rgb)
+    parts = [TargetPart("board", mesh, uv, material.albedo_850, texture_850, rgb, texture_rgb)]
+
+    def add(name: str, mesh: trimesh.Trimesh, albedo_850: float, rgb: tuple[float, float, float]) -> None:
+        parts.append(TargetPart(name, mesh, None, albedo_850, None, np.array(rgb), None))
+
+    for number, tape in enumerate(config.tapes, start=1):
+        (width, height), (x, y), angle = tape.size_mm, tape.centre_mm, float(np.deg2rad(tape.angle_deg))
+        offsets = {"top_m": tape.thickness_mm * MM, "bottom_m": -TAPE_SINK_M, "sagitta_m": sagitta_m}
+        size_m, centre_m = (width * MM, height * MM), (x * MM, y * MM)
+        strip = sheet(face_of(board), size_m, **offsets, centre_m=centre_m, angle_rad=angle)
+        add(f"tape_{number}", strip.apply_transform(T_camera_board), tape.albedo_850, tape.rgb)
+    backing, room = config.backing, config.room
+    if backing is not None:
+        corners = transform_points(T_camera_board, backing_corners_board_m(config, backing))
+        add("backing", _rectangle(corners), backing.albedo_850, backing.rgb)
+    if room is not None and room.floor_below_lens_m is not None:
+        corners = floor_corners_camera_m(room, room.floor_below_lens_m)
+        add("floor", _rectangle(corners), room.floor_albedo_850, room.floor_rgb)
+    if room is not None and room.back_wall_distance_m is not None:
+        corners = wall_corners_camera_m(room, room.back_wall_distance_m)
+        add("back_wall", _rectangle(corners), room.back_wall_albedo_850, room.back_wall_rgb)
+    return Target(config, tuple(parts), truth, T_camera_board, outline_board_m(board))
+
+
+def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
+    """Return the board less its damage, watertight, board frame."""
+    size_m, thickness_m = (config.board.width_mm * MM, config.board.height_mm * MM), config.board.thickness_mm * MM
+    body = sheet(face_of(config.board), size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=_sagitta_m(config))
+    return subtract(body, [cutter(damage, item) for damage, item in zip(truth, config.damages, strict=True)])
 
 
 def _rectangle(corners: np.ndarray) -> trimesh.Trimesh:
@@ -158,9 +194,6 @@ def _sagitta_m(config: TargetConfig) -> float:
     return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
 
 
-# ---- solids
-
-
 def sheet(
     face: Face,
     size_m: tuple[float, float],
@@ -172,19 +205,15 @@ def sheet(
     angle_rad: float = 0.0,
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
-
     Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. Board frame. Raises UserError where
-    the face needs more than MAX_CELLS.
-    """
+    the face needs more than MAX_CELLS."""
     import trimesh
 
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
 
     def plan(columns: int, rows: int) -> np.ndarray:
-        across, up = np.meshgrid(
-            np.linspace(-0.5, 0.5, columns + 1) * size_m[0], np.linspace(-0.5, 0.5, rows + 1) * size_m[1]
-        )
-        return np.stack([across, up], axis=-1) @ turn.T + centre_m
+        steps = (np.linspace(-0.5, 0.5, n + 1) * size for n, size in zip((columns, rows), size_m, strict=True))
+        return np.stack(np.meshgrid(*steps), axis=-1) @ turn.T + centre_m
 
     # Linear interpolation on a right triangle of legs a, b errs by (|f_aa| a^2 + 2 |f_ab| ab + |f_bb| b^2) / 8 or less.
     # Legs with a^2 (|f_aa| + |f_ab|) = b^2 (|f_bb| + |f_ab|) = 4 sagitta keep that below the sagitta.
@@ -196,33 +225,29 @@ def sheet(
     lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
     columns, rows = (max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True))
     if columns * rows > MAX_CELLS:
-        raise UserError(
-            f"board: its face needs {columns} x {rows} cells to be followed within {sagitta_m / MM * 1e3:.3g} um",
-            legal=f"at most {MAX_CELLS} cells",
-            fix="make the board smaller or bend it less",
-        )
+        needs = f"{columns} x {rows} cells to be followed within {sagitta_m / MM * 1e3:.3g} um"
+        fix = "make the board smaller or bend it less"
+        raise UserError(f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix)
     places = plan(columns, rows)
     points, normals = face.point(places[..., 0], places[..., 1]), face.normal(places[..., 0], places[..., 1])
     vertices = np.concatenate([(points + offset * normals).reshape(-1, 3) for offset in (top_m, bottom_m)])
     # triangles of the two grids of vertices, upper one first, and the walls between
     grid = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
-    below = grid.size
     a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
     upper = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     rim = np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
-    following = np.roll(rim, -1)
-    walls = np.concatenate(
-        [np.column_stack([rim + below, following + below, following]), np.column_stack([rim + below, following, rim])]
-    )
-    faces = np.concatenate([upper, upper[:, ::-1] + below, walls])
+    following, below = np.roll(rim, -1), grid.size
+    walls = [
+        np.column_stack([rim + below, following + below, following]),
+        np.column_stack([rim + below, following, rim]),
+    ]
+    faces = np.concatenate([upper, upper[:, ::-1] + below, *walls])
     return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
 
 
 def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh:
     """Return the solid that a damage takes away, board frame; it sticks out of the face, a through-hole's of the back.
-
-    Its radius is the declared one: on a bent face a dent's rim, which the truth holds, is not that of its ball.
-    """
+    Its radius is the declared one: on a bent face a dent's rim, which the truth holds, is not that of its ball."""
     import trimesh
 
     depth_m, radius_m = damage.depth_m, declared.radius_m
@@ -257,27 +282,18 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
 
 
 def subtract(body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Return body minus cutters by Manifold, watertight.
-
-    Called directly, because trimesh's own wrapper rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of
-    a 1/16 in hole.
-    """
+    """Return body minus cutters by Manifold, watertight. Called directly, because trimesh's own wrapper rounds to
+    float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
     import manifold3d  # type: ignore[import-not-found]
     import trimesh
 
-    solids = [
-        manifold3d.Manifold(
-            manifold3d.Mesh64(
-                vert_properties=np.ascontiguousarray(mesh.vertices, dtype=np.float64),
-                tri_verts=np.ascontiguousarray(mesh.faces, dtype=np.uint64),
-            )
-        )
-        for mesh in (body, *cutters)
-    ]
+    solids = []
+    for mesh in (body, *cutters):
+        vertices, faces = np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.uint64)
+        solids.append(manifold3d.Manifold(manifold3d.Mesh64(vert_properties=vertices, tri_verts=faces)))
     broken = [solid.status() for solid in solids if solid.status() != manifold3d.Error.NoError]
     if broken:
         raise RuntimeError(f"a solid is not closed: {broken}")
     result = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract).to_mesh64()
-    return trimesh.Trimesh(
-        vertices=result.vert_properties[:, :3], faces=result.tri_verts.astype(np.int64), process=False
-    )
+    faces = result.tri_verts.astype(np.int64)
+    return trimesh.Trimesh(vertices=result.vert_properties[:, :3], faces=faces, process=False)

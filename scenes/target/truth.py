@@ -1,28 +1,166 @@
-"""The truth: which material was taken out of the board, its place and its volume."""
+"""The target in closed form: the face as a height field, the planes around it, and the damage: place and volume."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from harness.vocabulary.geometry import rotate_vectors, transform_points
-from harness.vocabulary.units import MM
-from scenes.target.custom import DentConfig, HoleConfig, TargetConfig
-from scenes.target.face import Face, face_of
+from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
+from scenes.target.custom import (
+    BackingConfig,
+    BoardConfig,
+    CylinderConfig,
+    DentConfig,
+    HoleConfig,
+    PolynomialConfig,
+    RoomConfig,
+    SphereConfig,
+    TargetConfig,
+)
+
+OUTLINE_STEPS = 64
+"""Points along each side of the outline."""
+OPEN_FLOOR_M = 3.0
+"""Reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m."""
+ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Derivatives in x and y, in the order in which a face gives them."""
+_UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+
+
+@dataclass(frozen=True)
+class Face:
+    """A smooth height field with z(0, 0) = 0. ``derivatives`` gives z and its derivatives (`ORDERS`), each of the shape
+    of x and y, NaN beyond its reach. Arguments of the methods broadcast; every answer is vectorised."""
+
+    derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+
+    def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
+        return self.derivatives(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
+
+    def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return z of the face; NaN where the shape does not reach."""
+        return self._derived(x_m, y_m)[0]
+
+    def slope(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 2): dz/dx and dz/dy."""
+        return np.stack(self._derived(x_m, y_m)[1:3], axis=-1)
+
+    def bend(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 3): d2z/dx2, d2z/dxdy and d2z/dy2 in 1/m."""
+        return np.stack(self._derived(x_m, y_m)[3:], axis=-1)
+
+    def point(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 3): the face's points above plan positions."""
+        x, y = np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        return np.stack([x, y, self.height_m(x, y)], axis=-1)
+
+    def normal(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 3): unit normals out of the face."""
+        slope = self.slope(x_m, y_m)
+        upward = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
+        return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
+
+    def curvatures(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 2): principal curvatures in 1/m, positive where the face bulges to the camera, larger first.
+        From mean and Gaussian curvature of a Monge patch (do Carmo, Differential Geometry, section 3-3, example 5)."""
+        _, fx, fy, fxx, fxy, fyy = self._derived(x_m, y_m)
+        metric = 1 + fx**2 + fy**2
+        mean = ((1 + fx**2) * fyy - 2 * fx * fy * fxy + (1 + fy**2) * fxx) / (2 * metric**1.5)
+        gaussian = (fxx * fyy - fxy**2) / metric**2
+        spread = np.sqrt(np.maximum(mean**2 - gaussian, 0.0))
+        return np.stack([spread - mean, -spread - mean], axis=-1)
+
+
+def face_of(board: BoardConfig) -> Face:
+    """Return the face that a board's declaration describes."""
+    shape = board.shape
+    if isinstance(shape, CylinderConfig | SphereConfig):
+        straight = shape.straight_along if isinstance(shape, CylinderConfig) else ""
+        radius_m, sign = shape.radius_mm * MM, 1.0 if shape.bulge == "towards" else -1.0
+        bent_x, bent_y = float(straight != "x"), float(straight != "y")
+
+        def round_face(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+            square = radius_m**2 - bent_x * np.square(x) - bent_y * np.square(y)
+            root = np.sqrt(np.where(square > 0, square, np.nan))
+            return (
+                sign * (root - radius_m),
+                -sign * (bent_x * x / root),
+                -sign * (bent_y * y / root),
+                -sign * (bent_x * (1 / root + x**2 / root**3)),
+                -sign * (bent_x * bent_y * x * y / root**3),
+                -sign * (bent_y * (1 / root + y**2 / root**3)),
+            )
+
+        return Face(round_face)
+    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
+    terms = shape.terms if isinstance(shape, PolynomialConfig) else ()
+    coefficients = np.zeros(
+        tuple(max((getattr(t, key) for t in terms), default=0) + 1 for key in ("power_x", "power_y"))
+    )
+    for term in terms:
+        scale = MM / half_x**term.power_x / half_y**term.power_y
+        coefficients[term.power_x, term.power_y] += term.coefficient_mm * scale
+
+    def polynomial(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        if not coefficients.any():
+            return tuple(np.zeros(x.shape) for _ in ORDERS)
+        derived = (np.polynomial.polynomial.polyder(coefficients, dx, axis=0) for dx, _ in ORDERS)
+        along = (np.polynomial.polynomial.polyder(c, dy, axis=1) for c, (_, dy) in zip(derived, ORDERS, strict=True))
+        return tuple(np.asarray(np.polynomial.polynomial.polyval2d(x, y, c)) for c in along)
+
+    return Face(polynomial)
+
+
+def outline_board_m(board: BoardConfig) -> np.ndarray:
+    """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame."""
+    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
+    side, end = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False), np.ones(OUTLINE_STEPS)
+    x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
+    return face_of(board).point(half_x * x, half_y * y)
+
+
+def face_grid_m(board: BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
+    """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the board; board frame."""
+    face, places = face_of(board), np.linspace(-0.5, 0.5, steps + 1)
+    x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
+    return face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
+
+
+def backing_corners_board_m(config: TargetConfig, backing: BackingConfig) -> np.ndarray:
+    """Return the backing's corners in the board's frame; it faces the board."""
+    deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
+    z_m = deepest_m + backing.distance_mm * MM
+    size_m = np.array(backing.size_mm or (config.board.width_mm, config.board.height_mm)) * MM
+    if backing.size_mm is None:
+        size_m = size_m * (config.pose.distance_m + z_m) / config.pose.distance_m
+    return np.column_stack([_UNIT_CORNERS * size_m, np.full(4, -z_m)])
+
+
+def floor_corners_camera_m(room: RoomConfig, floor_below_lens_m: float) -> np.ndarray:
+    """Return the floor's corners in the camera's frame; it faces up and reaches from the lens to the back wall."""
+    far_m = room.back_wall_distance_m or OPEN_FLOOR_M
+    x, z = room.width_m * _UNIT_CORNERS[:, 0], far_m * (_UNIT_CORNERS[:, 1] + 0.5)
+    return np.column_stack([x, np.full(4, floor_below_lens_m), z])
+
+
+def wall_corners_camera_m(room: RoomConfig, back_wall_distance_m: float) -> np.ndarray:
+    """Return the back wall's corners in the camera's frame, on the floor (without a floor, centred on the axis)."""
+    foot_m = room.height_m / 2 if room.floor_below_lens_m is None else room.floor_below_lens_m
+    x, up = room.width_m * _UNIT_CORNERS[:, 0], room.height_m * (_UNIT_CORNERS[:, 1] + 0.5)
+    return np.column_stack([x, foot_m - up, np.full(4, back_wall_distance_m)])
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A hole or dent.
-
-    ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's unit normal there, out of the board.
-    ``depth_m``: of the material removed, along the axis; for a through-hole the board's thickness, so the gap to a
-    backing comes on top. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area). ``volume_m3``:
-    exact on a flat face, to second order in diameter over radius of curvature on a curved one.
-    """
+    """A hole or dent. ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's unit normal there,
+    out of the board. ``depth_m``: of the material removed, along the axis; for a through-hole the board's thickness, so
+    the gap to a backing comes on top. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area).
+    ``volume_m3``: exact on a flat face, to second order in diameter over radius of curvature on a curved one."""
 
     id: int
     kind: Literal["through", "blind", "dent"]
@@ -36,13 +174,8 @@ class Damage:
 
     def to_row(self) -> dict[str, Any]:
         """Return plain data in millimetres, one flat row for JSON or a table."""
-        row: dict[str, Any] = {
-            "id": self.id,
-            "kind": self.kind,
-            "diameter_mm": self.diameter_m / MM,
-            "depth_mm": self.depth_m / MM,
-            "volume_mm3": self.volume_m3 / MM**3,
-        }
+        row: dict[str, Any] = {"id": self.id, "kind": self.kind, "diameter_mm": self.diameter_m / MM}
+        row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
         places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
         for frame, (centre_m, axis) in places.items():
             row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
@@ -66,29 +199,14 @@ def truth_of(config: TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, 
             # Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) / 8 lower
             # on average than at the centre. The back of a through-hole is a parallel surface, curvatures k / (1 - t k).
             back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
-            lift_m = radius_m**2 / 8 * (back - float(bends.sum()))
-            volume_m3 = math.pi * radius_m**2 * (depth_m + lift_m)
-        truth.append(
-            Damage(
-                item.id,
-                item.kind,
-                2 * radius_m,
-                depth_m,
-                volume_m3,
-                centre,
-                axis,
-                transform_points(T_camera_board, centre),
-                rotate_vectors(T_camera_board, axis),
-            )
-        )
+            volume_m3 = math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+        in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
+        truth.append(Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera))
     return tuple(truth)
 
 
 def _lens(dent: DentConfig, bend: float) -> tuple[float, float]:
-    """Return rim radius and volume that a dent's ball shares with a sphere of curvature ``bend``.
-
-    Two caps on one rim circle, each pi h (3 r^2 + h^2) / 6; the sphere's counts against where it bends away (bend < 0).
-    """
+    """Return rim radius and volume that a dent's ball shares with a sphere of curvature ``bend``."""
     depth_m = dent.depth_mm * MM
     half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
     sphere_cap_m = bend * half_square

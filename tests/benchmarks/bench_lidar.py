@@ -16,7 +16,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.camera import CameraConfig, load_camera
-from scenes.sensor.lidar.correlation import strongest_peaks
+from scenes.sensor.lidar.kernels import strongest_peaks
 from scenes.sensor.source import SimulatedUnit
 
 CAMERA = load_camera("realsense_l515")

@@ -13,8 +13,7 @@ import pytest
 from detectors import load_detector
 from detectors.mapping.merge import Merged, merge
 from detectors.mapping.settings import AnyMerge, FusedMerge, GridMerge, VolumeMerge
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Lens
 from tests.mapped_views import Hole, Plane, arc, reference, registered, seen
 
 LENS = Lens(300, 200, 500.0, 500.0, 149.5, 99.5)

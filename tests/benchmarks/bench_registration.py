@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from board_views import pose, usual_error, views
 
-from detectors.registration.cpd import coherent_point_drift, drift_covariance
+from detectors.registration.by_points import coherent_point_drift, drift_covariance
 from detectors.registration.register import register
 from detectors.registration.settings import (
     AnyRegistration,

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.vocabulary.lens import Lens
-from scenes.optics import BeamFootprint, Optics
-from scenes.render.direct import direct_light, footprint_of
-from scenes.render.indirect import face_triangles
-from scenes.render.scene import lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
-from scenes.render.view import render_view, target_region
+from harness.vocabulary.geometry import Lens
+from scenes.optics import BeamFootprint, Optics, RenderConfig, footprint_of
+from scenes.render.direct import direct_light
+from scenes.render.scene import lit_scene, load_mitsuba
+from scenes.render.view import face_triangles, render_view, target_region
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import Target, build_target
 from scenes.target.thesis import ThesisTargetConfig

@@ -13,15 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from detectors.average import AverageConfig, RunningAverage
-from harness.engine.averages import averages_of
+from detectors.average import AverageConfig, FrameSums
+from harness.engine.trial import averages_of
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.imager import AmcwExposure, AmcwImager
 from scenes.sensor.camera import CameraConfig, load_camera
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.source import SimulatedUnit
@@ -52,7 +51,7 @@ class Stages:
     def filter_one(self) -> None:
         """The filter of the first frequency."""
         planes, amplitude = filter_inputs(self)
-        kernels.filter_image(planes, amplitude, *self.imager.filter_settings, self.filtered[0], self.edge[0])
+        kernels.filter_image(planes, amplitude, self.imager.filter_settings, self.filtered[0], self.edge[0])
 
 
 def unit_on(region: Region, camera: AmcwCamera = CAMERA) -> SimulatedUnit:
@@ -94,11 +93,11 @@ def test_a_simulated_frame_of_30_000_pixels_added_to_an_average(benchmark: Any) 
     unit, rng = unit_on(BOARD), random_stream(1)
     capture = unit.capture(2, 1)
     frame = next(capture.frames())
-    running = RunningAverage(capture, AverageConfig())
+    running = FrameSums(capture, [frame], AverageConfig())
 
     def step() -> None:
         unit.model.frame(unit.exposure, rng)
-        running.add(frame)
+        running.take(frame)
 
     benchmark.pedantic(step, rounds=300, iterations=1, warmup_rounds=5)
 
@@ -107,8 +106,8 @@ def test_a_simulated_frame_of_30_000_pixels_added_to_an_average(benchmark: Any) 
 def test_add_30_000_pixels_to_an_average(benchmark: Any) -> None:
     capture = unit_on(BOARD).capture(2, 1)
     frame = next(capture.frames())
-    running = RunningAverage(capture, AverageConfig())
-    benchmark.pedantic(running.add, args=(frame,), rounds=300, iterations=1, warmup_rounds=5)
+    running = FrameSums(capture, [frame], AverageConfig())
+    benchmark.pedantic(running.take, args=(frame,), rounds=300, iterations=1, warmup_rounds=5)
 
 
 # ---------------------------------------------------------------- averages drawn at once
@@ -211,7 +210,7 @@ class DrjitFilter:
     """`kernels.filter_image` in Dr.Jit: one kernel, 25 neighbours gathered from planes that stay on the device."""
 
     def __init__(self, unit: np.ndarray, amplitude: np.ndarray, frozen: bool) -> None:
-        from scenes.render.variant import load_mitsuba
+        from scenes.render.scene import load_mitsuba
 
         self.mi = load_mitsuba()
         import drjit as dr

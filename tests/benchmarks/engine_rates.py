@@ -22,7 +22,7 @@ from harness.engine.plan import SweepPlan, plan_of
 from harness.engine.processes import LocalEngine
 from harness.engine.run import run_plan
 from harness.engine.trial import TrialTask, run_trial
-from harness.engine.work import Limits, Progress
+from harness.engine.work import Limits, Outcome
 from harness.experiment.load import load_experiment
 
 FIRST = 8
@@ -47,7 +47,7 @@ class Watch:
     begun: tuple[float, float, int, float] | None = None
     last: tuple[float, float, int, float] = (0.0, 0.0, 0, 0.0)
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: Outcome) -> None:
         counts = progress.trials
         now = (time.perf_counter(), time.process_time(), counts.done, counts.seconds)
         if counts.done > self.last[2]:

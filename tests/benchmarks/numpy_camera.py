@@ -12,10 +12,9 @@ import math
 
 import numpy as np
 
-from harness.vocabulary.capture import Reason
+from harness.vocabulary.geometry import Reason
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.imager import AmcwExposure, AmcwImager
 
 f4 = np.float32
 
@@ -34,7 +33,7 @@ class NumpyCamera:
         self.knee, self.step_m = f4(imager.camera.converter.knee_units.value), f4(imager.camera.z_step_m)
         self.dim, self.concentration = f4(engine.dim_amplitude_units.value), f4(engine.concentration.value)
         self.cosines, self.sines, self.gains = imager._cosines, imager._sines, imager.gains
-        self.window, self.geometry = imager.filter_settings[0], imager.engine.geometry
+        self.window, self.geometry = imager.filter_settings.space, imager.engine.geometry
         self.outside = imager.outside_mask.ravel()
         self.unwrap = imager.unwrap
         h, w = exposure.shape
@@ -130,7 +129,7 @@ class NumpyCamera:
     def decode(
         self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: np.float32
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Unwrap, correct for the emitter beside the lens, gate: as `ranging.range_and_gates`."""
+        """Unwrap, correct for the emitter beside the lens, gate: as `ranging.ranges_of`."""
         turns = np.arctan2(filtered[:, 1], filtered[:, 0]) * f4(0.5 / math.pi)
         turns[turns < 0] += f4(1)
         half_m, residual2 = self._half_path(turns)
@@ -143,12 +142,12 @@ class NumpyCamera:
 
     def _half_path(self, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half the light's path (n,) in metres and the squared lattice residual (n,) of wrapped phases (f, n)."""
-        table, sizes = self.unwrap.table, np.array(self.unwrap.table.shape[:-1])[:, None]
-        digits = self.unwrap.offset[:, None] - np.floor(self.unwrap.combination.astype(f4) @ turns + f4(0.5)).astype(
-            int
-        )
-        named = ((digits >= 0) & (digits < sizes)).all(axis=0)
-        wraps = table[tuple(np.where(named, digits, 0))].T
+        unwrap, key, named = self.unwrap, np.zeros(turns.shape[1], int), np.ones(turns.shape[1], bool)
+        for row, size, offset in zip(unwrap.combination, unwrap.sizes, unwrap.offset, strict=True):
+            digit = offset - np.floor(row @ turns + f4(0.5)).astype(int)
+            named &= (digit >= 0) & (digit < size)
+            key = key * size + np.where(named, digit, 0)
+        wraps = unwrap.wraps[:, np.where(named, key, 0)]
         unknown = ~named | (wraps[0] < 0)
         lattice = self.unwrap.lattice.astype(f4)
         unwrapped = turns + np.where(unknown, 0, wraps).astype(f4)

@@ -20,8 +20,8 @@ from detectors.average import AverageConfig, prefix_averages
 from detectors.clusters import euclidean_clusters
 from detectors.crop import crop
 from harness.engine.trial import TrialTask
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
 from scenes.sensor.amcw import ranging
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.normals import standard_normals

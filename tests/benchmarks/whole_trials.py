@@ -15,7 +15,7 @@ from pathlib import Path
 from clocks import Stage, StageClock, Times, in_turns, spent
 
 from detectors import thesis
-from detectors.average import AverageConfig, RunningAverage, prefix_averages
+from detectors.average import AverageConfig, FrameSums, prefix_averages
 from detectors.score_map import ScoreMapDetector
 from harness.engine import trial
 from harness.engine.plan import Group, RenderJob, plan_of
@@ -139,8 +139,8 @@ def stages() -> list[Stage]:
         Stage("expose", imager.AmcwImager, "phasors"),
         Stage("filter", imager.AmcwImager, "filter"),
         Stage("range and gates", imager.AmcwImager, "_decode"),
-        Stage("average", RunningAverage, "add"),
-        Stage("average", RunningAverage, "cloud"),
+        Stage("average", FrameSums, "take"),
+        Stage("average", FrameSums, "cloud"),
         Stage("averages, other", trial, "_clouds"),
         Stage("crop", thesis, "crop"),
         Stage("fit", thesis, "fit_surface"),

@@ -111,9 +111,9 @@ def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, 
 def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel, light by r^-2."""
     from harness.vocabulary.geometry import Region
+    from scenes.optics import NoiseFreeView
     from scenes.sensor.camera import CameraConfig, load_camera
     from scenes.sensor.source import SimulatedUnit
-    from scenes.view import NoiseFreeView
 
     camera, (h, w) = stranger.camera, (stranger.camera.height, stranger.camera.width)
     model = load_camera(stranger.model)

@@ -16,11 +16,10 @@ import sys
 import numpy as np
 
 from detectors.average import AverageConfig
-from harness.engine.averages import averages_of
-from scenes.render.settings import RenderConfig
+from harness.engine.trial import averages_of
+from scenes.optics import RenderConfig
 from scenes.render.view import render_view
-from scenes.sensor.amcw.at_once import AtOnce
-from scenes.sensor.amcw.linear_frames import EVEN, UNEVEN
+from scenes.sensor.amcw.at_once import EVEN, UNEVEN, AtOnce
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.mesh import build_target

@@ -21,8 +21,15 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from detectors.recordings import open_capture
-from harness.scorecard.noise import LAGS, FixedPattern, correlation, deviations, fixed_pattern, temporal_sigma_m
-from harness.scorecard.planes import fit_plane
+from harness.scorecard.bench import (
+    LAGS,
+    FixedPattern,
+    correlation,
+    deviations,
+    fit_plane,
+    fixed_pattern,
+    temporal_sigma_m,
+)
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import Region

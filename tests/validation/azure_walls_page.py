@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.report import canvas
-from harness.report.canvas import BLUE, GREY, INK, ORANGE
-from harness.vocabulary.units import MM
+from harness.report import blocks as canvas
+from harness.report.blocks import BLUE, GREY, INK, ORANGE
+from harness.vocabulary.geometry import MM
 
 if TYPE_CHECKING:
     from azure_walls import FixedPattern, SigmaBin, WallCheck

@@ -24,12 +24,11 @@ import psutil
 from cluster_processes import Processes, processes, square, until
 
 from harness.engine.cluster import ClusterEngine
-from harness.engine.journal import Entry, Journal
-from harness.engine.options import code_of
+from harness.engine.journal import Journal
 from harness.engine.plan import SweepPlan, plan_of
 from harness.engine.run import run_plan
 from harness.engine.tables import tables_of
-from harness.engine.work import Job, Limits, Outcome, Progress
+from harness.engine.work import Ended, Job, Limits, Outcome, code_of
 from harness.experiment.load import load_experiment
 
 CHEAP = """\
@@ -84,12 +83,12 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     plan = plan_of(experiment, home / "cache")
     journal = Journal(home / "journal")
     with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"])) as engine:
-        until(lambda: engine.worker_count == workers)
+        until(lambda: engine.room("renders") > workers)
         bare = bare_rate(engine)
         scheduler = psutil.Process(cluster.scheduler.pid)
         steady: list[Look] = []
 
-        def look(now: Progress) -> None:
+        def look(now: Outcome) -> None:
             if now.trials.done:
                 mine, theirs = processor_s(psutil.Process()), processor_s(scheduler)
                 steady[1:] = [Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)]
@@ -101,7 +100,6 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     return {
         "trials": trials,
         "workers": workers,
-        "seconds_in_all": round(outcome.seconds, 1),
         "render_s": round(outcome.renders.seconds / outcome.renders.total, 2),
         "trials_per_s": round(count / wall, 1),
         "trial_ms": round(1e3 * work / count, 2),
@@ -170,7 +168,7 @@ def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[
         began = time.monotonic()
         copied = Journal(Path(other))
         for key, entry in zip(keys, entries, strict=False):
-            copied.write(key, Entry(**vars(entry)))
+            copied.write(key, Ended(**vars(entry)))
         write = (time.monotonic() - began) / len(entries)
     process = psutil.Process()
     before, began = process.memory_info().rss, time.monotonic()

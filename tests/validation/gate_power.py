@@ -21,7 +21,7 @@ import numpy as np
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.evaluation.pod.false_calls import threshold_for_rate
+from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.study.paired import ENOUGH, calls_change, hits_change, swap_change
 from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.evaluation.study.verdict import ALPHA, LIMIT_TESTS, compare_studies

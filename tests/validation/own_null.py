@@ -25,13 +25,11 @@ from detectors import load_detector
 from detectors.average import AverageConfig
 from detectors.interface import Detector
 from detectors.null import own_threshold
-from harness.engine.averages import averages_of
-from harness.vocabulary.capture import Cloud
-from harness.vocabulary.geometry import transform_points
+from harness.engine.trial import averages_of
+from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
+from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.render.settings import RenderConfig
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig

@@ -18,8 +18,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.hit_miss import fit_hit_miss
-from harness.evaluation.pod.likelihood_bounds import METHODS, bound
+from harness.evaluation.pod.hit_miss import METHODS, bound, fit_hit_miss
 from harness.vocabulary.errors import UserError
 
 UNKNOWN = np.zeros((2, 2))
@@ -74,7 +73,7 @@ def coverage(
         except UserError:
             refused += 1
             continue
-        separated += fit.separated
+        separated += fit.method == "Firth"
         for method in methods:
             limits[method].append(bound(fit, method=method).value)
     true = truth.size_at(0.9)

@@ -22,9 +22,8 @@ if __name__ == "__main__":
 from scipy import optimize, special
 
 from harness.evaluation.intervals import percentiles
-from harness.evaluation.pod.hit_miss import fit_hit_miss
-from harness.evaluation.pod.likelihood_bounds import bound
-from harness.evaluation.study.over_boards import design_effect, refitted_sizes, targets_of
+from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
+from harness.evaluation.study.limit import design_effect, refitted_sizes, targets_of
 from harness.vocabulary.errors import UserError
 
 A50_MM, WIDTH_MM = 6.0, 0.8

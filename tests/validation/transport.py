@@ -24,19 +24,14 @@ from scipy import ndimage
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.vocabulary.lens import Lens
-from harness.vocabulary.units import MM
-from scenes.optics import Optics
-from scenes.render.direct import OffFace, Quadrilaterals, cast, phasor_sums
-from scenes.render.indirect import PathWork, gather_in_pixels, range_change_m, range_noise_m
-from scenes.render.scene import LitScene, lit_scene
-from scenes.render.settings import RenderConfig
-from scenes.render.variant import load_mitsuba
-from scenes.render.view import render_view
+from harness.vocabulary.geometry import MM, Lens
+from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig
+from scenes.render.direct import OffFace, cast, phasor_sums
+from scenes.render.scene import LitScene, lit_scene, load_mitsuba
+from scenes.render.view import PathWork, gather_in_pixels, range_change_m, range_noise_m, render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import Target, build_target
 from scenes.target.thesis import ThesisTargetConfig
-from scenes.view import NoiseFreeView
 
 SIDE = 32
 """Sub-rays per side of a pixel in the reference."""

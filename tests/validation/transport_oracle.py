@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.vocabulary.units import SPEED_OF_LIGHT_AIR
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics
 from scenes.render.scene import LitScene
 
@@ -37,7 +37,7 @@ class Oracle:
     _histogram: bool
 
     def phasors(self, paths: int, seed: int, bounces: int) -> np.ndarray:
-        """(f, h, w) phasors of all light, in the units and with the sign of `scenes.view`, from ``paths`` a pixel."""
+        """(f, h, w) phasors of all light, in the units and with the sign of `scenes.optics`, from ``paths`` a pixel."""
         import drjit as dr
 
         integrator = self.mi.load_dict(

@@ -1,27 +1,23 @@
-"""Signal against size (a-hat against a), MIL-HDBK-1823A (2009) appendix G and ASTM E3023: regression, then POD.
-
-y = b0 + b1 x + tau * normal, x = size or ln size, y = signal or ln signal, censored at the noise floor and at
-saturation. A target is found where y > decision: POD = Phi((x - mu) / sigma), mu = (decision - b0) / b1 and
-sigma = tau / b1, with the covariance of both by the delta method.
-
-Repeated measures: k signals of one target are not k targets. The fit treats rows as independent, which leaves
-(mu, sigma) consistent for the whole scatter (between targets and within), and multiplies the covariance by k, the mean
-number of signals per target: right where a target's signals are all alike, too cautious where they are not. No mixed
-model is fitted; its split of the scatter would not change the POD of a new target seen once. Both covariances stand in
-the fit. Not modelled: scatter that grows with size, curvature (`diagnose` tests both).
-"""
+"""Signal against size (a-hat against a), MIL-HDBK-1823A (2009) appendix G and ASTM E3023: regression, then POD. y = b0
++ b1 x + tau * normal, x = size or ln size, y = signal or ln signal, censored at the noise floor and at saturation. A
+target is found where y > decision: POD = Phi((x - mu) / sigma), mu = (decision - b0) / b1 and sigma = tau / b1, with
+the covariance of both by the delta method. k signals of one target are not k targets: the fit takes rows as independent
+and multiplies the covariance by k, the mean number of signals per target, which is right where a target's signals are
+all alike and too cautious else. Not modelled: scatter that grows with size, curvature (`diagnose` tests both)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special, stats
 
-from harness.evaluation.pod.curve import Bound, PodCurve
-from harness.evaluation.pod.likelihood import ascend
+from harness.evaluation.pod.curve import Bound, PodCurve, ascend
+from harness.evaluation.pod.hit_miss import number_of_targets
 from harness.vocabulary.errors import UserError
 
 LEAST_TARGETS = 40
@@ -37,54 +33,32 @@ LEAST = 8
 
 @dataclass(frozen=True, eq=False)
 class AhatFit:
-    """A regression of signals and the POD curve that it implies.
-
-    ``x``, ``y`` (n,): size and signal on the axes of the fit (logarithms where ``log_size``, ``log_signal``), with
-    censored signals at their limit; ``below``, ``above`` (n,) bool: which are; ``left``, ``right``, ``decision`` in the
-    signal's own unit. ``covariance`` (3, 3) of (b0, b1, tau) holds for independent targets, ``covariance_of_rows`` were
-    each row one; ``curve.covariance`` derives from the first, ``rows_curve.covariance`` from the second.
-    ``log_likelihood`` is that of the signals in their own unit on either axis, so fits of one data set compare.
-    """
+    """A regression of signals and the POD curve that it implies. ``x``, ``y`` (n,): size and signal on the axes of the
+    fit, censored signals at their limit; ``below``, ``above`` (n,) bool: which are; ``left``, ``right``, ``decision``
+    in the signal's own unit. ``covariance`` (3, 3) of (b0, b1, tau) holds for independent targets; over ``per_target``
+    it is that were each row one. ``log_likelihood`` is of signals in their own unit."""
 
     curve: PodCurve
-    rows_curve: PodCurve
     b0: float
     b1: float
     tau: float
     covariance: np.ndarray
-    covariance_of_rows: np.ndarray
     log_likelihood: float
+    deviance: float
     x: np.ndarray
     y: np.ndarray
     below: np.ndarray
     above: np.ndarray
     target: np.ndarray
+    n: int
+    targets: int
+    per_target: float
     log_size: bool
     log_signal: bool
     decision: float
     left: float | None
     right: float | None
     notes: tuple[str, ...]
-
-    @property
-    def n(self) -> int:
-        """Number of rows."""
-        return len(self.x)
-
-    @property
-    def targets(self) -> int:
-        """Number of independent targets."""
-        return len(np.unique(self.target))
-
-    @property
-    def per_target(self) -> float:
-        """Mean number of signals per target."""
-        return self.n / self.targets
-
-    @property
-    def deviance(self) -> float:
-        """-2 ln likelihood, comparable between axes: the Jacobian of a logarithm is in it."""
-        return -2 * self.log_likelihood
 
 
 def fit_ahat(
@@ -99,53 +73,37 @@ def fit_ahat(
     inspections: ArrayLike | None = None,
 ) -> AhatFit:
     """Regress ``signal`` (n,) on ``size`` (n,) with censoring, and derive the POD of signals above ``decision``.
-
     Signals <= ``left`` are at the noise floor, signals >= ``right`` saturated. ``inspections`` (n,): which target a row
-    inspects, where a target was measured more than once. UserError: not finite, sizes or signals <= 0 under a
-    logarithm, a decision outside the limits, too few signals between them, signals that are all alike or do not grow
-    with size.
-    """
+    inspects. UserError for data that allow no such regression, or a signal that does not grow with size."""
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
-    names = np.arange(len(sizes)) if inspections is None else np.asarray(inspections).astype(str)
-    if not len(sizes) == len(signals) == len(names):
-        raise UserError(f"{len(sizes)} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
-    _, first, target = np.unique(names, return_index=True, return_inverse=True)
-    if np.any(other := sizes != sizes[first][target]):
-        raise UserError(f"target {names[other][0]} has more than one size", legal="one size for a target")
+    n = len(sizes)
+    names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
+    if not n == len(signals) == len(names):
+        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
+    targets = number_of_targets(sizes, names)
     low, high = -np.inf if left is None else left, np.inf if right is None else right
     if not low < high:
         raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
     if not low <= decision <= high:
-        raise UserError(
-            f"decision {decision:g} lies outside the signals that can be told apart",
-            legal=f"between the noise floor {low:g} and saturation {high:g}",
-        )
-    below = np.zeros(len(signals), bool) if left is None else signals <= left
-    above = np.zeros(len(signals), bool) if right is None else signals >= right
+        legal = f"between the noise floor {low:g} and saturation {high:g}"
+        raise UserError(f"decision {decision:g} lies outside the signals that can be told apart", legal=legal)
+    below, above = signals <= low, signals >= high
     between = signals[~(below | above)]
     if len(between) > 1 and np.ptp(between) <= SAME * np.abs(between).max():
-        raise UserError(
-            f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}",
-            fix="take hits and misses instead: signals that are all alike say nothing of size",
-        )
+        fix = "take hits and misses instead: signals that are all alike say nothing of size"
+        raise UserError(f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}", fix=fix)
     x = _axis("sizes", sizes, log_size)
     y = _axis("signals", np.clip(signals, low, high), log_signal)
     threshold = float(_axis("decision", np.array([decision]), log_signal)[0])
     line = fit_censored(np.column_stack([np.ones_like(x), x]), y, below, above)
     b0, b1 = line.coefficients
     if b1 <= 0:
-        raise UserError(
-            f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit",
-            fix="check the columns of size and signal, or take the signal with the other sign",
-        )
-    targets = len(first)
-    per_target = len(x) / targets
-    mu, sigma = float((threshold - b0) / b1), float(line.tau / b1)
+        fix = "check the columns of size and signal, or take the signal with the other sign"
+        raise UserError(f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit", fix=fix)
+    per_target = n / targets
+    mu, sigma, covariance = float((threshold - b0) / b1), float(line.tau / b1), line.covariance * per_target
     jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
-    curve, rows_curve = (
-        PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)
-        for covariance in (line.covariance * per_target, line.covariance)
-    )
+    curve = PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)
     notes = []
     if targets < LEAST_TARGETS:
         notes.append(f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -153,27 +111,10 @@ def fit_ahat(
         notes.append(f"{per_target:.3g} signals per target: covariance multiplied by that, {targets} targets count")
     if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
         notes.append(f"a90 = {a90:.4g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
-    return AhatFit(
-        curve=curve,
-        rows_curve=rows_curve,
-        b0=float(b0),
-        b1=float(b1),
-        tau=line.tau,
-        covariance=line.covariance * per_target,
-        covariance_of_rows=line.covariance,
-        log_likelihood=line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0),
-        x=x,
-        y=y,
-        below=below,
-        above=above,
-        target=np.asarray(target),
-        log_size=log_size,
-        log_signal=log_signal,
-        decision=decision,
-        left=left,
-        right=right,
-        notes=tuple(notes),
-    )
+    log_likelihood = line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0)  # the Jacobian
+    numbers = (float(b0), float(b1), line.tau, covariance, log_likelihood, -2 * log_likelihood)
+    axes = (log_size, log_signal, decision, left, right, tuple(notes))
+    return AhatFit(curve, *numbers, x, y, below, above, names, n, targets, per_target, *axes)
 
 
 def choose_axes(
@@ -185,46 +126,34 @@ def choose_axes(
     right: float | None = None,
     inspections: ArrayLike | None = None,
 ) -> tuple[AhatFit, ...]:
-    """Fit all pairs of axes that the data allow, best (smallest deviance) first; never chosen by the limit.
-
-    A logarithm is left out where there are sizes, or signals, floor or decision, that have none. All have three
-    parameters, so the deviances compare as they stand.
-    """
+    """Fit all pairs of axes that the data allow, best (smallest deviance) first; never chosen by the limit. A logarithm
+    is left out where there are sizes, or signals, floor or decision, that have none. All have three parameters."""
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
     lowest = signals.min(initial=np.inf) if left is None else left
     log_sizes = (False, True) if np.all(sizes > 0) else (False,)
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
-    limits: dict[str, float | None] = {"left": left, "right": right}
-    fits = [
-        fit_ahat(sizes, signals, decision=decision, log_size=one, log_signal=other, inspections=inspections, **limits)
-        for one, other in product(log_sizes, log_signals)
-    ]
-    return tuple(sorted(fits, key=lambda fit: fit.deviance))
+    fit = partial(fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections)
+    fits = [fit(log_size=one, log_signal=other) for one, other in product(log_sizes, log_signals)]
+    return tuple(sorted(fits, key=lambda one: one.deviance))
 
 
 def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95, *, rows_are_targets: bool = False) -> Bound:
-    """One-sided upper bound of the size found with probability ``pod``, the handbook's way: delta method on x.
-
-    x = mu + z sigma + z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). ``rows_are_targets``: the wrong
-    bound that takes each row for a target of its own. Infinite where the width sigma itself is not told from 0 at this
-    confidence: the curve's band is then open, and no size is demonstrated.
-    """
-    curve = fit.rows_curve if rows_are_targets else fit.curve
+    """One-sided upper bound of the size found with probability ``pod``, the handbook's way: delta method on x, x = mu +
+    z sigma + z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). ``rows_are_targets``: the wrong bound that
+    takes each row for a target of its own. Infinite where sigma itself is not told from 0 at this confidence."""
+    curve, v = fit.curve, fit.curve.covariance / (fit.per_target if rows_are_targets else 1.0)
     z, quantile = float(stats.norm.ppf(pod)), float(stats.norm.ppf(confidence))
-    if curve.sigma**2 <= quantile**2 * curve.covariance[1, 1]:
+    if curve.sigma**2 <= quantile**2 * v[1, 1]:
         why = "the signal's growth with size is too uncertain at this confidence (band open at large sizes)"
         return Bound(pod, confidence, "delta", float("inf"), why)
-    gradient = np.array([1.0, z])
-    x = curve.mu + z * curve.sigma + quantile * float(np.sqrt(gradient @ curve.covariance @ gradient))
+    x = curve.mu + z * curve.sigma + quantile * float(np.sqrt(v[0, 0] + 2 * z * v[0, 1] + z**2 * v[1, 1]))
     return Bound(pod, confidence, "delta", float(np.exp(x)) if curve.log_size else x)
 
 
 def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """(lower, upper) POD at ``sizes`` (any shape), each one-sided: the curves through the bounds of all sizes a_p.
-
-    So the lower one passes 0.9 at `ahat_bound`. (x - mu - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22) solved
-    for z; 0 and 1 where the band is open.
-    """
+    """(lower, upper) POD at ``sizes`` (any shape), each one-sided: the curves through the bounds of all sizes a_p. So
+    the lower one passes 0.9 at `ahat_bound`. (x - mu - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22) solved for
+    z; 0 and 1 where the band is open."""
     at = np.asarray(sizes, float)
     curve, c = fit.curve, float(stats.norm.ppf(confidence)) ** 2
     (v11, v12), (_, v22) = curve.covariance
@@ -245,18 +174,12 @@ def _finite(name: str, values: ArrayLike) -> np.ndarray:
 
 
 def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
-    if not log:
-        return values
-    if np.any(values <= 0):
+    if log and np.any(values <= 0):
         raise UserError(f"{name} <= 0 have no logarithm (smallest {values.min():.6g})", legal="values above 0")
-    return np.log(values)
+    return np.log(values) if log else values
 
 
-# the regression
-
-
-@dataclass(frozen=True, eq=False)
-class CensoredFit:
+class CensoredFit(NamedTuple):
     """``coefficients`` (p,), scatter ``tau`` (maximum likelihood: no correction for degrees of freedom), inverse
     observed information ``covariance`` (p + 1, p + 1) of (coefficients, tau), ``log_likelihood`` of the rows."""
 
@@ -267,20 +190,16 @@ class CensoredFit:
 
 
 def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray) -> CensoredFit:
-    """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958).
-
-    ``design`` (n, p); ``y`` (n,): the value, or the limit where ``below`` or ``above`` (n,) say that the value lies
-    beyond it. Rows are taken as independent with one scatter. Solved in Olsen's 1978 parameters (coefficients / tau,
-    1 / tau), in which the log-likelihood is concave. Raises UserError where the exact values do not determine the line
-    or its scatter.
-    """
+    """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958). ``design`` (n, p); ``y`` (n,):
+    the value, or the limit where ``below`` or ``above`` (n,) say that it lies beyond. Solved in Olsen's 1978 parameters
+    (coefficients / tau, 1 / tau), in which the log-likelihood is concave. UserError without a line or scatter."""
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
-        raise UserError(
-            f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a regression",
-            legal=f"more than {p} signals that are not censored, at different sizes",
+        said = (
+            f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a regression"
         )
+        raise UserError(said, legal=f"more than {p} signals that are not censored, at different sizes")
     start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
     rest = y - design @ start
     scale = float(np.sqrt(np.mean(rest[exact] ** 2)))
@@ -320,15 +239,10 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     jacobian[-1, -1] = -(tau**2) * scale
     covariance = jacobian @ np.linalg.solve(information, jacobian.T)
     log_likelihood = value - float(exact.sum() * np.log(scale))
-    covariance = (covariance + covariance.T) / 2
-    return CensoredFit(start + to_user @ slopes, float(tau * scale), covariance, log_likelihood)
+    return CensoredFit(start + to_user @ slopes, float(tau * scale), (covariance + covariance.T) / 2, log_likelihood)
 
 
-# whether the regression may be believed
-
-
-@dataclass(frozen=True)
-class Diagnostic:
+class Diagnostic(NamedTuple):
     """One test of one assumption: ``p_value`` of a statistic at least as large while the assumption holds."""
 
     assumption: str
@@ -336,72 +250,45 @@ class Diagnostic:
     statistic: float
     p_value: float
 
-    @property
-    def doubtful(self) -> bool:
-        """Return whether the data speak against the assumption at `LEVEL`."""
-        return self.p_value < LEVEL
-
-    @property
-    def name(self) -> str:
-        """Assumption and test."""
-        return f"{self.assumption} ({self.test})"
-
-    @property
-    def text(self) -> str:
-        """The test's answer in words."""
-        return f"doubtful at {LEVEL:.0%}" if self.doubtful else f"nothing against it at {LEVEL:.0%}"
-
 
 def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
-    """Test the four assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence; and of targets
-    measured repeatedly, independence of repeats.
-
-    The order of rows counts for independence only. The parameters are estimated, so the residuals are a little too
-    regular; below 20 signals trust none of it. Nothing with fewer than `LEAST` signals between the limits.
-    """
+    """Test the assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence of rows in their order,
+    and of repeats. Below 20 signals trust none of it; nothing with fewer than `LEAST` between the limits."""
     exact = ~(fit.below | fit.above)
     if exact.sum() < LEAST:
         return ()
     z, x = residual_scores(fit), fit.x[exact]
-    n, target = len(z), fit.target[exact]
+    n = len(z)
 
-    ratio = 0.0  # likelihood ratio of a quadratic term, which takes the censored signals in
+    bend = 0.0  # likelihood ratio of a quadratic term, which takes the censored signals in
     spread = (fit.x - fit.x.mean()) / fit.x.std()
     if len(np.unique(spread)) > 2:
         columns = np.column_stack([np.ones_like(spread), spread, spread**2])
         line, bent = (fit_censored(columns[:, :k], fit.y, fit.below, fit.above) for k in (2, 3))
-        ratio = max(float(2 * (bent.log_likelihood - line.log_likelihood)), 0.0)
-    tests = [Diagnostic("linearity", "quadratic term, likelihood ratio", ratio, float(stats.chi2.sf(ratio, 1)))]
-
+        bend = max(float(2 * (bent.log_likelihood - line.log_likelihood)), 0.0)
     # Breusch and Pagan 1979 with Koenker's 1981 studentised statistic n R^2 of z^2 on x.
-    share = 0.0 if x.std() == 0 or (z**2).std() == 0 else float(np.corrcoef(x, z**2)[0, 1]) ** 2
-    tests.append(Diagnostic("equal scatter", "Breusch-Pagan", n * share, float(stats.chi2.sf(n * share, 1))))
-    tests.append(_normality(z))
-
+    share = 0.0 if x.std() == 0 or (z**2).std() == 0 else n * float(np.corrcoef(x, z**2)[0, 1]) ** 2
     # Von Neumann's ratio of successive differences in the order of rows (Durbin-Watson's statistic), two-sided; with
     # divisor n in both: mean 2, variance 4 (n - 2) / ((n - 1)(n + 1)) for independent normal values.
     ratio = float(np.sum(np.diff(z) ** 2) / np.sum((z - z.mean()) ** 2))
     score = (ratio - 2) / np.sqrt(4 * (n - 2) / ((n - 1) * (n + 1)))
-    tests.append(Diagnostic("independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))))
-
+    tests = [
+        Diagnostic("linearity", "quadratic term, likelihood ratio", bend, float(stats.chi2.sf(bend, 1))),
+        Diagnostic("equal scatter", "Breusch-Pagan", share, float(stats.chi2.sf(share, 1))),
+        Diagnostic("normality", "Anderson-Darling", *_anderson_darling(z)),
+        Diagnostic("independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))),
+    ]
     # One-way analysis of variance of the residuals over targets: alike within a target, repeats are no targets.
-    _, group, size = np.unique(target, return_inverse=True, return_counts=True)
-    if fit.per_target > 1 and 2 <= len(size) < n:
-        mean = np.bincount(group, z) / size
-        between = float(np.sum(size * (mean - z.mean()) ** 2)) / (len(size) - 1)
-        within = float(np.sum((z - mean[group]) ** 2)) / (n - len(size))
-        f = between / within if within > 0 else np.inf
-        p = float(stats.f.sf(f, len(size) - 1, n - len(size)))
-        tests.append(Diagnostic("independence of repeats", "ANOVA over targets", f, p))
+    groups = [z[fit.target[exact] == name] for name in np.unique(fit.target[exact])]
+    if fit.per_target > 1 and 2 <= len(groups) < n:
+        f, p = stats.f_oneway(*groups)
+        tests.append(Diagnostic("independence of repeats", "ANOVA over targets", float(f), float(p)))
     return tuple(tests)
 
 
 def residual_scores(fit: AhatFit) -> np.ndarray:
-    """Residuals (signals between the limits,) as scores that are standard normal under the model.
-
-    Near a limit the distribution of residuals is cut off, so they are mapped through it first:
-    u = (F(r) - F(low)) / (F(high) - F(low)), z = Phi^-1(u), which is standard normal whatever was censored.
-    """
+    """Compute residuals (signals between the limits,) as scores that are standard normal under the model: mapped
+    through their distribution, which the limits cut off, u = (F(r) - F(low)) / (F(high) - F(low)), z = Phi^-1(u)."""
     exact = ~(fit.below | fit.above)
     line = (fit.b0 + fit.b1 * fit.x)[exact]
 
@@ -418,19 +305,13 @@ def residual_scores(fit: AhatFit) -> np.ndarray:
     return np.clip(np.where(np.isneginf(low) & np.isposinf(high), r, z), -38.0, 38.0)
 
 
-def _normality(z: np.ndarray) -> Diagnostic:
-    """Anderson and Darling, mean and variance estimated; p by D'Agostino and Stephens 1986, table 4.9."""
-    ordered = np.sort((z - z.mean()) / z.std(ddof=1))
-    n = len(z)
-    weights = 2 * np.arange(1, n + 1) - 1
+def _anderson_darling(z: np.ndarray) -> tuple[float, float]:
+    """The statistic, mean and variance estimated, and p by D'Agostino and Stephens 1986, table 4.9."""
+    ordered, n = np.sort((z - z.mean()) / z.std(ddof=1)), len(z)
     logs = special.log_ndtr(ordered) + special.log_ndtr(-ordered[::-1])
-    a = (-n - float(np.mean(weights * logs))) * (1 + 0.75 / n + 2.25 / n**2)
-    if a >= 0.6:
-        p = np.exp(1.2937 - 5.709 * a + 0.0186 * a**2)
-    elif a > 0.34:
-        p = np.exp(0.9177 - 4.279 * a - 1.38 * a**2)
-    elif a > 0.2:
-        p = 1 - np.exp(-8.318 + 42.796 * a - 59.938 * a**2)
-    else:
-        p = 1 - np.exp(-13.436 + 101.14 * a - 223.73 * a**2)
-    return Diagnostic("normality", "Anderson-Darling", a, float(np.clip(p, 0, 1)) if a < 13 else 0.0)
+    a = (-n - float(np.mean((2 * np.arange(1, n + 1) - 1) * logs))) * (1 + 0.75 / n + 2.25 / n**2)
+    pieces = [(0.6, 1.2937, -5.709, 0.0186, 0), (0.34, 0.9177, -4.279, -1.38, 0)]
+    pieces += [(0.2, -8.318, 42.796, -59.938, 1), (-np.inf, -13.436, 101.14, -223.73, 1)]
+    _, c0, c1, c2, upper = next(piece for piece in pieces if a > piece[0])
+    tail = np.exp(min(c0 + c1 * a + c2 * a**2, 700.0))
+    return a, float(np.clip(1 - tail if upper else tail, 0, 1)) if a < 13 else 0.0

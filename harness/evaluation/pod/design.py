@@ -1,24 +1,19 @@
 """Plans of hit/miss studies, made before anybody drills a hole; and the little that repeats of a few holes show.
-
-A study is planned from a guess of the POD curve: studies are simulated from it and analysed as real ones would be.
-MIL-HDBK-1823A asks for at least 60 independent targets, with sizes spread evenly and over where POD rises. The plan is
-as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less.
-"""
+Studies are simulated from a guess of the POD curve and analysed as real ones would be."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from harness.evaluation.pod.curve import LINKS, Bound, PodCurve, link_ppf
-from harness.evaluation.pod.false_calls import threshold_for_rate
-from harness.evaluation.pod.hit_miss import Between, HitMissFit, fit_hit_miss
-from harness.evaluation.pod.likelihood_bounds import bound
+from harness.evaluation.intervals import threshold_for_rate
+from harness.evaluation.pod.curve import Bound, PodCurve, link_ppf
+from harness.evaluation.pod.hit_miss import Between, bound, fit_hit_miss
 from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
@@ -27,7 +22,6 @@ SPREAD_SHARE = 1 / 3
 """Share of a concentrated design's targets that is still spread over the whole range: insurance against the guess."""
 RISE = (0.03, 0.97)
 """POD between which a curve counts as rising (MIL-HDBK-1823A: sizes should cover about that)."""
-
 LEAST_SIGNALS = 40
 """MIL-HDBK-1823A: independent targets where signals are recorded (a-hat), at least."""
 WORTH = 0.05
@@ -45,12 +39,9 @@ PLACEMENTS: tuple[Placement, ...] = ("uniform", "concentrated")
 
 @dataclass(frozen=True, eq=False)
 class StudyPlan:
-    """Expected outcome of studies of ``targets`` targets, placed by ``placement``, if the guess is right.
-
-    ``bound``: median over simulated studies of the upper bound on the size with this ``pod`` (a90/95), infinite where
-    half of them demonstrate none; ``low``, ``high``: their 10 % and 90 % quantiles; ``true_size``: the guess's own;
-    ``demonstrated``: share of studies with a finite bound; ``sizes`` (targets,) to make.
-    """
+    """Expected outcome of studies, if the guess is right. ``bound``: median over simulated studies of a90/95, infinite
+    where half of them demonstrate none; ``low``, ``high``: their 10 % and 90 % quantiles; ``true_size``: the guess's
+    own; ``demonstrated``: share of studies with a finite bound; ``sizes`` (targets,) to make."""
 
     targets: int
     placement: Placement
@@ -69,17 +60,10 @@ class StudyPlan:
 
 def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
     """The curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
-
-    UserError where it would not rise, and for sizes that are not above 0.
-    """
-    if link not in LINKS:
-        raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
+    UserError where it would not rise, and for sizes that are not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
-        raise UserError(
-            f"a50 {a50:g} and a90 {a90:g}: the chance of detection has to grow with size",
-            legal="0 < a50 < a90",
-            fix="a50 is found half the time, the larger a90 nine times of ten",
-        )
+        said = f"a50 {a50:g} and a90 {a90:g}: the chance of detection has to grow with size"
+        raise UserError(said, legal="0 < a50 < a90", fix="a50 is found half the time, the larger a90 nine times of ten")
     start, end = np.log([a50, a90]) if log_size else (a50, a90)
     half, nine_tenths = link_ppf(link, np.array([0.5, 0.9]))
     sigma = float((end - start) / (nine_tenths - half))
@@ -94,31 +78,16 @@ def design(
     placements: Sequence[Placement] = PLACEMENTS,
     pod: float = 0.9,
     confidence: float = 0.95,
-    method: str = "likelihood ratio",
     studies: int = 200,
     seed: int = 0,
 ) -> tuple[StudyPlan, ...]:
     """Simulate one `StudyPlan` for each number of targets and placement, in that order; a study takes about 5 ms.
-
-    Studies are analysed with the guess's link and axis (and with a floor or a ceiling where it has one, at about a
-    second a study), so choosing a model costs nothing here. A study that found all or nothing, or whose POD does not
-    grow with size, demonstrates nothing. The Monte Carlo error of ``demonstrated`` is sqrt(p (1 - p) / studies).
-    UserError for a range that is empty, or not above 0 under a logarithm.
-    """
+    Studies are analysed with the guess's link and axis, and with a floor or ceiling where it has one. A study that
+    found all or nothing, or whose POD does not grow with size, demonstrates nothing."""
     low, high = range_of_sizes
-    if not (np.isfinite([low, high]).all() and low < high) or (guess.log_size and low <= 0):
-        raise UserError(
-            f"range of sizes {low:g} to {high:g}",
-            legal="low < high" + (", above 0 for a curve over ln size" if guess.log_size else ""),
-        )
-    if studies < 1 or min(targets, default=0) < 2:
-        raise UserError(f"{studies} studies of {list(targets)} targets", legal="one study, two targets at least")
-    bounded: Between = "none"
-    if guess.floor > 0:
-        bounded = "both" if guess.ceiling < 1 else "floor"
-    elif guess.ceiling < 1:
-        bounded = "ceiling"
-    true_size, plans = guess.size_at(pod), []
+    kinds: dict[tuple[bool, bool], Between] = {(False, False): "none", (True, False): "floor", (False, True): "ceiling"}
+    bounded = kinds.get((guess.floor > 0, guess.ceiling < 1), "both")
+    method, true_size, plans = "likelihood ratio", guess.size_at(pod), []
     for number in targets:
         for placement in placements:
             sizes = place_sizes(guess, number, range_of_sizes, placement)
@@ -126,9 +95,7 @@ def design(
             bounds = np.full(studies, np.inf)
             for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
                 try:
-                    fit = fit_hit_miss(
-                        sizes, hits.astype(float), link=guess.link, log_size=guess.log_size, bounded=bounded
-                    )
+                    fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size, bounded=bounded)
                 except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
                     continue
                 bounds[study] = bound(fit, pod, confidence, method).value
@@ -136,53 +103,33 @@ def design(
             if number < LEAST_TARGETS:
                 notes.append(f"{number} targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
             if not low <= true_size <= high:
-                notes.append(
-                    f"the guess's size at POD {pod:g}, {true_size:.4g}, lies outside the range: it is extrapolated"
-                )
+                size = f"the guess's size at POD {pod:g}, {true_size:.4g}"
+                notes.append(f"{size}, lies outside the range: it is extrapolated")
             # Order statistics, as there is no mean between a number and infinity.
-            quantiles = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-            plans.append(
-                StudyPlan(
-                    targets=number,
-                    placement=placement,
-                    pod=pod,
-                    confidence=confidence,
-                    method=method,
-                    studies=studies,
-                    true_size=true_size,
-                    bound=quantiles[1],
-                    low=quantiles[0],
-                    high=quantiles[2],
-                    demonstrated=float(np.mean(np.isfinite(bounds))),
-                    sizes=sizes,
-                    notes=tuple(notes),
-                )
-            )
+            least, median, most = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
+            shown, told = float(np.mean(np.isfinite(bounds))), (number, placement, pod, confidence, method, studies)
+            plans.append(StudyPlan(*told, true_size, median, least, most, shown, sizes, tuple(notes)))
     return tuple(plans)
 
 
 def place_sizes(guess: PodCurve, number: int, range_of_sizes: tuple[float, float], placement: Placement) -> np.ndarray:
     """Ascending sizes (number,), evenly spaced on the Cartesian scale over the range ("uniform"), or `SPREAD_SHARE` of
     them so and the rest evenly where the guess rises through `RISE`, cut to the range ("concentrated")."""
-    if placement == "uniform":
-        return _evenly(number, *range_of_sizes)
-    if placement != "concentrated":
-        raise UserError(f"placement {placement!r} is not known", legal=", ".join(PLACEMENTS))
+
+    def evenly(n: int, start: float, end: float) -> np.ndarray:
+        """Midpoints of equal parts: no target wasted on the very ends."""
+        return start + (end - start) * (np.arange(n) + 0.5) / max(n, 1)
+
     low, high = range_of_sizes
-    between = [guess.floor + share * (guess.ceiling - guess.floor) for share in RISE]
-    start, end = (float(np.clip(guess.size_at(pod), low, high)) for pod in between)
+    if placement == "uniform":
+        return evenly(number, low, high)
+    rise = [guess.size_at(guess.floor + share * (guess.ceiling - guess.floor)) for share in RISE]
+    start, end = np.clip(rise, low, high).tolist()
     if not start < end:
-        raise UserError(
-            f"the guessed curve does not rise between sizes {low:g} and {high:g}",
-            legal=f"a range that meets {guess.size_at(between[0]):.4g} to {guess.size_at(between[1]):.4g}",
-        )
+        legal = f"a range that meets {rise[0]:.4g} to {rise[1]:.4g}"
+        raise UserError(f"the guessed curve does not rise between sizes {low:g} and {high:g}", legal=legal)
     spread = round(number * SPREAD_SHARE)
-    return np.sort(np.concatenate([_evenly(spread, low, high), _evenly(number - spread, start, end)]))
-
-
-def _evenly(number: int, low: float, high: float) -> np.ndarray:
-    """Midpoints of equal parts: no target wasted on the very ends."""
-    return low + (high - low) * (np.arange(number) + 0.5) / max(number, 1)
+    return np.sort(np.concatenate([evenly(spread, low, high), evenly(number - spread, start, end)]))
 
 
 @dataclass(frozen=True)
@@ -206,28 +153,16 @@ def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> Recommen
     pool = reaching or allowed
     number = (min if reaching else max)(plan.targets for plan in pool)
     by_placement = {plan.placement: plan for plan in pool if plan.targets == number}
-    even, close = by_placement.get("uniform"), by_placement.get("concentrated")
-    if even is None or close is None:
-        plan = next(iter(by_placement.values()))
-    else:
-        plan = close if close.high < (1 - WORTH) * even.high else even
+    plan, close = (by_placement.get(placement) or next(iter(by_placement.values())) for placement in PLACEMENTS)
+    if close.high < (1 - WORTH) * plan.high:
+        plan = close
     return Recommendation(plan, bool(enough), None if goal is None else bool(reaching))
 
 
 def guess_with_frames(guess: PodCurve, frames: int, *, guessed_with: int, fixed_share: float) -> PodCurve:
-    """Carry the guess to another number of averaged frames.
-
-    Noise has a white part that averages out and a fixed part that does not: variance(N) / variance(``guessed_with``) =
-    (1 - s) guessed_with / N + s, ``fixed_share`` s of the variance in the guess. With the target's shape known, its
-    detectability d' is size / noise (depth at a fixed diameter; about so for the diameter, the more so the larger it is
-    than the camera's blur), so sizes of equal POD scale with the noise's standard deviation. The curve's covariance
-    scales along. Not modelled: pixels that become valid, motion.
-    """
-    if not (frames >= 1 and guessed_with >= 1 and 0 <= fixed_share <= 1):
-        raise UserError(
-            f"{frames} frames, guessed with {guessed_with}, fixed share {fixed_share:g}",
-            legal="one frame at least, a share between 0 and 1",
-        )
+    """Carry the guess to another number of averaged frames: variance(N) / variance(``guessed_with``) = (1 - s)
+    guessed_with / N + s with ``fixed_share`` s. Sizes of equal POD scale with the noise (depth at a fixed diameter;
+    about so for the diameter). Not modelled: pixels that become valid, motion."""
     ratio = float(np.sqrt((1 - fixed_share) * guessed_with / frames + fixed_share))
     if guess.log_size:
         return replace(guess, mu=guess.mu + float(np.log(ratio)))
@@ -253,46 +188,11 @@ class FramesPlan:
     plan: StudyPlan
 
 
-def plans_by_frames(
-    guess: PodCurve,
-    frames: Sequence[int],
-    *,
-    guessed_with: int,
-    fixed_share: float,
-    targets: int,
-    range_of_sizes: tuple[float, float],
-    pod: float,
-    confidence: float,
-    studies: int,
-    seed: int,
-) -> tuple[FramesPlan, ...]:
-    """Plan with the guess carried to each of ``frames`` by `guess_with_frames`, on the same evenly spread targets and
-    with the same luck. UserErrors as of `design` and `guess_with_frames`."""
-    out = []
-    for number in frames:
-        curve = guess_with_frames(guess, number, guessed_with=guessed_with, fixed_share=fixed_share)
-        (plan,) = design(
-            curve,
-            (targets,),
-            range_of_sizes,
-            placements=("uniform",),
-            pod=pod,
-            confidence=confidence,
-            studies=studies,
-            seed=seed,
-        )
-        out.append(FramesPlan(number, curve, plan))
-    return tuple(out)
-
-
 @dataclass(frozen=True)
 class HoleFree:
-    """Hole-free boards of ``board_m2`` for ``rate_per_m2`` false calls.
-
-    ``calibration_boards``: the fewest from which a threshold can be had; such a threshold gives ``expected_per_m2`` on
-    average, and no more than ``upper_per_m2`` with ``confidence``. ``areas_m2``: for each of `CALLS` false calls the
-    area, on other boards, on which no more of them bound the rate by the wanted one, with the same confidence.
-    """
+    """Hole-free boards for a rate of false calls. ``calibration_boards``: the fewest that give a threshold, with
+    ``expected_per_m2`` on average and at most ``upper_per_m2`` with ``confidence``. ``areas_m2``: for each of `CALLS`
+    false calls the area on which no more of them bound the rate by the wanted one."""
 
     rate_per_m2: float
     board_m2: float
@@ -315,30 +215,9 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
     fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
     # Any distinct scores: what the rule says of its rates does not depend on them.
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
-    return HoleFree(
-        rate_per_m2=rate_per_m2,
-        board_m2=board_m2,
-        confidence=confidence,
-        calibration_boards=fewest,
-        expected_per_m2=threshold.rate_per_m2,
-        upper_per_m2=threshold.upper_per_m2,
-        areas_m2=tuple(float(stats.chi2.ppf(confidence, 2 * (calls + 1)) / 2 / rate_per_m2) for calls in CALLS),
-    )
-
-
-@dataclass(frozen=True)
-class RepeatsCheck:
-    """The limit of ``inspections`` inspections of ``targets`` targets, right and wrong.
-
-    ``right``: targets count, ``wrong``: each inspection is taken for a target of its own; ``text`` says it in words.
-    """
-
-    targets: int
-    inspections: int
-    right: Bound
-    wrong: Bound
-    fit: HitMissFit
-    text: str
+    areas = tuple(float(stats.chi2.ppf(confidence, 2 * (calls + 1)) / 2 / rate_per_m2) for calls in CALLS)
+    rates = threshold.rate_per_m2, threshold.upper_per_m2
+    return HoleFree(rate_per_m2, board_m2, confidence, fewest, *rates, areas)
 
 
 def repeats_are_not_targets(
@@ -350,38 +229,23 @@ def repeats_are_not_targets(
     log_size: bool = False,
     pod: float = 0.9,
     confidence: float = 0.95,
-    method: str = "likelihood ratio",
-) -> RepeatsCheck:
-    """State both limits of one set of inspections: ``size``, ``hit`` (0/1) and ``target`` (identity), each (n,).
-
-    Fifty repeats of eight holes repeat the noise, not the holes: they are eight targets. UserErrors as of
-    `harness.evaluation.pod.hit_miss.fit_hit_miss`.
-    """
-    fit = fit_hit_miss(
-        np.asarray(size, float), np.asarray(hit, float), link=link, log_size=log_size, inspections=np.asarray(target)
+) -> tuple[Bound, Bound]:
+    """The bound of ``size``, ``hit`` (0/1) and ``target`` (identity), each (n,), and the wrong one that takes each row
+    for a target of its own. Fifty repeats of eight holes repeat the noise, not the holes: they are eight targets."""
+    right, wrong = (
+        # A fit of its own: where hits and misses separate, the penalty would still count targets.
+        bound(fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=names), pod, confidence)
+        for names in (target, None)
     )
-    right = bound(fit, pod, confidence, method)
-    # A fit of its own: where hits and misses separate, the penalty would still count targets.
-    rows = fit_hit_miss(np.asarray(size, float), np.asarray(hit, float), link=link, log_size=log_size)
-    wrong = bound(rows, pod, confidence, method)
-    name = f"a{100 * pod:g}/{100 * confidence:g}"
-    said = [f"{limit.value:.4g}" if limit.demonstrated else "not demonstrated" for limit in (right, wrong)]
-    text = (
-        f"{fit.n} inspections of {fit.targets} targets are {fit.targets} targets: {name} {said[0]}; "
-        f"taken for {fit.n} targets, wrongly, {said[1]}"
-    )
-    return RepeatsCheck(fit.targets, fit.n, right, wrong, fit, text)
+    return right, wrong
 
 
 @dataclass(frozen=True)
 class RepeatedStudies:
     """``studies`` simulated studies, each of ``repeats`` inspections of ``targets`` targets of ``sizes`` (targets,).
-
     ``share``: of the variance of luck, the target's own. ``right``, ``wrong``: medians of the upper bound that counts
-    targets and of the one that counts rows, infinite where half of the studies demonstrate none; ``*_demonstrated``:
-    share of studies with a finite one; ``*_too_small``: share whose bound is below ``true_size``, which has to be no
-    more than 1 - confidence. ``text``: the first study that has a curve, in words; empty where none has.
-    """
+    targets and of that which counts rows, infinite where half demonstrate none; ``*_demonstrated``: share with a finite
+    one; ``*_too_small``: share below ``true_size``. ``text``: the first study that has a curve, in words."""
 
     share: float
     targets: int
@@ -396,6 +260,9 @@ class RepeatedStudies:
     right_too_small: float
     wrong_too_small: float
     text: str
+
+
+NUMBERS = ("right", "wrong", "right_demonstrated", "wrong_demonstrated", "right_too_small", "wrong_too_small")
 
 
 def repeated_studies(
@@ -413,47 +280,27 @@ def repeated_studies(
     """Simulate studies with repeats: one row for each of ``shares``; sizes evenly spread. Any single inspection is
     found with the guess's POD at any share (luck is a normal copula). A study without a rising curve demonstrates
     nothing. Bounds by likelihood ratio."""
-    if targets < 2 or repeats < 2:
-        raise UserError(f"{repeats} repeats of {targets} targets", legal="two repeats of two targets at least")
     sizes, true_size = place_sizes(guess, targets, range_of_sizes, "uniform"), guess.size_at(pod)
-    rows = []
+    size, target, n, rows = np.repeat(sizes, repeats), np.repeat(np.arange(targets), repeats), targets * repeats, []
+    asked: dict[str, Any] = {"link": guess.link, "log_size": guess.log_size, "pod": pod, "confidence": confidence}
     for share in shares:
         stream = random_stream(seed, "repeats", targets, repeats)
-        right, wrong, texts = np.full(studies, np.inf), np.full(studies, np.inf), []
+        bounds, text = np.full((2, studies), np.inf), ""
         for study in range(studies):
             own, of_noise = stream.standard_normal((targets, 1)), stream.standard_normal((targets, repeats))
             luck = stats.norm.cdf(np.sqrt(share) * own + np.sqrt(1 - share) * of_noise)
             hit = luck < guess.pod(sizes)[:, None]
             try:
-                check = repeats_are_not_targets(
-                    np.repeat(sizes, repeats),
-                    hit.ravel(),
-                    np.repeat(np.arange(targets), repeats),
-                    link=guess.link,
-                    log_size=guess.log_size,
-                    pod=pod,
-                    confidence=confidence,
-                )
+                both = repeats_are_not_targets(size, hit.ravel(), target, **asked)
             except UserError:  # One class only, or a slope that is not positive: such a study demonstrates nothing.
                 continue
-            right[study], wrong[study] = check.right.value, check.wrong.value
-            texts.append(check.text)
-        medians = [float(np.quantile(one, 0.5, method="inverted_cdf")) for one in (right, wrong)]
-        rows.append(
-            RepeatedStudies(
-                share=share,
-                targets=targets,
-                repeats=repeats,
-                studies=studies,
-                true_size=true_size,
-                sizes=sizes,
-                right=medians[0],
-                wrong=medians[1],
-                right_demonstrated=float(np.mean(np.isfinite(right))),
-                wrong_demonstrated=float(np.mean(np.isfinite(wrong))),
-                right_too_small=float(np.mean(right < true_size)),
-                wrong_too_small=float(np.mean(wrong < true_size)),
-                text=texts[0] if texts else "",
-            )
-        )
+            bounds[:, study] = [one.value for one in both]
+            name = f"a{100 * pod:g}/{100 * confidence:g}"
+            said = [f"{limit.value:.4g}" if limit.demonstrated else "not demonstrated" for limit in both]
+            right = f"{n} inspections of {targets} targets are {targets} targets: {name} {said[0]}"
+            text = text or f"{right}; taken for {n} targets, wrongly, {said[1]}"
+        medians = np.quantile(bounds, 0.5, axis=1, method="inverted_cdf").tolist()
+        known, small = np.isfinite(bounds).mean(axis=1).tolist(), (bounds < true_size).mean(axis=1).tolist()
+        numbers = dict(zip(NUMBERS, (*medians, *known, *small), strict=True))
+        rows.append(RepeatedStudies(share, targets, repeats, studies, true_size, sizes, text=text, **numbers))
     return tuple(rows)

@@ -1,26 +1,42 @@
 """Probability of detection from hits and misses: a binomial regression on size, by MIL-HDBK-1823A appendix G.
 
-A target that was inspected k times is one target: rows that share an identity in ``inspections`` are taken as fully
-dependent (the handbook's conservative reading), so covariance and likelihood ratio criterion are scaled by k, the mean
-number of inspections a target. Curves may start above 0 (chance hits) or end below 1 (targets that no size makes
-visible): P(hit) = f + (c - f) F(b0 + b1 z) with 0 <= f <= 1/2 <= c <= 1. That likelihood is not concave: it is
-maximised from several starts. Not modelled: targets that differ in anything but size, inspectors as a factor, a floor
-above or a ceiling below one half.
-"""
+Rows that share an identity in ``inspections`` are one target and taken as fully dependent (the handbook's reading): of
+k rows a target, covariance and likelihood ratio criterion are scaled by k. P(hit) = f + (c - f) F(b0 + b1 z) with 0 <=
+f <= 1/2 <= c <= 1; with floor f or ceiling c fitted it is not concave, and maximised from several starts. Not modelled:
+targets that differ in anything but size, inspectors, a floor above or a ceiling below one half. Bounds are one-sided:
+
+- "likelihood ratio" (default): the set 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 in (mu, sigma), MIL-HDBK-1823A
+  G.3; a90/95 is the largest a90 in it, which equals the profile likelihood of a90 at that criterion.
+- "profile": the same at the one-sided criterion chi2(2 confidence - 1, 1) = 2.706.
+- "wald": the size at which the pointwise lower Wald band of the linear predictor crosses the wanted POD (Fieller)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
+from scipy.optimize import elementwise
 from scipy.special import xlogy
 
-from harness.evaluation.pod.curve import LINKS, PodCurve, link_ppf, logs_of_link
-from harness.evaluation.pod.likelihood import HitsAndMisses, maxima, penalised_maxima
+from harness.evaluation.pod.curve import (
+    LINKS,
+    Bound,
+    HitsAndMisses,
+    PodCurve,
+    flat_maximum,
+    link_cdf,
+    link_ppf,
+    logs_of_link,
+    maxima,
+    penalised_maxima,
+    profile,
+)
 from harness.vocabulary.errors import UserError
 
 Between = Literal["none", "floor", "ceiling", "both"]
@@ -37,13 +53,10 @@ NEAR_EDGE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class HitMissFit:
-    """A fitted curve and its basis.
-
-    ``b0``, ``b1``: POD = floor + (ceiling - floor) F(b0 + b1 x), x = size or ln size; ``covariance`` (2, 2) of the two,
-    scaled for repeats. ``deviance``, ``null_deviance``, ``log_likelihood`` count every row, as the handbook's tables
-    do; where ``method`` is "Firth" they are those of the likelihood without its penalty. ``n`` rows, ``hits`` of them
-    hits, ``targets`` different ones, ``repeats`` = n / targets. ``x`` (n,), ``hit`` (n,): the data, for the bounds.
-    """
+    """A fitted curve and its basis. POD = floor + (ceiling - floor) F(b0 + b1 x), x = size or ln size; ``covariance``
+    (2, 2) of the two, scaled for ``repeats`` = n / targets. Deviances count every row, without the penalty of
+    ``method`` "Firth". ``place`` (4,): intercept and slope in z = (x - centre) / spread, floor and ceiling; ``data``:
+    the likelihood maximised."""
 
     curve: PodCurve
     b0: float
@@ -55,45 +68,16 @@ class HitMissFit:
     n: int
     hits: int
     targets: int
-    separated: bool
+    repeats: float
     method: Literal["ML", "Firth"]
     notes: tuple[str, ...]
     bounded: Between
     x: np.ndarray
     hit: np.ndarray
-
-    @property
-    def repeats(self) -> float:
-        """Mean number of inspections of a target."""
-        return self.n / self.targets
-
-    @property
-    def covariance_of_rows(self) -> np.ndarray:
-        """(2, 2) of (b0, b1) as if every row were a target of its own: the number that is too small."""
-        return self.covariance / self.repeats
-
-    @property
-    def centre(self) -> float:
-        """Mean of ``x``, from which `data` counts."""
-        return float(self.x.mean())
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of ``x``, the unit of `data`."""
-        return float(self.x.std())
-
-    @property
-    def place(self) -> np.ndarray:
-        """(4,) intercept and slope in standardised sizes, floor and ceiling."""
-        slope = self.b1 * self.spread
-        return np.array([self.b0 + self.b1 * self.centre, slope, self.curve.floor, self.curve.ceiling])
-
-    @property
-    def data(self) -> HitsAndMisses:
-        """The likelihood that was maximised, in standardised sizes z = (x - centre) / spread."""
-        penalty = self.repeats if self.method == "Firth" else None
-        floor, ceiling = self.curve.floor, self.curve.ceiling
-        return _data(self.x, self.hit, self.curve.link, penalty=penalty, floor=floor, ceiling=ceiling)
+    centre: float
+    spread: float
+    place: np.ndarray
+    data: HitsAndMisses
 
 
 @dataclass(frozen=True)
@@ -113,114 +97,93 @@ class FloorCeilingTest:
 
 
 def fit_hit_miss(
-    size: Sequence[float] | np.ndarray,
-    hit: Sequence[float] | np.ndarray,
+    size: ArrayLike,
+    hit: ArrayLike,
     *,
     link: str = "logit",
     log_size: bool = False,
-    inspections: Sequence[object] | np.ndarray | None = None,
+    inspections: ArrayLike | None = None,
     bounded: Between = "none",
 ) -> HitMissFit:
     """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row.
-
-    Where hits and misses do not overlap there is no maximum of the likelihood: Firth's penalised one is fitted, with
-    a note. `UserError` for values that cannot be fitted and for a chance of detection that does not grow with size.
-    """
+    Where hits and misses do not overlap there is no maximum of the likelihood: Firth's penalised one is fitted, with a
+    note. `UserError` for values that cannot be fitted and for a chance of detection that does not grow with size."""
     x, hits = _checked(size, hit, link, log_size, bounded)
-    targets = _number_of_targets(x, inspections)
-    repeats = len(x) / targets
+    n, targets = len(x), number_of_targets(x, inspections)
+    repeats, rate, centre, spread = n / targets, float(hits.mean()), float(x.mean()), float(x.std())
     # Complete and quasi-complete separation on a line, either way round: Albert and Anderson, Biometrika 71 (1984).
     separated = bool(x[~hits].max() <= x[hits].min() or x[hits].max() <= x[~hits].min())
-    data = _data(x, hits, link, several=True, penalty=repeats if separated else None)
+    design = np.column_stack([np.ones_like(x), (x - centre) / spread])
+    found, penalty = hits.astype(float), repeats if separated else None
+    several = HitsAndMisses(design, found[None], 1.0 - found[None], link, penalty)
     notes: tuple[str, ...] = ()
-    rate = float(hits.mean())
     if separated:
+        place = np.append(penalised_maxima(several, EXACT)[0], [0.0, 1.0])
         if x[hits].mean() < x[~hits].mean():
-            raise _not_rising()
-        place = np.append(penalised_maxima(data, EXACT)[0], [0.0, 1.0])
+            place[1] = 0.0
         notes = ("no miss is larger than any hit (separation): no maximum likelihood; Firth's penalised likelihood",)
         if bounded != "none":
             notes += (f"no {'floor or ceiling' if bounded == 'both' else bounded} fitted: separated data hold none",)
     else:
         start = np.array([float(link_ppf(link, np.array(rate))), 0.0])
-        place = np.append(maxima(data, start, EXACT)[0], [0.0, 1.0])
+        place = np.append(maxima(several, start, EXACT)[0], [0.0, 1.0])
         if bounded != "none" and place[1] > 0:
-            place, notes = _bounded_maximum(_data(x, hits, link), place, bounded)
+            place, notes = _bounded_maximum(HitsAndMisses(design, found, 1.0 - found, link), place, bounded)
     if place[1] <= 0:
-        raise _not_rising()
-    single = _data(x, hits, link, floor=place[2], ceiling=place[3])
+        fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
+        raise UserError("the chance of detection does not grow with size: the slope is not positive", fix=fix)
+    floor, ceiling = float(place[2]), float(place[3])
+    single = HitsAndMisses(design, found, 1.0 - found, link, floor=floor, ceiling=ceiling)
     log_likelihood = float(single.value(place[:2]))
-    unscale = np.array([[1.0, -x.mean() / x.std()], [0.0, 1.0 / x.std()]])
-    b0, b1 = unscale @ place[:2]
+    unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
+    b0, b1 = (float(b) for b in unscale @ place[:2])
     covariance = unscale @ (_covariance(single, place) * repeats) @ unscale.T
     slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
-    of_curve = slopes @ covariance @ slopes.T
-    if targets < len(x):
-        notes += (f"{len(x)} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
-    return HitMissFit(
-        curve=PodCurve(link, log_size, float(-b0 / b1), float(1.0 / b1), of_curve, float(place[2]), float(place[3])),
-        b0=float(b0),
-        b1=float(b1),
-        covariance=covariance,
-        deviance=-2.0 * log_likelihood,
-        null_deviance=float(-2.0 * len(x) * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate))),
-        log_likelihood=log_likelihood,
-        n=len(x),
-        hits=int(hits.sum()),
-        targets=targets,
-        separated=separated,
-        method="Firth" if separated else "ML",
-        notes=notes,
-        bounded="none" if separated else bounded,
-        x=x,
-        hit=hits,
-    )
+    if targets < n:
+        notes += (f"{n} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
+    curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T, floor, ceiling)
+    null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
+    numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
+    method: Literal["ML", "Firth"] = "Firth" if separated else "ML"
+    fitted: Between = "none" if separated else bounded
+    maximised = replace(single, penalty=penalty)
+    return HitMissFit(curve, *numbers, method, notes, fitted, x, hits, centre, spread, place, maximised)
 
 
 def choose_model(
-    size: Sequence[float] | np.ndarray,
-    hit: Sequence[float] | np.ndarray,
+    size: ArrayLike,
+    hit: ArrayLike,
     *,
     links: Sequence[str] = LINKS,
-    inspections: Sequence[object] | np.ndarray | None = None,
+    inspections: ArrayLike | None = None,
     bounded: Between = "none",
 ) -> tuple[HitMissFit, ...]:
     """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order knows nothing of
     the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
-    fits = [
-        fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=inspections, bounded=bounded)
-        for log_size, link in product(logs, links)
-    ]
-    return tuple(sorted(fits, key=lambda fit: fit.deviance))
+    fit = partial(fit_hit_miss, size, hit, inspections=inspections, bounded=bounded)
+    fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, links)]
+    return tuple(sorted(fits, key=lambda one: one.deviance))
 
 
 def floor_ceiling_test(
-    size: Sequence[float] | np.ndarray,
-    hit: Sequence[float] | np.ndarray,
+    size: ArrayLike,
+    hit: ArrayLike,
     *,
     bounded: Between = "both",
     link: str = "logit",
     log_size: bool = False,
-    inspections: Sequence[object] | np.ndarray | None = None,
+    inspections: ArrayLike | None = None,
 ) -> FloorCeilingTest:
-    """Test three or four parameters against two by the likelihood ratio.
-
-    A floor of 0 and a ceiling of 1 lie on the boundary, so the statistic is distributed as 1/2 chi2(0) + 1/2 chi2(1)
-    for one of them and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases
-    5 and 7, with the correlation of floor and ceiling neglected: they are fed by opposite ends of the sizes).
-    """
-    if bounded == "none":
-        raise UserError("a test of floor and ceiling needs one of them", legal="floor, ceiling, both")
+    """Test three or four parameters against two by the likelihood ratio. A floor of 0 and a ceiling of 1 lie on the
+    boundary: 1/2 chi2(0) + 1/2 chi2(1) for one of them, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for both (Self
+    and Liang, JASA 82 (1987), 605, cases 5 and 7, their correlation neglected)."""
     plain = fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=inspections)
     fit = fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=inspections, bounded=bounded)
     statistic = max((plain.deviance - fit.deviance) / plain.repeats, 0.0)
     one, two = stats.chi2.sf(statistic, [1, 2])
     tail = float(0.5 * one if bounded != "both" else 0.5 * one + 0.25 * two)
     return FloorCeilingTest(bounded, statistic, tail if statistic > 1e-9 else 1.0, fit)
-
-
-# floor and ceiling
 
 
 def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, np.ndarray]:
@@ -256,9 +219,8 @@ def bounded_profile(data: HitsAndMisses, place: np.ndarray, bounded: str, z0: fl
         predictor = float(link_ppf(data.link, np.array(share)))
         value, by = value_and_gradient(data, np.array([predictor - b1 * z0, b1, at[1], at[2]]))
         by_share = by[0] / np.exp(float(logs_of_link(data.link, np.array(predictor))[2])) / between
-        return -value, -np.array(
-            [b1 * (by[1] - z0 * by[0]), by[2] - by_share * (1.0 - share), by[3] - by_share * share]
-        )
+        slopes = [b1 * (by[1] - z0 * by[0]), by[2] - by_share * (1.0 - share), by[3] - by_share * share]
+        return -value, -np.array(slopes)
 
     floors = sorted({float(np.clip(f, *floor)) for f in (place[2], 0.01)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (place[3], 0.5 * (1.0 + pod))})
@@ -284,13 +246,7 @@ def _bounded_maximum(data: HitsAndMisses, plain: np.ndarray, bounded: str) -> tu
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """The likeliest curve (4,) with floor and ceiling in these ranges, and its log-likelihood.
-
-    Floor and ceiling free the curve to rise steeply anywhere, and each such place can hold a maximum. So the search
-    starts from the likeliest places of a coarse grid, each with a middle and a slope of its own, and from the three
-    likeliest steps between neighbouring sizes, where the chance jumps from the share of hits below to that above: the
-    limit that a steep slope tends to.
-    """
+    """The likeliest curve (4,) with floor and ceiling in these ranges, from a grid's best and three steps."""
     z = data.z
     floors = sorted({float(np.clip(f, *floor)) for f in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (0.75, 0.9, 0.98)})
@@ -298,33 +254,28 @@ def _search(
     likeliest = []
     for middle, b1 in product(middles, plain[1] * np.array([1.0, 3.0, 12.0, 50.0])):
         places = [np.array([-b1 * middle, min(b1, STEEPEST), f, c]) for f, c in product(floors, ceilings)]
-        values = [value_and_gradient(data, place)[0] for place in places]
-        best = int(np.argmax(values))
-        likeliest.append((values[best], places[best]))
-    likeliest.sort(key=lambda pair: -pair[0])
-    starts = [place for _, place in likeliest[:STARTS]]
+        likeliest.append(max(((value_and_gradient(data, at)[0], at) for at in places), key=lambda pair: pair[0]))
+    starts = [at for _, at in sorted(likeliest, key=lambda pair: -pair[0])[:STARTS]]
 
     order = np.argsort(z, kind="stable")
     sizes, first = np.unique(z[order], return_index=True)
-    below, hits = np.append(0.0, np.cumsum(data.hits[order]))[first[1:]], data.hits.sum()
-    low, high = np.clip(below / first[1:], *floor), np.clip((hits - below) / (len(z) - first[1:]), *ceiling)
-    value = xlogy(below, low) + xlogy(first[1:] - below, 1.0 - low) + xlogy(hits - below, high)
-    value += xlogy(len(z) - first[1:] - (hits - below), 1.0 - high)
+    n_below, hits = first[1:], data.hits.sum()
+    below, n_above = np.append(0.0, np.cumsum(data.hits[order]))[n_below], len(z) - n_below
+    low, high = np.clip(below / n_below, *floor), np.clip((hits - below) / n_above, *ceiling)
+    value = xlogy(below, low) + xlogy(n_below - below, 1.0 - low)
+    value += xlogy(hits - below, high) + xlogy(n_above - (hits - below), 1.0 - high)
     slope, middle = np.minimum(6.0 / np.diff(sizes), STEEPEST), 0.5 * (sizes[1:] + sizes[:-1])
-    starts += [
-        np.array([-slope[k] * middle[k], slope[k], low[k], high[k]]) for k in np.argsort(-value, kind="stable")[:3]
-    ]
+    steps = np.stack([-slope * middle, slope, low, high], axis=1)
 
+    def loss(place: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = value_and_gradient(data, place)
+        return -value, -gradient
+
+    limits = ((-STEEPEST * 10, STEEPEST * 10), (1e-6, STEEPEST), floor, ceiling)
+    exactness = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 500}
     found, largest = plain, float("-inf")
-    for start in starts:
-        end = optimize.minimize(
-            lambda place: tuple(-part for part in value_and_gradient(data, place)),
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=((-STEEPEST * 10, STEEPEST * 10), (1e-6, STEEPEST), floor, ceiling),
-            options={"ftol": 1e-13, "gtol": 1e-8, "maxiter": 500},
-        )
+    for start in [*starts, *steps[np.argsort(-value, kind="stable")[:3]]]:
+        end = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits, options=exactness)
         if -end.fun > largest + 1e-9:
             found, largest = end.x, -float(end.fun)
     return found, largest
@@ -333,38 +284,18 @@ def _search(
 def _covariance(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:
     """(2, 2) covariance of (b0, b1): inverse expected information over the parameters off their boundaries."""
     b0, b1, floor, ceiling = place
-    if floor <= 0 and ceiling >= 1:
-        return np.asarray(np.linalg.inv(data.information(place[:2])))
-    share, _, density = np.exp(logs_of_link(data.link, b0 + b1 * data.z))
-    p = np.clip(floor + (ceiling - floor) * share, 1e-12, 1.0 - 1e-12)
+    hit, miss, density = np.exp(logs_of_link(data.link, b0 + b1 * data.z))
+    p_hit = np.maximum(floor + (ceiling - floor) * hit, 1e-300)
+    p_miss = np.maximum(1 - ceiling + (ceiling - floor) * miss, 1e-300)
     slopes = [(ceiling - floor) * density, (ceiling - floor) * density * data.z]
-    slopes += [1.0 - share] if floor > NEAR_EDGE else []
-    slopes += [share] if ceiling < 1.0 - NEAR_EDGE else []
+    slopes += [1.0 - hit] if floor > NEAR_EDGE else []
+    slopes += [hit] if ceiling < 1.0 - NEAR_EDGE else []
     design = np.column_stack(slopes)
-    return np.asarray(np.linalg.pinv(design.T @ (design / (p * (1.0 - p))[:, None]))[:2, :2])
-
-
-# what is given
-
-
-def _data(
-    x: np.ndarray,
-    hit: np.ndarray,
-    link: str,
-    *,
-    several: bool = False,
-    penalty: float | None = None,
-    floor: float = 0.0,
-    ceiling: float = 1.0,
-) -> HitsAndMisses:
-    """The study in standardised sizes, or as the only one of several."""
-    design = np.column_stack([np.ones_like(x), (x - x.mean()) / x.std()])
-    found = hit.astype(float)[None] if several else hit.astype(float)
-    return HitsAndMisses(design, found, 1.0 - found, link, penalty, floor=floor, ceiling=ceiling)
+    return np.asarray(np.linalg.pinv(design.T @ (design / (p_hit * p_miss)[:, None]))[:2, :2])
 
 
 def _checked(
-    size: Sequence[float] | np.ndarray, hit: Sequence[float] | np.ndarray, link: str, log_size: bool, bounded: Between
+    size: ArrayLike, hit: ArrayLike, link: str, log_size: bool, bounded: Between
 ) -> tuple[np.ndarray, np.ndarray]:
     """x (n,) and hits (n,) as booleans, or the user's mistake."""
     sizes, hits = np.asarray(size, float), np.asarray(hit, float)
@@ -389,22 +320,168 @@ def _checked(
     return np.log(sizes) if log_size else sizes, hits == 1.0
 
 
-def _number_of_targets(x: np.ndarray, inspections: Sequence[object] | np.ndarray | None) -> int:
-    """Count the different targets that the rows inspect; a target has one size."""
+def number_of_targets(size: np.ndarray, inspections: ArrayLike | None) -> int:
+    """Count the different targets that rows (n,) inspect; each row is its own where ``inspections`` is None."""
     if inspections is None:
-        return len(x)
-    names = [str(name) for name in inspections]
-    if len(names) != len(x):
-        raise UserError(f"{len(names)} identities of targets for {len(x)} rows", legal="one for each row")
-    size_of: dict[str, float] = {}
-    for name, value in zip(names, x, strict=True):
-        if size_of.setdefault(name, float(value)) != value:
-            raise UserError(f"target {name} has more than one size", legal="one size for each target")
-    return len(size_of)
+        return len(size)
+    names = np.asarray(inspections).astype(str)
+    if len(names) != len(size):
+        raise UserError(f"{len(names)} identities of targets for {len(size)} rows", legal="one for each row")
+    _, first, target = np.unique(names, return_index=True, return_inverse=True)
+    if np.any(other := size != size[first][target]):
+        raise UserError(f"target {names[other][0]} has more than one size", legal="one size for each target")
+    return len(first)
 
 
-def _not_rising() -> UserError:
-    return UserError(
-        "the chance of detection does not grow with size: the slope is not positive",
-        fix="check that hits are 1 and misses 0, and that size is what detection depends on",
-    )
+METHODS = ("likelihood ratio", "wald", "profile")
+FARTHEST = 2.0**40
+"""Largest distance from the estimate, in spreads of the sizes, at which a bound is looked for."""
+DIRECTIONS = 720
+"""Points on the outline of the likelihood ratio set from which a band is drawn."""
+REACH = 10
+"""Doublings of a distance at most, from 2 to 2000 standard errors."""
+
+
+def bound(
+    fit: HitMissFit,
+    pod: float = 0.9,
+    confidence: float = 0.95,
+    method: str = "likelihood ratio",
+    *,
+    design_effect: float = 1.0,
+) -> Bound:
+    """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
+    ``design_effect``: what targets that come in clusters multiply the variance by; so it multiplies the criterion (Rao
+    and Scott, Annals of Statistics 12 (1984), 46)."""
+    _check(pod, confidence, method)
+    if pod <= fit.curve.floor:
+        raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
+    if method == "wald":
+        x, why = _wald_bound(fit, pod, confidence, design_effect)
+    else:
+        x, why = _likelihood_bound(fit, pod, criterion(method, confidence) * design_effect * fit.repeats)
+    with np.errstate(over="ignore"):
+        value = float(np.exp(x)) if fit.curve.log_size else x
+    if not np.isfinite(value):
+        why = f"not demonstrated: {why or 'the bound is beyond all numbers'}"
+        return Bound(pod, confidence, method, float("inf"), why)
+    return Bound(pod, confidence, method, value)
+
+
+def band(
+    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95, method: str = "likelihood ratio"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper POD at ``sizes`` (n,), each one-sided at ``confidence`` as in `bound`, for drawing: the lower one
+    crosses 90 % at a90/95 to a part in 1e4. A fitted floor and ceiling are held at their estimates."""
+    _check(0.5, confidence, method)
+    x = np.log(sizes) if fit.curve.log_size else np.asarray(sizes, float)
+    if method == "wald":
+        middle, v = fit.b0 + fit.b1 * x, fit.covariance
+        reach = float(stats.norm.ppf(confidence)) * np.sqrt(v[0, 0] + 2.0 * x * v[0, 1] + x**2 * v[1, 1])
+        low, high = middle - reach, middle + reach
+    else:
+        outline = _outline(fit, criterion(method, confidence) * fit.repeats)
+        predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
+        low, high = predictors.min(axis=0), predictors.max(axis=0)
+    between = fit.curve.ceiling - fit.curve.floor
+    low, high = (fit.curve.floor + between * link_cdf(fit.curve.link, edge) for edge in (low, high))
+    return low, high
+
+
+def criterion(method: str, confidence: float) -> float:
+    """Largest 2 (llmax - ll) in the set: 3.841 for the likelihood ratio, 2.706 for the one-sided profile, at 95 %."""
+    share = confidence if method == "likelihood ratio" else 2.0 * confidence - 1.0
+    return float(stats.chi2.ppf(share, 1))
+
+
+def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
+    """The largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and why."""
+    data, place, level = fit.data, fit.place, float(link_ppf(fit.curve.link, np.array(pod)))
+    share = (pod - fit.curve.floor) / (fit.curve.ceiling - fit.curve.floor)
+    # The curve's middle where floor or ceiling keep it from this POD.
+    z_best = fit.curve.mu + fit.curve.sigma * (float(link_ppf(fit.curve.link, np.array(share))) if 0 < share < 1 else 0)
+    z_best = (z_best - fit.centre) / fit.spread
+    top = float(data.value(place[:2]))
+    plain = replace(data, floor=0.0, ceiling=1.0)
+    flat = 2.0 * (top - flat_maximum(plain, level))
+    if flat <= allowed:
+        return float("inf"), f"a chance that does not grow with size fits too (ratio {flat:.2f} <= {allowed:.2f})"
+    low = 2.0 * (top - most_likely_below(data, place, fit.bounded, pod))
+    if low <= allowed:
+        return float("inf"), f"a ceiling of {pod:.0%} or less fits too (ratio {low:.2f} <= {allowed:.2f})"
+
+    slope = place[1]
+
+    def excess(z: float) -> float:
+        """The root of the ratio, which grows about linearly with z, less that of the criterion."""
+        nonlocal slope
+        if fit.bounded == "none":
+            value, slope = profile(plain, z, level, slope)
+        else:
+            value = bounded_profile(data, place, fit.bounded, z, pod)
+        return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
+
+    reach = 0.25
+    while excess(z_best + reach) <= 0:
+        reach *= 2.0
+        if reach > FARTHEST:
+            return float("inf"), "the likelihood ratio set has no end"
+    exactness = 1e-10 if fit.bounded == "none" else 1e-6
+    z = optimize.brentq(excess, z_best, z_best + reach, xtol=exactness)
+    return fit.centre + fit.spread * float(z), ""
+
+
+def _wald_bound(fit: HitMissFit, pod: float, confidence: float, design_effect: float) -> tuple[float, str]:
+    """The root of (b0 + b1 x - t)^2 = z^2 Var(b0 + b1 x) above the estimate; none where the slope may be 0."""
+    if fit.bounded != "none":
+        raise UserError("no Wald bound with a floor or a ceiling", legal="likelihood ratio, profile")
+    level, z2 = float(link_ppf(fit.curve.link, np.array(pod))), float(stats.norm.ppf(confidence)) ** 2
+    v = fit.covariance * design_effect
+    square = fit.b1**2 - z2 * v[1, 1]
+    if square <= 0:
+        return float("inf"), f"the slope is within {np.sqrt(z2):.3f} standard errors of 0"
+    half = fit.b1 * (fit.b0 - level) - z2 * v[0, 1]
+    constant = (fit.b0 - level) ** 2 - z2 * v[0, 0]
+    return float((-half + np.sqrt(max(half**2 - square * constant, 0.0))) / square), ""
+
+
+def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
+    """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
+    data, best = fit.data, fit.place[:2]
+    scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
+    metric = scale @ (fit.covariance / fit.repeats) @ scale.T
+    try:
+        root = np.linalg.cholesky(metric)
+    except np.linalg.LinAlgError:  # a step, whose covariance is singular: any metric will do that spans both directions
+        spread, directions = np.linalg.eigh(metric)
+        root = directions * np.sqrt(np.maximum(spread, 1e-4 * max(float(spread[-1]), 1e-8)))
+    angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
+    step = np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T
+    with np.errstate(divide="ignore"):
+        farthest = np.where(step[:, 1] < 0, -best[1] / step[:, 1], np.inf)
+    lowest, which = float(data.value(best)) - 0.5 * allowed, np.arange(DIRECTIONS)
+
+    def excess(distance: np.ndarray, along: np.ndarray) -> np.ndarray:
+        return data.value(best + distance[..., None] * step[along]) - lowest
+
+    inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 2.0)
+    for _ in range(REACH):
+        further = (excess(outside, which) > 0) & (outside < farthest)
+        if not further.any():
+            break
+        inside = np.where(further, outside, inside)
+        outside = np.where(further, np.minimum(2.0 * outside, farthest), outside)
+    crossed = excess(outside, which) < 0
+    outside[crossed] = elementwise.find_root(
+        excess, (inside[crossed], outside[crossed]), args=(which[crossed],), tolerances={"xrtol": 1e-9, "fatol": 1e-9}
+    ).x
+    return np.asarray(best + outside[:, None] * step)
+
+
+def _check(pod: float, confidence: float, method: str) -> None:
+    if method not in METHODS:
+        raise UserError(f"bound by {method!r} is not known", legal=", ".join(METHODS))
+    if not 0 < pod < 1:
+        raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
+    if not 0.5 < confidence < 1:
+        raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")

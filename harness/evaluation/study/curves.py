@@ -1,16 +1,10 @@
-"""Curves over all thresholds: ROC over sites, free-response curve, per-region overlap and pixels' ROC.
+"""Hits by chance, and curves over all thresholds: areas are trapezoids on those counted, intervals draw boards again.
 
-- ROC: signals of damages against signals of the same places on boards without damage. Signals are the highest scores
-  within the hit radius, so a larger radius raises both.
-- Free-response curve (FROC): share of the damages of damaged boards that were found, against false calls per square
-  metre of hole-free boards (Chakraborty, Medical Physics 16 (1989), 561, counts them on all images). Beside damage
-  there are second findings and rims of it, which hole-free face does not have: the rate is the table's and the gate's.
-- AU-PRO: mean share of each damage's pixels above a threshold against the share of undamaged pixels above it,
-  integrated to a false-positive rate of 0.3 and divided by it (Bergmann et al., Int. J. Computer Vision 129 (2021),
-  1038, section 4.3); and the area under the ROC of pixels. Judged pixels only.
-
-Areas are trapezoids on the thresholds that were counted; their intervals draw whole boards again.
-"""
+- ROC: signals of damages (highest scores within the hit radius) against those of the same places without damage.
+- Free-response curve (FROC): share of damages found against false calls per square metre of hole-free boards
+  (Chakraborty, Medical Physics 16 (1989), 561, counts them on all images).
+- AU-PRO: mean share of each damage's pixels above a threshold against that of undamaged pixels, integrated to 0.3 and
+  divided by it (Bergmann et al., Int. J. Computer Vision 129 (2021), 1038, 4.3); area under the ROC of pixels."""
 
 from __future__ import annotations
 
@@ -19,11 +13,91 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
-from harness.evaluation.study.over_boards import DRAWS, board_weights, row_weights
+from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, percentiles
+from harness.evaluation.study.limit import DRAWS, board_weights, row_weights
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+@dataclass(frozen=True)
+class ChanceHits:
+    """``probability`` by shuffling, from ``laid`` pairs of a place and another board's run. ``expected``,
+    ``expected_upper``: 1 - exp(-rate pi r^2) at the false-call rate and its bound, were calls spread evenly; NaN
+    without hole-free boards. ``found`` of ``sites`` unflawed places (repeats as shares) were found: ``of_sites``."""
+
+    probability: float
+    interval: Interval
+    laid: int
+    expected: float
+    expected_upper: float
+    found: float
+    sites: int
+    of_sites: float
+    sites_interval: Interval
+
+    def without(self, pod: float) -> float:
+        """Return POD by sight alone: (POD - chance) / (1 - chance), 0 where chance explains all."""
+        return max(0.0, (pod - self.probability) / (1 - self.probability)) if self.probability < 1 else 0.0
+
+
+def chance_hits(
+    holes: pd.DataFrame,
+    sites: pd.DataFrame,
+    runs: pd.DataFrame,
+    findings: pd.DataFrame,
+    radius_mm: float,
+    rate: FalseCallRate | None = None,
+    draws: int = DRAWS,
+) -> ChanceHits:
+    """Count chance hits of one set-up at one number of frames, from its rows of the study's tables."""
+    places = holes.drop_duplicates(["board", "hole"])
+    probability, laid, drawn = _shuffled(places, runs, findings, radius_mm, draws)
+    rates = (np.nan, np.nan) if rate is None else (rate.rate_per_m2, rate.upper_per_m2)
+    expected, upper = (-np.expm1(-np.array(rates) * np.pi * (radius_mm / 1000) ** 2)).tolist()
+    n, found = 0, 0.0
+    if not sites.empty:
+        share = sites.groupby(["board", "hole"])["detected"].mean()
+        n, found = len(share), float(share.sum())
+    # Boards drawn again from boards without one have none either, which is no certainty.
+    interval = percentiles(drawn) if probability > 0 else Interval(0.0, upper)
+    of_sites, ends = found / n if n else np.nan, Interval(*map(float, clopper_pearson(found, n)))
+    return ChanceHits(probability, interval, laid, expected, upper, found, n, of_sites, ends)
+
+
+def _shuffled(
+    places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float, draws: int
+) -> tuple[float, int, np.ndarray]:
+    """The share of places with a finding near, the number of places laid, and the share of boards drawn again."""
+    names, of_place, size = np.unique(places["board"].to_numpy(), return_inverse=True, return_counts=True)
+    at = places[["true_x_mm", "true_y_mm"]].to_numpy(float)
+    w = board_weights(len(names), draws)
+    hits, laid, weights = [], [], []
+    for role in ("damaged", "hole_free"):
+        boards, runs_of = np.unique(runs["board"][runs["role"] == role].to_numpy(), return_counts=True)
+        counts = np.zeros((len(names), len(boards)))  # places of board i that have a finding of board j near
+        if not findings.empty:
+            unmatched = findings[(findings["role"] == role) & (findings["hole"] == "")]
+            for _, here in unmatched.groupby(["board", "repeat"], sort=True):
+                offset = at[:, None] - here[["x_mm", "y_mm"]].to_numpy(float)
+                near = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
+                counts[:, np.searchsorted(boards, here["board"].iloc[0])] += np.bincount(of_place, near, len(names))
+        other = np.ones_like(counts)
+        if role == "damaged":  # a board's places are not laid over its own runs
+            other = (names[:, None] != boards).astype(float)
+            where = np.minimum(np.searchsorted(names, boards), len(names) - 1)
+            weights.append(np.where(names[where] == boards, w[:, where], 0.0))  # none without places
+        else:
+            weights.append(board_weights(len(boards), draws, "hole-free") if len(boards) else np.zeros((draws, 0)))
+        hits.append(counts * other)
+        laid.append(size[:, None] * runs_of * other)
+    all_hits, all_laid, of_runs = (np.column_stack(parts) for parts in (hits, laid, weights))
+    if not all_laid.sum():
+        return np.nan, 0, np.full(draws, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        drawn = ((w @ all_hits) * of_runs).sum(axis=1) / ((w @ all_laid) * of_runs).sum(axis=1)
+    return float(all_hits.sum() / all_laid.sum()), int(all_laid.sum()), drawn
+
 
 PRO_LIMIT = 0.3
 """False-positive rate to which per-region overlap is integrated, as MVTec AD does."""
@@ -47,17 +121,14 @@ class Roc:
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
     """Shares and rates at ``threshold`` (k,), descending: ``false_calls_per_m2`` (k,), ``found`` (k,) share of all
-    damages with ``found_low``, ``found_high`` (k,) over boards. ``large_found`` (k,): share of those of a50 and more
-    whose signal is above it, None without them. ``at``: (false calls per m2, found) at the threshold in use;
-    ``area_m2`` of hole-free boards inspected.
-    """
+    damages with ``found_low``, ``found_high`` (k,) over boards. ``at``: (false calls per m2, found) at the threshold in
+    use; ``area_m2`` of hole-free boards inspected."""
 
     threshold: np.ndarray
     false_calls_per_m2: np.ndarray
     found: np.ndarray
     found_low: np.ndarray
     found_high: np.ndarray
-    large_found: np.ndarray | None
     at: tuple[float, float]
     area_m2: float
 
@@ -85,54 +156,37 @@ def roc_curves(
     """Draw the ROC of all damages, and of those below a50, from a50 to a90 and above, where there are any."""
     if holes.empty or sites.empty:
         return ()
-    size = holes["true_diameter_mm"].to_numpy(float)
-    classes = {
-        "all sizes": np.ones(len(size), bool),
-        "below a50": size < a50_mm,
-        "a50 to a90": (size >= a50_mm) & (size < a90_mm),
-        "a90 and above": size >= a90_mm,
-    }
-    negative, found = _signal(sites), []
+    size, negative, found = holes["true_diameter_mm"].to_numpy(float), _signal(sites), []
     of_free = row_weights(sites["board"].to_numpy(), draws, "hole-free")
-    for name, of in classes.items():
+    for name, of in (
+        ("all sizes", np.ones(len(size), bool)),
+        ("below a50", size < a50_mm),
+        ("a50 to a90", (size >= a50_mm) & (size < a90_mm)),
+        ("a90 and above", size >= a90_mm),
+    ):
         damages, positive = holes[of], _signal(holes[of])
         if not len(damages):
             continue
         levels = np.unique(np.concatenate([positive, negative]))[::-1]
-        false, true = (1 - np.searchsorted(np.sort(s), levels, "left") / len(s) for s in (negative, positive))
+        false, true = (
+            np.append(0.0, 1 - np.searchsorted(np.sort(s), levels, "left") / len(s)) for s in (negative, positive)
+        )
         area = _rank_area(positive, negative, np.ones((1, len(positive))), np.ones((1, len(negative))))
         interval = UNKNOWN
         if min(len(np.unique(table["board"])) for table in (damages, sites)) > 1:
             of_damaged = row_weights(damages["board"].to_numpy(), draws)
             interval = percentiles(_rank_area(positive, negative, of_damaged, of_free))
-        found.append(
-            Roc(
-                name=name,
-                false=np.concatenate([[0.0], false]),
-                true=np.concatenate([[0.0], true]),
-                at=(float((negative > threshold).mean()), float((positive > threshold).mean())),
-                area=float(area[0]),
-                area_interval=interval,
-                damages=len(positive),
-                unflawed=len(negative),
-            )
-        )
+        at = (float((negative > threshold).mean()), float((positive > threshold).mean()))
+        found.append(Roc(name, false, true, at, float(area[0]), interval, len(positive), len(negative)))
     return tuple(found)
 
 
 def free_response(
-    operating: pd.DataFrame,
-    runs: pd.DataFrame,
-    holes: pd.DataFrame,
-    a50_mm: float,
-    draws: int = DRAWS,
+    operating: pd.DataFrame, runs: pd.DataFrame, holes: pd.DataFrame, draws: int = DRAWS
 ) -> FreeResponse | None:
     """Draw the free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
-    threshold was counted.
-
-    Thresholds with fewer false calls than a higher one has are left out: that far down findings run into one another,
-    to one that covers the board, and the curve would fold back.
-    """
+    threshold was counted. Thresholds with fewer false calls than a higher one has are left out: that far down findings
+    run into one another, to one that covers the board, and the curve would fold back."""
     free = runs[runs["role"] == "hole_free"] if len(runs) else runs
     if operating.empty or holes.empty or free.empty:
         return None
@@ -148,107 +202,71 @@ def free_response(
     hits, inspections = counted[thresholds].to_numpy(float), of_board.to_numpy(float)
     weights = board_weights(len(inspections), draws)
     edges = [percentiles(column) for column in ((weights @ hits) / (weights @ inspections)[:, None]).T]
-    size, signal = holes["true_diameter_mm"].to_numpy(float), _signal(holes)
-    large = signal[size >= a50_mm]
-    return FreeResponse(
-        threshold=thresholds,
-        false_calls_per_m2=calls[kept] / area_m2,
-        found=hits.sum(axis=0) / inspections.sum(),
-        found_low=np.array([edge.low for edge in edges]),
-        found_high=np.array([edge.high for edge in edges]),
-        large_found=(large[:, None] > thresholds).mean(axis=0) if len(large) else None,
-        at=(int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean())),
-        area_m2=area_m2,
-    )
+    low, high = np.array([(edge.low, edge.high) for edge in edges]).reshape(-1, 2).T
+    at = (int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean()))
+    return FreeResponse(thresholds, calls[kept] / area_m2, hits.sum(axis=0) / inspections.sum(), low, high, at, area_m2)
 
 
 def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None:
     """Compute per-region overlap and ROC of pixels of one set-up; None without damaged or without undamaged pixels."""
     if pixels.empty:
         return None
-    of_damage = pixels["hole"] != ""
-    face = _per_board(pixels[~of_damage].assign(share=0.0))
-    seen = pixels[of_damage & (pixels["pixels"] > 0)]
-    damage = _per_board(seen.assign(share=seen["above"] / seen["pixels"]))
-    if face is None or damage is None:
+    of_damage = (pixels["hole"] != "") & (pixels["pixels"] > 0)
+    face, damage = pixels[pixels["hole"] == ""].assign(share=0.0), pixels[of_damage]
+    if face.empty or damage.empty:
         return None
-    false, overlap, true = _rates(face, damage, np.ones((1, len(face.board))), np.ones((1, len(damage.board))))
-    why = (
-        ""
-        if false[0, -2] >= PRO_LIMIT or overlap[0, -2] == 1
-        else f"the thresholds counted end at a false-positive rate of {false[0, -2]:.3g}"
-    )
-    weights = board_weights(len(damage.board), draws)
-    same = len(face.board) == len(damage.board) and bool(np.all(face.board == damage.board))
-    if same:
-        drawn = _rates(face, damage, weights, weights)
-    else:
-        drawn = _rates(face, damage, board_weights(len(face.board), draws, "hole-free"), weights)
-    many = len(damage.board) > 1 and len(face.board) > 1
-    pro, areas = _area(false, overlap, PRO_LIMIT) / PRO_LIMIT, _area(drawn[0], drawn[1], PRO_LIMIT) / PRO_LIMIT
-    return PixelCurves(
-        false=false[0],
-        overlap=overlap[0],
-        true=true[0],
-        pro=np.nan if why else float(pro[0]),
-        pro_interval=UNKNOWN if why or not many else percentiles(areas),
-        auroc=float(_area(false, true, 1.0)[0]),
-        auroc_interval=percentiles(_area(drawn[0], drawn[2], 1.0)) if many else UNKNOWN,
-        why=why,
-    )
+    one, two = _per_board(face), _per_board(damage.assign(share=damage["above"] / damage["pixels"]))
+    boards = len(one[0]), len(two[0])
+    false, overlap, true = _rates(one, two, np.ones((1, boards[0])), np.ones((1, boards[1])))
+    why = ""
+    if false[0, -2] < PRO_LIMIT and overlap[0, -2] != 1:
+        why = f"the thresholds counted end at a false-positive rate of {false[0, -2]:.3g}"
+    of_damaged = board_weights(boards[1], draws)
+    of_face = of_damaged if np.array_equal(one[0], two[0]) else board_weights(boards[0], draws, "hole-free")
+    drawn = _rates(one, two, of_face, of_damaged)
+    pro, areas = (_area(x, y, PRO_LIMIT) / PRO_LIMIT for x, y in ((false, overlap), drawn[:2]))
+    of_pro = UNKNOWN if why or min(boards) < 2 else percentiles(areas)
+    auroc = float(_area(false, true, 1.0)[0])
+    of_auroc = UNKNOWN if min(boards) < 2 else percentiles(_area(drawn[0], drawn[2], 1.0))
+    value = np.nan if why else float(pro[0])
+    return PixelCurves(false[0], overlap[0], true[0], value, of_pro, auroc, of_auroc, why)
 
 
 def _signal(table: pd.DataFrame) -> np.ndarray:
     """Signals; where no pixel was judged nothing can be found at any threshold."""
-    signal = table["signal"].to_numpy(float)
-    return np.where(np.isnan(signal), -np.inf, signal)
+    return table["signal"].fillna(-np.inf).to_numpy(float)
 
 
 def _rank_area(positive: np.ndarray, negative: np.ndarray, weights: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(draws,) chance that a positive signal exceeds a negative one, ties half (Mann and Whitney), under weights."""
     order = np.argsort(negative, kind="stable")
     ranked = negative[order]
-    below = np.concatenate([np.zeros((len(others), 1)), np.cumsum(others[:, order], axis=1)], axis=1)
+    below = np.pad(np.cumsum(others[:, order], axis=1), ((0, 0), (1, 0)))
     lower, upper = np.searchsorted(ranked, positive, "left"), np.searchsorted(ranked, positive, "right")
     won = (weights * 0.5 * (below[:, lower] + below[:, upper])).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(won / (weights.sum(axis=1) * others.sum(axis=1)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Counted:
-    """Counts per board (b,) and threshold (k,), descending: ``above`` and ``share`` (b, k) summed over its regions;
-    ``pixels``, ``regions`` (b,)."""
-
-    board: np.ndarray
-    above: np.ndarray
-    share: np.ndarray
-    pixels: np.ndarray
-    regions: np.ndarray
-
-
-def _per_board(rows: pd.DataFrame) -> _Counted | None:
-    if rows.empty:
-        return None
+def _per_board(rows: pd.DataFrame) -> tuple[np.ndarray, ...]:
+    """Boards (b,); ``above`` and ``share`` (b, k) per descending threshold; ``pixels`` and number of regions (b,)."""
     table = rows.pivot_table(["above", "share", "pixels"], "board", "threshold", "sum", sort=True)
     regions = rows.groupby(["board", "threshold"], sort=True).size().unstack().to_numpy(float)
     above, share = (table[name].to_numpy(float)[:, ::-1] for name in ("above", "share"))
-    return _Counted(table.index.to_numpy(), above, share, table["pixels"].to_numpy(float)[:, 0], regions[:, 0])
+    return table.index.to_numpy(), above, share, table["pixels"].to_numpy(float)[:, 0], regions[:, 0]
 
 
 def _rates(
-    face: _Counted, damage: _Counted, face_weights: np.ndarray, weights: np.ndarray
+    face: tuple[np.ndarray, ...], damage: tuple[np.ndarray, ...], face_weights: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(draws, k + 2) false-positive rate, overlap and true-positive rate, from (0, 0, 0) to (1, 1, 1)."""
+    (_, false, _, face_pixels, _), (_, above, share, pixels, regions) = face, damage
 
-    def ends(share: np.ndarray) -> np.ndarray:
-        return np.pad(np.pad(share, ((0, 0), (1, 0))), ((0, 0), (0, 1)), constant_values=1.0)
+    def rate(of: np.ndarray, total: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+        share = (drawn @ of) / (drawn @ total)[:, None]
+        return np.column_stack([np.zeros(len(drawn)), share, np.ones(len(drawn))])
 
-    return (
-        ends((face_weights @ face.above) / (face_weights @ face.pixels)[:, None]),
-        ends((weights @ damage.share) / (weights @ damage.regions)[:, None]),
-        ends((weights @ damage.above) / (weights @ damage.pixels)[:, None]),
-    )
+    return rate(false, face_pixels, face_weights), rate(share, regions, weights), rate(above, pixels, weights)
 
 
 def _area(x: np.ndarray, y: np.ndarray, limit: float) -> np.ndarray:

@@ -1,13 +1,12 @@
-"""The detection limit of one set-up: a90/95 and what stands beside it.
+"""The detection limit of one set-up: a90/95, the same over boards drawn again, and POD over diameter and depth.
 
 The headline is the likelihood ratio bound of the hit/miss curve (`harness.evaluation.pod.statement.state_hits`), in
 which damages are the independent targets. Damages of one board are not quite that; beside it stands the same bound with
-its criterion multiplied by the boards' design effect (`harness.evaluation.study.over_boards`). Where the a50 of boards
-scatters by 2 mm about 6 mm, a90/95 covers 88 % (60 boards) and 91 % (20), that bound 93 % and 95 %; where boards do not
-matter both cover 95 to 97 %. The upper percentile of boards drawn again is no substitute: estimates of a90 are
-skewed, and it covers 86 % with 20 boards and 94 % with 60 even there (300 studies,
-``tests/validation/study_coverage.py``).
-"""
+its criterion multiplied by the boards' design effect. Where the a50 of boards scatters by 2 mm about 6 mm, a90/95
+covers 88 % (60 boards) and 91 % (20), that bound 93 % and 95 %; where boards do not matter both cover 95 to 97 %. The
+upper percentile of boards drawn again is no substitute: it covers 86 % with 20 boards (300 studies,
+``tests/validation/study_coverage.py``). Boards, not damages, are what a study draws at random, so whole boards are
+resampled with replacement (the cluster bootstrap; Davison and Hinkley 1997, section 3.8)."""
 
 from __future__ import annotations
 
@@ -17,17 +16,226 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval, clopper_pearson, percentiles
-from harness.evaluation.pod.curve import Bound
-from harness.evaluation.pod.false_calls import FalseCallRate, false_call_rate
-from harness.evaluation.pod.hit_miss import HitMissFit, fit_hit_miss
-from harness.evaluation.pod.inspection_file import Inspections
-from harness.evaluation.pod.likelihood_bounds import band, bound
-from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
-from harness.evaluation.study.over_boards import DRAWS, design_effect, refitted_sizes, row_weights, targets_of
+from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, false_call_rate, percentiles
+from harness.evaluation.pod.curve import (
+    Bound,
+    HitsAndMisses,
+    PodCurve,
+    link_cdf,
+    link_ppf,
+    maxima,
+    penalised_maxima,
+    slopes_of_link,
+)
+from harness.evaluation.pod.hit_miss import HitMissFit, band, bound, fit_hit_miss
+from harness.evaluation.pod.statement import CONFIDENCE, POD, Inspections, PodStatement, state_hits, state_signals
 from harness.evaluation.study.record import Inspected, SetUpRecord
-from harness.evaluation.study.surface import depth_varies
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.seeds import random_stream
+
+DRAWS = 500
+"""The 95 % percentile is then the 475th smallest, known to about one percentile."""
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Damages, one a row: ``board`` (n,), ``size_mm`` (n,), ``hits`` of ``inspections`` (n,)."""
+
+    board: np.ndarray
+    size_mm: np.ndarray
+    hits: np.ndarray
+    inspections: np.ndarray
+
+    @property
+    def boards(self) -> int:
+        """Number of different boards."""
+        return len(np.unique(self.board))
+
+
+def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray) -> Targets:
+    """Join rows (n,) of inspections to targets: repeats of one damage of one board are one target."""
+    _, boards = np.unique(board, return_inverse=True)
+    _, holes = np.unique(hole, return_inverse=True)
+    _, first, which = np.unique(boards * (holes.max(initial=0) + 1) + holes, return_index=True, return_inverse=True)
+    hits, inspections = np.bincount(which, np.asarray(hit, float)), np.bincount(which).astype(float)
+    return Targets(board[first], size_mm[first], hits, inspections)
+
+
+def board_weights(boards: int, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
+    """Draw boards again: (draws, boards) how often each is in each draw; the same for the same number of boards of a
+    population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
+    stream = random_stream(0, "boards drawn again", population, boards)
+    return stream.multinomial(boards, np.full(boards, 1.0 / boards), size=draws).astype(float)
+
+
+def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
+    """Lay `board_weights` on rows that belong to ``board`` (n,): (draws, n)."""
+    names, which = np.unique(board, return_inverse=True)
+    return board_weights(len(names), draws, population)[:, which]
+
+
+def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
+    """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm with these PODs, by Firth's
+    likelihood where hits and misses do not overlap. Infinite where nothing is found or the chance does not grow with
+    size; the smallest size inspected where everything is found."""
+    x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
+    centre, spread = float(x.mean()), float(x.std()) or 1.0
+    z = (x - centre) / spread
+    weights = row_weights(targets.board, draws)
+    hits, misses = weights * targets.hits, weights * (targets.inspections - targets.hits)
+    largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
+    smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
+    repeats = (weights @ targets.inspections) / weights.sum(axis=1)
+    data = HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, curve.link)
+    start = np.array([(centre - curve.mu) / curve.sigma, spread / curve.sigma])
+    b = np.full((draws, 2), np.nan)
+    overlap = largest_miss > smallest_hit
+    b[overlap] = maxima(data.of(overlap), start)
+    apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & ~overlap
+    if apart.any():
+        some = HitsAndMisses(data.design, hits[apart], misses[apart], curve.link, repeats[apart])
+        b[apart] = penalised_maxima(some, 1e-6)
+    at = crossings(b, curve.link, pods)
+    at[:, largest_miss == -np.inf] = z.min()
+    with np.errstate(over="ignore"):
+        return np.asarray(np.exp(centre + spread * at) if curve.log_size else centre + spread * at)
+
+
+def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
+    """Sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite where flat or unknown."""
+    levels = link_ppf(link, np.array(pods))[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(b[:, 1] > 0, (levels - b[:, 0]) / b[:, 1], np.inf)
+
+
+def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
+    """Compute the variance of the size with this POD when boards are the units over that when damages are: 1 where
+    damages of one board are no more alike than those of two. Both are sandwich variances (Liang and Zeger, Biometrika
+    73 (1986), 13) with G / (G - 1) for G units. NaN below two boards."""
+    if targets.boards < 2 or len(targets.board) < 3:
+        return np.nan
+    x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
+    up, down, _ = slopes_of_link(curve.link, (x - curve.mu) / curve.sigma)
+    slope = targets.hits * up - (targets.inspections - targets.hits) * down
+    design = np.column_stack([np.ones_like(x), x])
+    # x_p = (level - b0) / b1: its slopes by b0 and b1.
+    gradient = -curve.sigma * np.array([1.0, curve.mu + curve.sigma * float(link_ppf(curve.link, np.array(pod)))])
+    information = design.T @ ((targets.inspections * up * down)[:, None] * design)
+    influence = (design * slope[:, None]) @ np.linalg.solve(information, gradient)
+    _, which = np.unique(targets.board, return_inverse=True)
+    units = (np.bincount(which, influence), influence)
+    of_boards, of_targets = (float((one**2).sum() * len(one) / (len(one) - 1)) for one in units)
+    return of_boards / of_targets if of_targets > 0 else np.nan
+
+
+LINKS = ("logit", "probit")
+LEAST_RATIO = 1.2
+"""Deepest over shallowest damage below which a coefficient of depth would be guesswork."""
+DEPTHS = 25
+"""Depths at which a90 is drawn, in equal ratios over those inspected."""
+
+
+@dataclass(frozen=True, eq=False)
+class PodSurface:
+    """``b`` (3,): coefficients of 1, ln a and ln d, sizes in mm; ``interaction_p``: p-value of ln a ln d, which is not
+    fitted. ``depth_mm`` (k,), ``a90_mm`` (k,) with ``a90_low_mm``, ``a90_high_mm`` (k,) 95 % percentiles over boards,
+    which hold the truth in some 87 % of studies of 30 boards. ``depth_slope``: minus d ln a90 / d ln depth (b2 / b1),
+    with its interval. ``diameter_range_mm``, ``depth_range_mm``: inspected. ``note``: what to know beside it, or ""."""
+
+    link: str
+    b: np.ndarray
+    interaction_p: float
+    deviance: float
+    depth_mm: np.ndarray
+    a90_mm: np.ndarray
+    a90_low_mm: np.ndarray
+    a90_high_mm: np.ndarray
+    depth_slope: float
+    depth_slope_interval: Interval
+    diameter_range_mm: tuple[float, float]
+    depth_range_mm: tuple[float, float]
+    note: str = ""
+
+    def pod(self, diameter_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+        """POD at diameters and depths of a common shape."""
+        return link_cdf(self.link, self.b[0] + self.b[1] * np.log(diameter_mm) + self.b[2] * np.log(depth_mm))
+
+
+def depth_varies(depth_mm: np.ndarray) -> bool:
+    """Return whether depths (n,) differ enough to matter."""
+    return bool(len(depth_mm) and depth_mm.max() >= LEAST_RATIO * depth_mm.min())
+
+
+def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | None, str]:
+    """Fit the surface; None, and why, where there is none."""
+    from scipy.stats import chi2
+
+    seen = record.inspected
+    hit = seen.hit
+    if not len(hit) or hit.all() or not hit.any():
+        return None, "every damage fared alike: there is no surface to fit"
+    diameters, depths = ((float(sizes.min()), float(sizes.max())) for sizes in (seen.diameter_mm, seen.depth_mm))
+    if depths[0] <= 0 or not depth_varies(seen.depth_mm):
+        return None, "depth does not vary: {:g} to {:g} mm".format(*depths)
+    if diameters[0] == diameters[1]:
+        return None, f"diameter does not vary: {diameters[0]:g} mm"
+    a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
+    crossed = np.stack([np.ones_like(a), a, d, a * d], axis=1)
+    if _separated(crossed[:, :3], hit):
+        return None, "hits and misses do not overlap over diameter and depth (separation): no maximum likelihood"
+    repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
+
+    def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
+        """Deviance, coefficients and link."""
+        hits = hit.astype(float)
+        b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
+        return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), b, link
+
+    deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
+    if b[1] <= 0:
+        return None, "the chance of detection does not grow with diameter"
+    p, note = np.nan, "POD falls with depth" if b[2] < 0 else ""
+    if not _separated(crossed, hit):
+        p = float(chi2.sf(max(deviance - fit(link, crossed)[0], 0.0) / repeats, 1))
+        if p < 0.05:
+            note += f"{'; ' if note else ''}diameter and depth interact (p = {p:.2g}), which the surface leaves out"
+    weights, level = row_weights(seen.board, draws), float(link_ppf(link, np.array(0.9)))
+    drawn = np.vstack([b, _coefficients(crossed[:, :3], weights * hit, weights * ~hit, link, b)])
+    depth_mm, many = np.geomspace(*depths, DEPTHS), len(np.unique(seen.board)) > 1
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        a90 = np.exp((level - drawn[:, :1] - drawn[:, 2:] * np.log(depth_mm)) / drawn[:, 1:2])
+        slope = np.where(drawn[:, 1] > 0, drawn[:, 2] / drawn[:, 1], np.nan)
+    a90 = np.where(drawn[:, 1:2] > 0, a90, np.inf)
+    edges = [percentiles(column) if many else UNKNOWN for column in a90[1:].T]
+    low, high = np.array([(edge.low, edge.high) for edge in edges]).T
+    of_slope = percentiles(slope[1:]) if many else UNKNOWN
+    drawn_a90 = (depth_mm, a90[0], low, high)
+    return PodSurface(link, b, p, deviance, *drawn_a90, float(slope[0]), of_slope, diameters, depths, note), ""
+
+
+def _coefficients(
+    design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray | None = None
+) -> np.ndarray:
+    """(draws, p) coefficients; columns are centred and scaled for the search, whose first column is the constant."""
+    centre, scale = design[:, 1:].mean(axis=0), design[:, 1:].std(axis=0)
+    back = np.eye(design.shape[1])
+    back[1:, 1:] = np.diag(1 / scale)
+    back[0, 1:] = -centre / scale
+    z = np.column_stack([np.ones(len(design)), (design[:, 1:] - centre) / scale])
+    first = np.zeros(design.shape[1]) if start is None else np.linalg.solve(back, start)
+    return maxima(HitsAndMisses(z, hits, misses, link), first) @ back.T
+
+
+def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
+    """Return whether a plane parts hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
+    programming: the largest sum of one-sided margins, which is 0 where hits and misses overlap."""
+    from scipy.optimize import linprog
+
+    scaled = np.column_stack([np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)])
+    signed = np.where(hit, 1.0, -1.0)[:, None] * scaled
+    found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1), method="highs")
+    return bool(-found.fun > 1e-7 * len(signed))
+
 
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
 """29: with a POD below 90 % as many targets are all found in less than 5 % of studies (0.9^29 = 0.047)."""
@@ -40,20 +248,11 @@ WIDER = 1.1
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
     """Sizes in mm. ``statement``: curve, band and bounds from hits, None where none can be fitted, and ``why``.
-
-    ``a90_95``: the limit to quote; infinite where not demonstrated. ``a50_mm``, ``a90_mm``: estimates;
-    ``*_draws_mm`` (B,): the same of boards drawn again, in the same order for all set-ups of as many boards (infinite
-    where a draw has none); ``*_interval_mm``: their 95 % percentiles. ``over_boards``: a90/95 were damages of one
-    board as alike as the data say, never below ``a90_95``.
-    Where everything is found both estimates are the smallest size inspected, which they do not exceed
-    (``is_at_most``); where nothing is found, or the chance of detection does not grow with size, they are NaN and their
-    draws infinite. Boards drawn again from boards that all fared alike do so too, which is no certainty: intervals are
-    then unknown.
-    ``design_effect``: variance of a90 with boards as units over that with damages as units. ``rate`` = ``hits`` /
-    ``inspections`` with an interval over boards. ``false_calls`` on hole-free boards (None: none inspected) as a
-    Poisson count, ``false_calls_interval_per_m2`` over boards. ``signals``: a second opinion, the signal's regression
-    on size with the threshold as decision; None, and ``signals_why``, where it cannot be fitted.
-    """
+    ``a90_95``: the limit to quote; infinite where not demonstrated. ``a90_draws_mm`` (B,): over boards drawn again, in
+    one order for all set-ups of as many boards. ``over_boards``: a90/95 were damages of one board as alike as the data
+    say. Where everything is found the estimates are the smallest size inspected, which they do not exceed; where
+    nothing is, or POD does not grow with size, they are NaN and their draws infinite. ``signals``: a second opinion,
+    the signal's regression with the threshold as decision, or ``signals_why`` not."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -61,7 +260,6 @@ class SetUpLimit:
     a90_95: Bound
     a50_mm: float
     a90_mm: float
-    a50_draws_mm: np.ndarray
     a90_draws_mm: np.ndarray
     a50_interval_mm: Interval
     a90_interval_mm: Interval
@@ -77,48 +275,38 @@ class SetUpLimit:
     false_calls_interval_per_m2: Interval
     signals: PodStatement | None
     signals_why: str
+    largest_mm: float
 
     @property
     def is_at_most(self) -> bool:
         """Return whether ``a50_mm`` and ``a90_mm`` are sizes that both do not exceed, everything having been found."""
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
-    @property
-    def largest_mm(self) -> float:
-        """The largest diameter inspected, NaN without any. Of what lies beyond it the curve alone speaks."""
-        seen = self.record.inspected.diameter_mm
-        return float(seen.max()) if len(seen) else np.nan
-
     def beyond(self, size_mm: float) -> bool:
-        """Return whether a size (an estimate, a bound or the end of an interval) lies beyond ``largest_mm``."""
+        """Return whether a size lies beyond ``largest_mm``, where the curve alone speaks of it."""
         return bool(size_mm > self.largest_mm)
 
     @property
-    def over_boards_mm(self) -> float:
-        """The size of ``over_boards``."""
-        return self.over_boards.value
-
-    @property
     def boards_matter(self) -> bool:
-        """Return whether the limit over boards is more than 10 % above a90/95 by a design effect: where that is
-        unknown, as of boards that were all found, the number of boards is to blame and not what they have in common."""
-        return bool(np.isfinite(self.design_effect) and self.over_boards_mm > WIDER * self.a90_95.value)
+        """Return whether the limit over boards is more than 10 % above a90/95 by a known design effect."""
+        return bool(np.isfinite(self.design_effect) and self.over_boards.value > WIDER * self.a90_95.value)
 
 
-def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np.nan) -> SetUpLimit:
+def limit_of(
+    record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np.nan, tested: bool = False
+) -> SetUpLimit:
     """Judge ``record``. ``noise_floor``: signals up to this are what unflawed places give too, so they enter the
-    regression of signals as censored; NaN where unknown. Deterministic. No error for data without a curve: ``why``."""
-    seen = record.inspected
+    regression of signals as censored; NaN where unknown. ``tested``: for a floor and a ceiling too, with a note.
+    Deterministic. No error for data without a curve: ``why``."""
+    seen, unflawed = record.inspected, record.unflawed
     targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
     statement: PodStatement | None = None
-    why = "no damage was inspected"
-    if len(seen.hit):
+    why, effect, n = "no damage was inspected", np.nan, len(seen.hit)
+    if n:
         try:
-            statement, why = state_hits(_rows(record, seen.hit, np.ones(len(seen.hit), bool)), unit="mm"), ""
+            statement, why = state_hits(_rows(record, seen.hit, np.ones(n, bool)), unit="mm", tested=tested), ""
         except UserError as error:
             why = error.message
-
-    effect = np.nan
     if statement is not None:
         if depth_varies(seen.depth_mm):
             low, high = seen.depth_mm.min(), seen.depth_mm.max()
@@ -127,10 +315,10 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np
         a90_95, a50, a90 = statement.bound, statement.a50, statement.a90
         of_a50, of_a90 = refitted_sizes(targets, statement.curve, (0.5, POD), draws)
         fit = fit_of(record, statement)
-        if not fit.separated:
+        if fit.method == "ML":
             effect = design_effect(targets, statement.curve, POD)
         over_boards = bound(fit, design_effect=effect) if effect > 1 else a90_95
-    elif len(seen.hit) and seen.hit.all():
+    elif n and seen.hit.all():
         # Were the POD of the 29th smallest target below 90 %, so would those of the 28 smaller ones be, and all 29
         # would be found in less than 5 % of studies. So a90 lies below its size, with no assumption but that POD grows.
         a50 = a90 = float(targets.size_mm.min())
@@ -142,22 +330,14 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np
         a50 = a90 = np.nan
         a90_95 = over_boards = Bound(POD, CONFIDENCE, "likelihood ratio", np.inf, f"not demonstrated: {why}")
         of_a50 = of_a90 = np.full(draws, np.inf)
-
-    rate_interval = UNKNOWN
-    if targets.boards > 1 and targets.hits.sum() not in (0.0, targets.inspections.sum()):
-        weights = row_weights(targets.board, draws)
-        rate_interval = percentiles((weights @ targets.hits) / (weights @ targets.inspections))
-
-    unflawed = record.unflawed
-    area, calls_interval = float(unflawed.area_m2.sum()), UNKNOWN
-    calls: FalseCallRate | None = None
-    if area > 0:
-        calls = false_call_rate(int(unflawed.calls.sum()), area)
-        if len(np.unique(unflawed.board)) > 1 and calls.calls:
-            weights = row_weights(unflawed.board, draws, "hole-free")
-            with np.errstate(invalid="ignore", divide="ignore"):
-                calls_interval = percentiles((weights @ unflawed.calls) / (weights @ unflawed.area_m2))
-
+    rate_interval = calls_interval = UNKNOWN
+    if targets.hits.sum() not in (0.0, targets.inspections.sum()):
+        rate_interval = _over_boards(targets.board, targets.hits, targets.inspections, draws, "damaged")
+    calls = None
+    if len(unflawed.board):
+        calls = false_call_rate(int(unflawed.calls.sum()), float(unflawed.area_m2.sum()))
+        if calls.calls:
+            calls_interval = _over_boards(unflawed.board, unflawed.calls, unflawed.area_m2, draws, "hole-free")
     judged = np.isfinite(seen.signal)  # where no pixel was judged there is no signal
     signals: PodStatement | None = None
     signals_why = f"{int(judged.sum())} signals"
@@ -169,29 +349,13 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np
             signals, signals_why = state_signals(read, decision=decision, left=left, unit="mm"), ""
         except UserError as error:
             signals_why = error.message
+    ends = (UNKNOWN, UNKNOWN) if statement is None else (percentiles(of_a50), percentiles(of_a90))
+    counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n, float(seen.hit.mean()) if n else np.nan)
+    estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
+    largest_mm = float(seen.diameter_mm.max()) if n else np.nan
+    further = (signals_why, largest_mm)
     return SetUpLimit(
-        record=record,
-        statement=statement,
-        why=why,
-        a90_95=a90_95,
-        a50_mm=a50,
-        a90_mm=a90,
-        a50_draws_mm=of_a50,
-        a90_draws_mm=of_a90,
-        a50_interval_mm=UNKNOWN if statement is None else percentiles(of_a50),
-        a90_interval_mm=UNKNOWN if statement is None else percentiles(of_a90),
-        over_boards=over_boards,
-        design_effect=effect,
-        boards=targets.boards,
-        targets=len(targets.board),
-        hits=int(seen.hit.sum()),
-        inspections=len(seen.hit),
-        rate=float(seen.hit.mean()) if len(seen.hit) else np.nan,
-        rate_interval=rate_interval,
-        false_calls=calls,
-        false_calls_interval_per_m2=calls_interval,
-        signals=signals,
-        signals_why=signals_why,
+        record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
     )
 
 
@@ -207,18 +371,21 @@ def target_names(seen: Inspected) -> np.ndarray:
     return np.array([f"{board}:{hole}" for board, hole in zip(seen.board, seen.hole, strict=True)], dtype=str)
 
 
+def _over_boards(board: np.ndarray, count: np.ndarray, of: np.ndarray, draws: int, population: str) -> Interval:
+    """95 % percentiles of sum(count) / sum(of) over boards drawn again; unknown of a single board."""
+    if len(np.unique(board)) < 2:
+        return UNKNOWN
+    weights = row_weights(board, draws, population)
+    return percentiles((weights @ count) / (weights @ of))
+
+
 def _rows(record: SetUpRecord, response: np.ndarray, kept: np.ndarray) -> Inspections:
-    seen = record.inspected
-    names = target_names(seen)[kept]
-    return Inspections(
-        path=Path(record.label),
-        size_column="diameter",
-        response_column="hit" if response.dtype == bool else "signal",
-        size=seen.diameter_mm[kept],
-        response=np.asarray(response[kept], float),
-        target=names if len(np.unique(names)) < len(names) else None,
-        line=np.flatnonzero(kept) + 1,
-    )
+    seen, names = record.inspected, target_names(record.inspected)[kept]
+    column = "hit" if response.dtype == bool else "signal"
+    target = names if len(np.unique(names)) < len(names) else None
+    values = np.asarray(response[kept], float)
+    lines = np.flatnonzero(kept) + 1
+    return Inspections(Path(record.label), "diameter", column, seen.diameter_mm[kept], values, target, lines)
 
 
 def _all_found(size_mm: np.ndarray, what: str) -> Bound:
@@ -232,9 +399,8 @@ def _all_found(size_mm: np.ndarray, what: str) -> Bound:
 @dataclass(frozen=True)
 class SizeRow:
     """POD of one diameter: ``pod`` from the curve, ``lower`` and ``upper`` each one-sided at 95 % by the likelihood
-    ratio (NaN without a curve). ``extrapolated``: the diameter lies outside the sizes inspected. ``near`` targets are
-    within 10 % of it; ``near_rate`` is their share of hits, with Clopper and Pearson's ``near_interval`` (95 %,
-    two-sided; repeats of a target count as shares of it): what the data say without a curve."""
+    ratio (NaN without a curve). ``extrapolated``: outside the sizes inspected. ``near`` targets are within 10 % of it;
+    ``near_rate``: their share of hits, with Clopper and Pearson's ``near_interval``."""
 
     diameter_mm: float
     pod: float
@@ -254,11 +420,11 @@ def pod_at(limit: SetUpLimit, diameters_mm: Sequence[float]) -> tuple[SizeRow, .
         of_curve = np.array([limit.statement.curve.pod(sizes), *band(fit_of(limit.record, limit.statement), sizes)])
     low, high = seen.diameter_mm.min(initial=np.inf), seen.diameter_mm.max(initial=-np.inf)
     names, rows = target_names(seen), []
-    for size, (pod, lower, upper) in zip(sizes.tolist(), of_curve.T.tolist(), strict=True):
+    for size, pod, lower, upper in np.vstack([sizes, of_curve]).T.tolist():
         near = np.abs(seen.diameter_mm / size - 1) <= NEAR
         targets = len(np.unique(names[near]))
-        rate = float(seen.hit[near].mean()) if near.any() else np.nan
-        ends = clopper_pearson(rate * targets if near.any() else 0, targets)
-        interval = Interval(float(ends[0]), float(ends[1]))
-        rows.append(SizeRow(size, pod, lower, upper, not low <= size <= high, targets, rate, interval))
+        rate = float(seen.hit[near].mean()) if targets else np.nan
+        ends = clopper_pearson(rate * targets if targets else 0, targets)
+        of_near = (targets, rate, Interval(*map(float, ends)))
+        rows.append(SizeRow(size, pod, lower, upper, not low <= size <= high, *of_near))
     return tuple(rows)

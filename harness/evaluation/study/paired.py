@@ -1,9 +1,7 @@
-"""Two set-ups compared: hits and a90 board by board, their limits, and their false calls.
-
-Boards are the unit: damages of one board share its render, its pose and its surface, so they are not exchanged one by
-one. Not in any test of hits and limits: that each set-up drew its own calibration of the threshold. A gate needs a
-margin for that (`harness.evaluation.study.verdict`).
-"""
+"""Two set-ups compared: hits and a90 board by board, their limits, and their false calls. Boards are the unit: damages
+of one board share its render, its pose and its surface, so they are not exchanged one by one. Not in any test of hits
+and limits: that each set-up drew its own calibration of the threshold. A gate needs a margin for that
+(`harness.evaluation.study.verdict`). Of two one-sided p the first is of being worse."""
 
 from __future__ import annotations
 
@@ -13,28 +11,21 @@ from typing import Literal
 import numpy as np
 
 from harness.evaluation.intervals import Interval, percentiles
-from harness.evaluation.pod.likelihood import HitsAndMisses, maxima
+from harness.evaluation.pod.curve import HitsAndMisses, maxima
 from harness.evaluation.pod.statement import POD
-from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.over_boards import Targets, crossings, targets_of
+from harness.evaluation.study.limit import SetUpLimit, crossings, targets_of
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
 from harness.vocabulary.seeds import random_stream
 
 Tails = tuple[float, float]
-"""One-sided p: (worse, better) for the second set-up."""
-
-
-# hits on the same inspections
 
 
 @dataclass(frozen=True)
 class HitsChange:
-    """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``.
-
-    ``only_first``, ``only_second``: found by one alone. ``mcnemar_p``: McNemar's exact test (two-sided), which takes
-    inspections as independent. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so few (many)
-    hits of the second are if each board's two sums of hits might as well be exchanged.
-    """
+    """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``. ``only_first``,
+    ``only_second``: found by one alone. ``mcnemar_p``: McNemar's exact test (two-sided), which takes inspections as
+    independent. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so few (many) hits of the
+    second are if each board's two sums of hits might as well be exchanged."""
 
     boards: int
     inspections: int
@@ -43,11 +34,6 @@ class HitsChange:
     mcnemar_p: float
     fewer_p: float
     more_p: float
-
-    @property
-    def sides(self) -> Tails:
-        """p of (worse, better)."""
-        return self.fewer_p, self.more_p
 
     @property
     def boards_p(self) -> float:
@@ -64,9 +50,8 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
     names, board = np.unique(first.board[one], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
-    fewer, more = sign_flip(gained)
     p = mcnemar(only_first, only_second)
-    return HitsChange(len(names), len(one), only_first, only_second, p, fewer, more)
+    return HitsChange(len(names), len(one), only_first, only_second, p, *sign_flip(gained))
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
@@ -86,18 +71,11 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
-    """(P(sum <= observed), P(sum >= observed)) of integer differences (n,) whose signs are tossed independently.
-
-    Fisher's randomisation test for pairs, exact: the distribution of the sum is built up board by board. Its null is
-    that the two set-ups are exchangeable on each board, whatever the boards have in themselves.
-    """
-    sizes = np.abs(gained[gained != 0]).astype(int)
-    chance = np.zeros(int(sizes.sum()) + 1)  # of the sum of those that come out positive
-    chance[0] = 1.0
-    for size in sizes:
-        tossed = 0.5 * chance
-        tossed[size:] += 0.5 * chance[: len(chance) - size]
-        chance = tossed
+    """(P(sum <= observed), P(sum >= observed)) of integer differences (n,) whose signs are tossed: Fisher's
+    randomisation test for pairs, exact, by building the distribution of the sum up board by board."""
+    chance = np.ones(1)  # of the sum of those that come out positive
+    for size in np.abs(gained[gained != 0]).tolist():
+        chance = 0.5 * (np.pad(chance, (0, size)) + np.pad(chance, (size, 0)))
     return _tails(chance, int(gained[gained > 0].sum()))
 
 
@@ -106,19 +84,12 @@ def _tails(chance: np.ndarray, observed: int) -> Tails:
     return min(1.0, float(chance[: observed + 1].sum())), min(1.0, float(chance[observed:].sum()))
 
 
-# limits
-
-
 @dataclass(frozen=True)
 class LimitChange:
-    """a90 of the second set-up over and less that of the first.
-
-    ``interval_mm``: 95 % percentiles of the difference over boards drawn again: the same boards for both where
-    ``paired``, else independently. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown (shrunk), and
-    with 500 draws never below 1/501 where paired. Unpaired it is a share of all 250,000 pairs of draws; of a share
-    below 1/501 each the tails of both are no more than their few outermost draws: significance there is a matter of
-    the two distributions hardly overlapping, not of a p known to its digits.
-    """
+    """a90 of the second set-up over and less that of the first. ``interval_mm``: 95 % percentiles of the difference
+    over boards drawn again, the same for both where ``paired``. ``grown_p``, ``shrunk_p``: share of draws in which it
+    has not grown (shrunk), never below 1/501 with 500 paired draws. Unpaired it is a share of all pairs of draws, and
+    below 1/501 no p known to its digits."""
 
     ratio: float
     difference_mm: float
@@ -127,29 +98,21 @@ class LimitChange:
     shrunk_p: float
     paired: bool
 
-    @property
-    def sides(self) -> Tails:
-        """p of (worse, better)."""
-        return self.grown_p, self.shrunk_p
-
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
-    """Compare two a90 by boards drawn again. ``same_boards``: of equal numbers and damage; paired only if both were
-    inspected on the same of them."""
+    """Compare two a90 by boards drawn again. ``same_boards``: of equal damage; paired if both saw the same."""
     one, two = first.a90_draws_mm, second.a90_draws_mm
     boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
     paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(one) == len(two)
     with np.errstate(invalid="ignore"):  # NaN, no evidence either way, where both are infinite
         differences = two - one if paired else (two[:, None] - one[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
-    weight = 1.0 / (1 + len(one))  # no share of so few draws is evidence below this
+    weight = 1.0 / (1 + len(one)) if paired else 0.0  # no share of so few draws is evidence below this
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
-    grown, shrunk = ((1 - weight) * share + weight for share in shares) if paired else shares
+    grown, shrunk = ((1 - weight) * share + weight for share in shares)
     before, now = first.a90_mm, second.a90_mm
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
-
-# a90 on the same boards
 
 LINK = "logit"
 """The link, on size itself, for all: the choice of a curve must not depend on which result is whose."""
@@ -175,11 +138,6 @@ class SwapChange:
     shrunk_p: float
     tosses: int
 
-    @property
-    def sides(self) -> Tails:
-        """p of (worse, better)."""
-        return self.grown_p, self.shrunk_p
-
 
 @dataclass(frozen=True, eq=False)
 class Exchange:
@@ -187,6 +145,7 @@ class Exchange:
     from ``centre_mm``; ``first``, ``second`` (n,) hits of ``inspections`` (n,); ``start`` (2,): the pooled curve."""
 
     board: np.ndarray
+    boards: int
     z: np.ndarray
     centre_mm: float
     spread_mm: float
@@ -195,27 +154,16 @@ class Exchange:
     inspections: np.ndarray
     start: np.ndarray
 
-    @property
-    def boards(self) -> int:
-        """Number of boards that both inspected."""
-        return int(self.board.max()) + 1
-
     def log_ratios(self, exchanged: np.ndarray) -> np.ndarray:
         """ln(a90 of the second / a90 of the first), (draws,), with the results of boards ``exchanged`` (draws, boards)
         exchanged. NaN where neither has an a90."""
         swapped = exchanged[:, self.board]
+        one, two = np.where(swapped, self.second, self.first), np.where(swapped, self.first, self.second)
         with np.errstate(invalid="ignore"):
-            return self._log_a90(np.where(swapped, self.first, self.second)) - self._log_a90(
-                np.where(swapped, self.second, self.first)
-            )
+            return self._log_a90(two) - self._log_a90(one)
 
     def _log_a90(self, hits: np.ndarray) -> np.ndarray:
-        """(draws,) of ``hits`` (draws, n).
-
-        Infinite where nothing is found or the chance does not grow with size; the middle of the gap where hits and
-        misses do not overlap; at least the smallest damage, which is it where everything is found. Any rule would do
-        that does not ask whose results they are; a90 of a limit is estimated with more care.
-        """
+        """(draws,) of ``hits`` (draws, n): infinite without a rising chance, the gap's middle where separated."""
         misses = self.inspections - hits
         largest_miss = np.where(misses > 0, self.z, -np.inf).max(axis=1)
         smallest_hit = np.where(hits > 0, self.z, np.inf).min(axis=1)
@@ -236,24 +184,20 @@ def exchange(first: Inspected, second: Inspected) -> Exchange | None:
         for hit in (first.hit[one], second.hit[two])
     )
     centre, spread = float(before.size_mm.mean()), float(before.size_mm.std()) or 1.0
-    z = (before.size_mm - centre) / spread
-    boards = np.unique(before.board, return_inverse=True)[1]
-    return Exchange(boards, z, centre, spread, before.hits, now.hits, before.inspections, _pooled(z, before, now))
+    z, hits = (before.size_mm - centre) / spread, before.hits + now.hits
+    misses, start = before.inspections + now.inspections - hits, np.array([0.0, 1.0])
+    # Where the hits of both do not overlap the misses of both, no exchange has a curve to be searched.
+    if hits.any() and misses.any() and z[misses > 0].max() > z[hits > 0].min():
+        start = np.asarray(maxima(_curves(z, hits[None], misses[None]), start)[0])
+    names, board = np.unique(before.board, return_inverse=True)
+    return Exchange(board, len(names), z, centre, spread, before.hits, now.hits, before.inspections, start)
 
 
 def swap_change(first: Inspected, second: Inspected, tosses: int = TOSSES) -> SwapChange | None:
-    """Test whether a90 differs on the inspections that both have: results exchanged board by board, curves refitted.
-
-    The total of hits cannot tell alone: where luck grows and a50 stays, small damages are won and large ones lost, and
-    a90 grows with as many hits. Nor can boards drawn again: of 500 draws none says less than 1/501.
-
-    Fisher's randomisation test for pairs: were the set-ups alike, each board's two results might as well be exchanged,
-    and so might all of them at once. The distribution of ln(a90 / a90) is therefore symmetric, and a one-sided p is
-    half of the two-sided one. Tosses are drawn until `ENOUGH` of them are as far out as what was observed, but no more
-    than ``tosses`` (Besag and Clifford, Biometrika 78 (1991), 301: the p is exact whatever their number), so that a
-    small p is known well and a large one costs little. None without shared inspections. Deterministic; the studies
-    exchanged give the same p on the other side.
-    """
+    """Test whether a90 differs on the inspections that both have: results exchanged board by board, curves refitted. It
+    sees what the total of hits cannot: luck that grows. Fisher's randomisation test for pairs; a one-sided p is half of
+    the two-sided one. Tosses are drawn until `ENOUGH` are as far out as what was observed, at most ``tosses`` (Besag
+    and Clifford, Biometrika 78 (1991), 301: p is exact whatever their number). None without shared inspections."""
     pair = exchange(first, second)
     if pair is None:
         return None
@@ -280,22 +224,9 @@ def swap_change(first: Inspected, second: Inspected, tosses: int = TOSSES) -> Sw
     return SwapChange(ratio, grown, shrunk, drawn)
 
 
-def _pooled(z: np.ndarray, before: Targets, now: Targets) -> np.ndarray:
-    """(2,) coefficients of one curve for both, the same whichever is first. Without meaning where the hits of both do
-    not overlap the misses of both: then no exchange has a curve to be searched."""
-    hits = before.hits + now.hits
-    misses = before.inspections + now.inspections - hits
-    flat = np.array([0.0, 1.0])
-    if not (hits.any() and misses.any()) or z[misses > 0].max() <= z[hits > 0].min():
-        return flat
-    return np.asarray(maxima(_curves(z, hits[None], misses[None]), flat)[0])
-
-
 def _curves(z: np.ndarray, hits: np.ndarray, misses: np.ndarray) -> HitsAndMisses:
     return HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, LINK)
 
-
-# false calls
 
 SAME = 1e-6
 """Relative difference of one threshold from machine to machine."""
@@ -304,13 +235,9 @@ SAME = 1e-6
 @dataclass(frozen=True)
 class CallsChange:
     """``calls`` on ``areas_m2`` of hole-free boards, ``calling`` of ``boards`` with a call (first repeat of each), each
-    (first, second).
-
-    ``counts_p``: conditional binomial test of two Poisson counts, two-sided (Przyborowski and Wilenski 1940), as if
-    thresholds were known. ``more_p``, ``fewer_p``: one-sided, they decide. They toss the signs of boards where frames
-    and threshold are the same (``way`` "signs"); allow for two draws of the calibration on different frames
-    ("calibrations"); and are the larger of both on identical frames with calibrated thresholds that differ ("both").
-    """
+    (first, second). ``counts_p``: binomial test of two Poisson counts, as if thresholds were known. ``more_p``,
+    ``fewer_p``: one-sided, they decide, by ``way``: signs of boards tossed (same frames and threshold), two draws of
+    the calibration (different frames), or the larger of both."""
 
     calls: tuple[int, int]
     areas_m2: tuple[float, float]
@@ -320,11 +247,6 @@ class CallsChange:
     more_p: float
     fewer_p: float
     way: Literal["signs", "calibrations", "both"]
-
-    @property
-    def sides(self) -> Tails:
-        """p of (worse, better)."""
-        return self.more_p, self.fewer_p
 
     @property
     def rates_per_m2(self) -> tuple[float, float]:
@@ -339,21 +261,12 @@ class CallsChange:
 
 
 def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float | None) -> CallsChange | None:
-    """Compare false calls of two set-ups whose thresholds were each calibrated on hole-free boards of their own.
-
-    Two honest calibrations for one wanted rate give two different true rates: with the 4th highest of 60 scores as
-    threshold, the chance that a new board calls is Beta(4, 57) distributed (Wilks 1941), half its mean to either side.
-    A test of two Poisson counts that ignores it is called at 5 % in 20 % of honest pairs with 240 hole-free boards
-    each. So the test that decides gives each set-up its own draw of that distribution, and asks how many of all boards
-    that called are the second's. On identical frames with the same threshold both had the same luck: there the signs of
-    each board's difference are tossed instead, and smaller changes show. Identical frames alone are not enough: a
-    detector that scores otherwise has luck of its own on them, and of two equally good ones with 240 boards each, that
-    toss alone calls 6 % at 0.1 %. So where detector, version, settings or anything else moved the threshold, both tests
-    must agree.
-
-    None where either has no hole-free board. ``wanted_per_m2``: the rate that both were calibrated to, None where the
-    threshold is the lowest without a false call, or was given (no calibration runs).
-    """
+    """Compare false calls of two set-ups whose thresholds were each calibrated on hole-free boards of their own. Two
+    honest calibrations for one rate give two different true rates (Beta distributed, Wilks 1941): a test of two Poisson
+    counts is called at 5 % in 20 % of honest pairs with 240 boards each. So each gets its own draw of that
+    distribution. On identical frames with the same threshold the signs of each board's difference are tossed, which
+    shows smaller changes; where anything moved the threshold on identical frames, both tests must agree. None where
+    either has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
     from scipy.stats import betabinom, binomtest, hypergeom
 
     one, two = first.unflawed, second.unflawed
@@ -365,19 +278,17 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
     # Scores on identical frames are alike if the calibration took the same number for threshold, which two ways of
     # scoring do by chance only where scores are few whole numbers. A given threshold had no luck.
+    given = not (first.calibration_runs or second.calibration_runs)
     way: Literal["signs", "calibrations", "both"] = "both"
     if first.frames_digest != second.frames_digest:
         way = "calibrations"
-    elif not (first.calibration_runs or second.calibration_runs) or np.isclose(
-        first.threshold, second.threshold, rtol=SAME, atol=0.0
-    ):
+    elif given or np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
         way = "signs"
     by_signs = by_draws = (0.0, 0.0)
     if way != "calibrations":
-        shared, at, there = np.intersect1d(np.unique(one.board), np.unique(two.board), return_indices=True)
+        _, at, there = np.intersect1d(np.unique(one.board), np.unique(two.board), return_indices=True)
         sums = [np.bincount(np.unique(t.board, return_inverse=True)[1], t.calls) for t in (one, two)]
-        gained = (sums[1][there] - sums[0][at]).round().astype(int) if len(shared) else np.zeros(0, int)
-        by_signs = sign_flip(gained)
+        by_signs = sign_flip((sums[1][there] - sums[0][at]).round().astype(int))
     if way != "signs":
         total = calling_1 + calling_2
         ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)
@@ -401,8 +312,7 @@ def _calling(table: Unflawed) -> tuple[int, int]:
 
 
 def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
-    """(r, n + 1 - r): the threshold is the r-th highest of n calibration runs' scores, as
-    `harness.evaluation.pod.false_calls.threshold_for_rate` takes it; None where it was given."""
+    """(r, n + 1 - r): the threshold is the r-th highest of n calibration runs' scores; None where it was given."""
     n = record.calibration_runs
     if not n:
         return None

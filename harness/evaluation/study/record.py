@@ -1,27 +1,34 @@
-"""The record of a study: every inspection of every set-up, by itself enough for limits and comparisons.
-
-Stored as ``study.json`` in a result folder and as the baseline of a gate, so that a comparison needs no other file.
-The classes here declare the file: each field's type says what JSON may hold in its place, and the file is written,
-checked and read by these types alone.
-"""
+"""The record of a study: every inspection of every set-up, by itself enough for limits and comparisons. Stored as
+``study.json`` in a result folder and as the baseline of a gate, so that a comparison needs no other file. The classes
+here declare the file: each field's type says what JSON may hold in its place, and the file is written, checked and read
+by these types alone."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler, Strict, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    PlainSerializer,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from harness.vocabulary.declaration.diagnose import shown
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.json_text import strict_json
-from harness.vocabulary.limits import RECORD_BYTES, bounded_bytes
-from harness.vocabulary.versions import check_version
+from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.provenance import check_version
 
 RECORD_VERSION = 2
 """1: hits by depth alone. Raised when a field's meaning, or what counts as a hit, changes."""
@@ -49,24 +56,12 @@ class StoredColumn:
         )
 
 
-class NumberOrNull:
-    """A number in memory, NaN for null in JSON."""
-
-    @staticmethod
-    def __get_pydantic_core_schema__(source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(
-            lambda value: np.nan if value is None else value,
-            handler.generate_schema(RealOrNull),
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda v: None if v != v else v),
-        )
-
-
 def _one_table(table: Any) -> Any:
     """Refuse columns of different lengths and rows that stand there twice."""
     columns = {name: column for name, column in vars(table).items() if column is not None}
-    lengths = {len(column): name for name, column in columns.items()}
+    lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
-        raise ValueError("columns of different lengths: " + ", ".join(f"`{k}` {n}" for n, k in lengths.items()))
+        raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
     named = [column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")]
     if len(set(zip(*named, strict=True))) < len(table.board):
         raise ValueError("the same inspection stands there twice")
@@ -74,11 +69,10 @@ def _one_table(table: Any) -> Any:
 
 
 def _no_set_up_twice(set_ups: tuple[SetUpRecord, ...]) -> tuple[SetUpRecord, ...]:
-    seen: set[tuple[str, int]] = set()
-    for one in set_ups:
-        if (one.variant, one.frames) in seen:
-            raise ValueError(f"set-up {one.variant!r} with frames {one.frames} stands there twice")
-        seen.add((one.variant, one.frames))
+    names = [(one.variant, one.frames) for one in set_ups]
+    for variant, frames in names:
+        if names.count((variant, frames)) > 1:
+            raise ValueError(f"set-up {variant!r} with frames {frames} stands there twice")
     return set_ups
 
 
@@ -95,18 +89,17 @@ Depths = Annotated[np.ndarray, StoredColumn(float, Annotated[Real, Field(ge=0)])
 Numbers = Annotated[np.ndarray, StoredColumn(float, Real)]
 NumbersOrNull = Annotated[np.ndarray, StoredColumn(float, RealOrNull)]
 Truths = Annotated[np.ndarray, StoredColumn(bool, Annotated[bool, Strict()])]
+NULL_IS_NAN = BeforeValidator(lambda value: np.nan if value is None else value)
+NAN_IS_NULL = PlainSerializer(lambda value: None if value != value else value)
 FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one a row: each damage of each board once for every repeat of the noise.
-
-    ``board``, ``repeat`` (n,) int, ``hole`` (n,) str name it; ``diameter_mm``, ``depth_mm`` (removed material),
-    ``x_mm``, ``y_mm`` (on the board) are true. ``hit`` (n,) bool. ``signal`` (n,): the highest score within the hit
-    radius of the damage's centre, NaN where no pixel there was judged. ``by_depth``, ``by_no_return`` (n,) bool: hits
-    by each kind of finding, either of which is a ``hit``; None where hits were counted by depth alone.
-    """
+    """Inspections of damage, one a row: each damage of each board once for every repeat of the noise. ``diameter_mm``,
+    ``depth_mm`` (removed material), ``x_mm``, ``y_mm`` (on the board) are true. ``signal`` (n,): the highest score
+    within the hit radius of the damage's centre, NaN where no pixel there was judged. ``by_depth``, ``by_no_return``
+    (n,) bool: hits by each kind of finding; None where hits were counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -150,14 +143,10 @@ class Calibrated:
 
 @dataclass(frozen=True, eq=False)
 class SetUpRecord:
-    """One set-up at one number of frames.
-
-    ``axes``: its place on the experiment's axes other than frames, by dotted path. ``threshold`` in the detector's
-    units, ``threshold_mm`` that times the mean scale, NaN where the detector has none; ``calibration_runs`` hole-free
-    runs on boards of their own set it (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and
-    damage, ``frames_digest`` those with camera, noise seed and the code that simulates: equal for identical frames.
-    ``calibrated``: what those runs found; None in records that do not keep it.
-    """
+    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold`` in the detector's
+    units, ``threshold_mm`` NaN where it has no scale; ``calibration_runs`` hole-free runs on boards of their own set it
+    (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and damage, ``frames_digest`` those with
+    camera, noise seed and the code that simulates. ``calibrated``: what those runs found, where kept."""
 
     __pydantic_config__ = FORM
     variant: Name
@@ -166,7 +155,7 @@ class SetUpRecord:
     detector: Name
     detector_version: Whole
     threshold: Real
-    threshold_mm: Annotated[float, NumberOrNull]
+    threshold_mm: Annotated[float, Field(allow_inf_nan=True, strict=True), NULL_IS_NAN, NAN_IS_NULL]
     calibration_runs: Number
     failed: Number
     targets_digest: Name
@@ -210,11 +199,8 @@ def record_text(record: StudyRecord) -> str:
 
 
 def read_record(path: Path) -> StudyRecord:
-    """Read the record at ``path``: a file, or a result folder with its ``study.json``.
-
-    Raises UserError where there is none, where it is no record or a damaged one (with set-up and field), and where
-    it is of another version.
-    """
+    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError where there is
+    none, where it is no record or a damaged one (with set-up and field), and where it is of another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
         data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # its form says where a NaN stands
@@ -232,57 +218,13 @@ def read_record(path: Path) -> StudyRecord:
         raise UserError(f"{file}: is damaged: {_mistake(error, data)}", fix=AGAIN) from error
 
 
-# mistakes in words
-
-
-WORDS = {
-    "Input should be": "should be",
-    "a valid integer": "a whole number",
-    "a valid number": "a number",
-    "a valid boolean": "true or false",
-    "a valid string": "text",
-    "a valid dictionary": "a mapping",
-    "a dictionary": "a mapping",
-    "a valid tuple": "a list",
-    "a valid list": "a list",
-}
-"""pydantic's words and ours, for what JSON holds."""
-
-
 def _mistake(error: ValidationError, data: Any) -> str:
-    """Describe the first mistake in a study's data in one sentence, with set-up, field and row, and count the rest."""
+    """Describe the first mistake in a study's data in one sentence, with its place, and count the rest."""
     first, *others = error.errors(include_url=False)
-    more = f"; and {len(others)} more" if others else ""
-    return f"{', '.join(_place(first['loc'], data))}{_what(first)}{more}"
-
-
-def _place(location: tuple[int | str, ...], data: Any) -> Iterator[str]:
-    path = list(location)
-    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(path[1], int):
-        one = data["set_ups"][path[1]]
-        variant = one.get("variant") if isinstance(one, dict) else None
-        named = f" ({variant}, frames {one.get('frames')})" if isinstance(variant, str) else ""
-        yield f"set-up {path[1] + 1}{named}"
-        path = path[2:]
-    rows = [part for part in path if isinstance(part, int)]
-    if names := [part for part in path if isinstance(part, str) and not part.startswith(("float", "none"))]:
-        yield f"`{'.'.join(names)}`"
-    if rows:
-        yield f"value {rows[0] + 1}"
-
-
-def _what(error: Any) -> str:
-    """One of pydantic's errors as the end of our sentence."""
-    kind, value = error["type"], error.get("input")
-    if kind == "missing":
-        return " is missing"
-    if kind == "unexpected_keyword_argument":
-        return " is no field of a record"
-    if kind == "value_error":
-        return f"{': ' if error['loc'] else ''}{error['ctx']['error']}"
-    if kind == "too_short":
-        return " is empty"
-    text = str(error["msg"]).partition(" or an instance of")[0]
-    for old, new in WORDS.items():
-        text = text.replace(old, new)
-    return f" {text}, not {shown(value)}"
+    path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
+    where, value = ".".join(map(str, path)), first.get("input")
+    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(one := data["set_ups"][path[1]], dict):
+        where += f" (set-up {one.get('variant')}, frames {one.get('frames')})"
+    told = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
+    text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]
+    return f"{where}: {text}{told}" + (f"; and {len(others)} more" if others else "")

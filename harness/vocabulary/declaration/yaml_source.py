@@ -1,16 +1,16 @@
-"""YAML 1.2 as plain data that remembers the place of every key and value.
+"""YAML 1.2 as plain data that remembers the place of every key and value; problems are shown there, all at once.
 
 The parser is ruamel.yaml's; only its node tree is used, so that no tag can build an object, every duplicate key is
 seen, and places come from the nodes. Not supported on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several
-documents, keys that are no text.
-"""
+documents, keys that are no text."""
 
 from __future__ import annotations
 
 import re
+import textwrap
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -21,28 +21,104 @@ from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEve
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from harness.vocabulary.declaration.problems import MAX_PROBLEMS, DeclarationError, Place, Problem
+from harness.vocabulary.errors import UserError
+
+SHOWN_COLUMNS = 110
+"""Characters of a source line that a message shows; longer lines are cut around the caret."""
+MAX_PROBLEMS = 100
+"""Most problems that a message lists, and that are looked for in a single mapping."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Position of something written: ``line`` and ``column`` count from 1, in characters; ``width`` is the caret's.
+    ``line`` 0 means an argument of the command line, whose ``line_text`` is the whole argument."""
+
+    origin: str
+    line: int
+    column: int
+    line_text: str
+    width: int = 1
+
+    @property
+    def head(self) -> str:
+        """``file:line:column``, or the option's name."""
+        return f"{self.origin}:{self.line}:{self.column}" if self.line else self.origin
+
+    def excerpt(self) -> list[str]:
+        """Return the source line and a caret under the place, both indented."""
+        start = max(0, self.column - 1 - SHOWN_COLUMNS // 2) if len(self.line_text) > SHOWN_COLUMNS else 0
+        cut = self.line_text[start : start + SHOWN_COLUMNS]
+        shown = "".join(letter if letter.isprintable() else " " for letter in cut)
+        offset = self.column - 1 - start
+        width = max(1, min(self.width, len(shown) - offset))
+        label = f"{self.line or '':>5}"
+        return [f"{label} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake: what, where, what would be legal, the nearest legal word, and a second place that it concerns."""
+
+    message: str
+    place: Place | None
+    legal: str | None = None
+    nearest: str | None = None
+    fix: str | None = None
+    other: Place | None = None
+    other_says: str = ""
+
+    def __str__(self) -> str:
+        lines = [f"{self.place.head}: {self.message}", *self.place.excerpt()] if self.place else [self.message]
+        if self.other:
+            lines += [f"  {self.other_says} {self.other.head}", *self.other.excerpt()]
+        lines += [f"  did you mean: {self.nearest}"] if self.nearest else []
+        if self.legal:
+            lines += textwrap.wrap(self.legal, 118, initial_indent="  legal: ", subsequent_indent=" " * 9)
+        return "\n".join(lines + ([f"  to do: {self.fix}"] if self.fix else []))
+
+
+class DeclarationError(UserError):
+    """Everything that is wrong with an experiment, in the order of the file."""
+
+    def __init__(self, origin: str, problems: Iterable[Problem]) -> None:
+        self.origin, self.problems = origin, in_order(problems)
+        count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
+        told = [*map(str, self.problems[:MAX_PROBLEMS])]
+        told += [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+        super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(told))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return DeclarationError, (self.origin, self.problems)
+
+
+def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
+    """Return problems by place, each (place, message) once; first those without a place, then the command line's."""
+    unique = {(problem.place, problem.message): problem for problem in problems}.values()
+
+    def position(problem: Problem) -> tuple[int, int]:
+        place = problem.place
+        return (-1, 0) if place is None else (place.line, place.column if place.line else 0)
+
+    return tuple(sorted(unique, key=position))
+
 
 KeyPath = tuple[str | int, ...]
 """Position of a value in the data: keys of mappings and indices of lists."""
-
 MAX_BYTES = 500_000
 """An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte."""
 MAX_NODES = 50_000
-"""Values as written, and after aliases are followed: what bounds an alias bomb."""
+"""Values, aliases followed: what bounds an alias bomb."""
 MAX_DEPTH = 40
 """Nesting; the schema needs 8."""
-
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Plain data (dicts, lists, text, numbers, booleans, None) and the place of everything in it.
-
-    ``values`` and ``keys`` map a `KeyPath` to the place of the value, respectively of its key.
-    """
+    """Plain data (dicts, lists, text, numbers, booleans, None) and the place of everything in it. ``values`` and
+    ``keys`` map a `KeyPath` to the place of the value, respectively of its key."""
 
     origin: str
     text: str
@@ -51,129 +127,89 @@ class Source:
     keys: Mapping[KeyPath, Place]
 
     def place_of(self, path: KeyPath) -> Place:
-        """The place of a value; of the innermost enclosing value where it is not written (a default)."""
-        return _innermost(self.values, path)
+        """Return the place of a value; of the innermost enclosing value where it is not written (a default)."""
+        while path and path not in self.values:
+            path = path[:-1]
+        return self.values[path]
 
     def key_place_of(self, path: KeyPath) -> Place:
-        """The place of a key; of the value where it has none (list items, the top level)."""
-        return self.keys[path] if path in self.keys else _innermost({**self.values, **self.keys}, path)
+        """Return the place of a key, else of the innermost enclosing key or value that has one."""
+        while path and path not in self.keys and path not in self.values:
+            path = path[:-1]
+        return self.keys[path] if path in self.keys else self.values[path]
 
     def with_value(self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()) -> Source:
-        """This source with ``data`` whose value at ``path`` came from ``donor`` at ``donor_path``, places and all."""
-        values = {at: place for at, place in self.values.items() if at[: len(path)] != path}
-        keys = {at: place for at, place in self.keys.items() if at[: len(path)] != path}
-        depth = len(donor_path)
-        values |= {path + at[depth:]: place for at, place in donor.values.items() if at[:depth] == donor_path}
-        keys |= {path + at[depth:]: place for at, place in donor.keys.items() if at[:depth] == donor_path}
-        keys[path] = donor.place_of(donor_path)
-        return Source(self.origin, self.text, data, values, keys)
+        """Return this source with ``data`` whose value at ``path`` came from ``donor`` at ``donor_path``."""
+        depth, merged = len(donor_path), []
+        for own, others in ((self.values, donor.values), (self.keys, donor.keys)):
+            kept = {at: place for at, place in own.items() if at[: len(path)] != path}
+            merged.append(kept | {path + at[depth:]: p for at, p in others.items() if at[:depth] == donor_path})
+        merged[1][path] = donor.place_of(donor_path)
+        return Source(self.origin, self.text, data, *merged)
 
 
 def read_yaml(path: Path) -> Source:
     """Read a file whose top level is a mapping. Raises DeclarationError with every problem of the text, and places."""
-    path, origin = Path(path), str(path)
-
-    def refused(
-        message: str, place: Place | None = None, legal: str | None = None, fix: str | None = None
-    ) -> DeclarationError:
-        return DeclarationError(origin, [Problem(message, place, legal=legal, fix=fix)])
-
+    path, place, legal, fix = Path(path), None, None, None
     try:
         with path.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)
+        if len(content) <= MAX_BYTES:
+            text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+            source = parse_yaml(text, str(path))
+            if isinstance(source.data, dict):
+                return source
+            kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
+            message, place, legal = f"the file {kind}", source.place_of(()), "keys and values, as in `name: thesis`"
+        else:
+            message, legal = "the file is too large for a declaration", f"at most {MAX_BYTES} bytes"
     except FileNotFoundError:
         found = sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        raise refused("there is no such file", legal=", ".join(found[:10]) or None) from None
+        message, legal = "there is no such file", ", ".join(found[:10]) or None
     except IsADirectoryError:
-        raise refused("this is a folder, not a YAML file") from None
+        message = "this is a folder, not a YAML file"
     except OSError as error:
-        raise refused(f"cannot be read ({error.strerror})") from error
-    if len(content) > MAX_BYTES:
-        raise refused("the file is too large for a declaration", legal=f"at most {MAX_BYTES} bytes")
-    try:
-        text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        message = f"cannot be read ({error.strerror})"
     except UnicodeDecodeError as error:
-        before = content[: error.start].decode("utf-8", errors="replace")
+        lines = content[: error.start].decode("utf-8", errors="replace").split("\n")
         rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
-        start = before.rfind("\n") + 1
-        place = Place(origin, before.count("\n") + 1, len(before) - start + 1, before[start:] + rest)
-        message = f"byte 0x{content[error.start]:02x} is not UTF-8"
-        raise refused(message, place, fix="save the file as UTF-8") from None
-    source = parse_yaml(text, origin)
-    if not isinstance(source.data, dict):
-        kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
-        raise refused(f"the file {kind}", source.place_of(()), legal="keys and values, as in `name: thesis`")
-    return source
+        place = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + rest)
+        message, fix = f"byte 0x{content[error.start]:02x} is not UTF-8", "save the file as UTF-8"
+    raise DeclarationError(str(path), [Problem(message, place, legal=legal, fix=fix)])
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
-    """Parse ``text[start:]``; places are those in the whole text. Raises DeclarationError.
-
-    ``is_argument``: the text is an argument of the command line, so that places have no line number.
-    """
-    line_starts = [0, *(match.end() for match in re.finditer("\n", text))]
-    lines: dict[int, str] = {}
-    """Each line once: its places share it, however many they are and however long it is."""
+    """Parse ``text[start:]``; places are those in the whole text. Raises DeclarationError. ``is_argument``: the text is
+    an argument of the command line, so that places have no line number."""
+    starts, lines = [0, *(match.end() for match in re.finditer("\n", text))], text.split("\n")
 
     def place(index: int, end: int) -> Place:
-        """The place of the characters from ``index`` to ``end``, counted after ``start``."""
-        index, end = min(index + start, len(text)), end + start
-        line = bisect_right(line_starts, index) - 1
-        first = line_starts[line]
-        if line not in lines:
-            line_end = text.find("\n", first)
-            lines[line] = text[first:] if line_end < 0 else text[first:line_end]
-        width = max(1, min(end, first + len(lines[line])) - index)
-        return Place(origin, 0 if is_argument else line + 1, index - first + 1, lines[line], width)
+        """Return the place of the characters from ``index`` to ``end``, counted after ``start``."""
+        index = min(index + start, len(text))
+        line = bisect_right(starts, index) - 1
+        width = max(1, min(end + start, starts[line] + len(lines[line])) - index)
+        return Place(origin, 0 if is_argument else line + 1, index - starts[line] + 1, lines[line], width)
 
     version = _OTHER_VERSION.search(text)
     if version:
         problem = Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))
         raise DeclarationError(origin, [problem])
-    root = _composed(text[start:], origin, place)
-    builder = _Builder(place)
-    data = builder.build(root, (), ()) if root is not None else None
-    if builder.problems:
-        raise DeclarationError(origin, builder.problems)
-    builder.values.setdefault((), place(0, 0))
-    return Source(origin, text, data, builder.values, builder.keys)
-
-
-def to_yaml(data: Any) -> str:
-    """Plain data as YAML 1.2, in its own order of keys; `parse_yaml` inverts it."""
-    writer = YAML()
-    writer.default_flow_style = False
-    writer.width = 120
-    stream = StringIO()
-    writer.dump(data, stream)
-    return stream.getvalue()
-
-
-def _innermost(places: Mapping[KeyPath, Place], path: KeyPath) -> Place:
-    while path and path not in places:
-        path = path[:-1]
-    return places[path]
-
-
-def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Node | None:
-    """ruamel.yaml's node tree; its errors become a problem with a place.
-
-    Too deep and too long texts are refused first: composing recurses, scanning slows with depth, nodes take memory.
-    """
-    depth, nodes, problem = 0, 0, None
+    depth = nodes = 0
     try:
-        for event in YAML(typ="safe", pure=True).parse(text):
+        for event in YAML(typ="safe", pure=True).parse(text[start:]):
+            # composing recurses, scanning slows with depth, nodes take memory; keys are nodes, too
             depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
             nodes += isinstance(event, NodeEvent)
-            at = int(event.start_mark.index)
-            if depth > MAX_DEPTH:
-                problem = Problem("nested too deep", place(at, at + 1), legal=f"at most {MAX_DEPTH} levels")
-            elif nodes > 2 * MAX_NODES:  # keys are nodes, too
-                problem = Problem("too many values", place(at, at + 1), legal=f"at most {MAX_NODES} values")
-            if problem is not None:
-                break
-        else:
-            return YAML(typ="safe", pure=True).compose(text)
+            if depth > MAX_DEPTH or nodes > 2 * MAX_NODES:
+                at = place(event.start_mark.index, event.start_mark.index + 1)
+                message, limit = ("nested too deep", MAX_DEPTH) if depth > MAX_DEPTH else ("too many values", MAX_NODES)
+                raise DeclarationError(origin, [Problem(message, at, legal=f"at most {limit}")])
+        root = YAML(typ="safe", pure=True).compose(text[start:])
+        builder = _Builder(place)
+        data = None if root is None else builder.build(root, (), ())
+        if not builder.problems:
+            return Source(origin, text, data, {(): place(0, 0), **builder.values}, builder.keys)
+        raise DeclarationError(origin, builder.problems)
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -182,35 +218,43 @@ def _composed(text: str, origin: str, place: Callable[[int, int], Place]) -> Nod
         problem = Problem(f"no valid YAML: {what}", where, other=begun, other_says="begun at")
     except ReaderError as error:
         index = int(error.position)
-        problem = Problem(f"character U+{ord(text[index]):04X} is not allowed in YAML", place(index, index + 1))
+        letter = f"U+{ord(text[start + index]):04X}"
+        problem = Problem(f"character {letter} is not allowed in YAML", place(index, index + 1))
     except YAMLError as error:
         problem = Problem(f"no valid YAML: {error}", place(0, 1))
-    raise DeclarationError(origin, [problem]) from None
+    raise DeclarationError(origin, [problem])
 
 
-@dataclass
+def to_yaml(data: Any) -> str:
+    """Return plain data as YAML 1.2, in its own order of keys; `parse_yaml` inverts it."""
+    writer, stream = YAML(), StringIO()
+    writer.default_flow_style, writer.width = False, 120
+    writer.dump(data, stream)
+    return stream.getvalue()
+
+
 class _Builder:
     """Turns nodes into plain data, noting places and problems on the way."""
 
-    place: Callable[[int, int], Place]
-    values: dict[KeyPath, Place] = field(default_factory=dict)
-    keys: dict[KeyPath, Place] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
-    nodes: int = 0
+    def __init__(self, place: Callable[[int, int], Place]) -> None:
+        self._place = place
+        self.values: dict[KeyPath, Place] = {}
+        self.keys: dict[KeyPath, Place] = {}
+        self.problems: list[Problem] = []
+        self._nodes = 0
 
     def build(self, node: Node, path: KeyPath, within: tuple[Node, ...]) -> Any:
-        self.values[path] = here = self._place(node)
-        self.nodes += 1
-        if len(self.problems) >= MAX_PROBLEMS:
+        """Return the data of a node at a path; ``within``: the nodes around it."""
+        self.values[path] = here = self._of(node)
+        self._nodes += 1
+        if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
             return None
-        if self.nodes > MAX_NODES:
-            if self.nodes == MAX_NODES + 1:
-                self._problem("too many values", here, f"at most {MAX_NODES} values, aliases followed")
-            return None
+        if self._nodes > MAX_NODES:
+            return self._refuse("too many values", here, f"at most {MAX_NODES} values, aliases followed")
         if any(node is outer for outer in within):
-            return self._problem("an alias within its own anchor", here)
+            return self._refuse("an alias within its own anchor", here)
         if len(within) >= MAX_DEPTH:
-            return self._problem("nested too deep", here, f"at most {MAX_DEPTH} levels")
+            return self._refuse("nested too deep", here, f"at most {MAX_DEPTH} levels")
         if isinstance(node, MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
@@ -220,51 +264,44 @@ class _Builder:
     def _mapping(self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            if len(self.problems) >= MAX_PROBLEMS:
-                break
-            at, before = self._place(key_node), len(self.problems)
+            at, before = self._of(key_node), len(self.problems)
             if key_node.tag == _TAG + "merge":
                 fix = "write the keys out, or an alias for a whole value"
-                self._problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix)
+                self.problems.append(Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix))
                 continue
             key = self._scalar(key_node, at) if isinstance(key_node, ScalarNode) else None
-            if not isinstance(key, str):
-                if len(self.problems) == before:
-                    self._problem("a key must be text", at, "text; put quotes around numbers")
-            elif key in result:
-                first = self.keys[(*path, key)]
-                self.problems.append(
-                    Problem(f"duplicate key `{key}`", at, other=first, other_says="already written at", fix="keep one")
-                )
-            else:
+            if isinstance(key, str) and key not in result:
                 self.keys[(*path, key)] = at
                 result[key] = self.build(value_node, (*path, key), within)
+            elif isinstance(key, str):
+                first, message = self.keys[(*path, key)], f"duplicate key `{key}`"
+                self.problems.append(Problem(message, at, other=first, other_says="already written at", fix="keep one"))
+            elif len(self.problems) == before:
+                self._refuse("a key must be text", at, "text; put quotes around numbers")
         return result
 
     def _scalar(self, node: Node, here: Place) -> Any:
         kind, text = str(node.tag).removeprefix(_TAG), node.value
-        plain = text.lower().replace("_", "") if isinstance(node, ScalarNode) else ""
         try:
             if not isinstance(node, ScalarNode):
-                kind = ""
+                pass
             elif kind == "null":
                 return None
             elif kind == "bool":
                 return {"true": True, "false": False}[text.lower()]
-            elif kind == "int":
-                return int(plain, 0) if re.match(r"[-+]?0[ox]", text) else int(plain)
-            elif kind == "float":
-                return float(plain.replace(".inf", "inf").replace(".nan", "nan"))
+            elif kind in ("int", "float"):
+                digits = text.lower().replace("_", "").replace(".inf", "inf").replace(".nan", "nan")
+                return float(digits) if kind == "float" else int(digits, 0 if re.match("[-+]?0[ox]", digits) else 10)
             elif kind in ("str", "timestamp"):  # YAML 1.2 has no dates: they are text
                 text.encode()
                 return text
         except (ValueError, KeyError):
-            return self._problem(f"{text[:40]!r} cannot be read as {kind}", here)
+            return self._refuse(f"{text[:40]!r} cannot be read as {kind}", here)
         tag = str(node.tag).replace(_TAG, "!!")
-        return self._problem(f"the tag {tag} is not read", here, "plain mappings, lists, text and numbers")
+        return self._refuse(f"the tag {tag} is not read", here, "plain mappings, lists, text and numbers")
 
-    def _problem(self, message: str, place: Place, legal: str | None = None, fix: str | None = None) -> None:
-        self.problems.append(Problem(message, place, legal=legal, fix=fix))
+    def _refuse(self, message: str, place: Place, legal: str | None = None) -> None:
+        self.problems.append(Problem(message, place, legal=legal))
 
-    def _place(self, node: Node) -> Place:
-        return self.place(node.start_mark.index, node.end_mark.index)
+    def _of(self, node: Node) -> Place:
+        return self._place(node.start_mark.index, node.end_mark.index)

@@ -1,69 +1,202 @@
 """Sums over frames of the imager without its frames: most pixels to first order in the noise, the rest one by one.
 
 `at_once` sorts the pixels of a view, once. Where all gates are sure to let a pixel through and noise acts to first
-order, its frames are a moving sum of one normal a pixel, displaced and rounded (`scenes.sensor.amcw.linear_frames`);
-where a gate is sure to stop it, nothing is drawn; all others, at rims mostly, go through the whole chain with the
-windows that they need, and pixels beside them get the same noise. Frames are independent, so sums over parts of a
-capture add up. Not as in a frame: amplitudes have their own noise, independent of that of z (in frames their
-correlation is 0.1 at most, at rims of a camera that weighs by amplitude); a pixel without a range has, in all its
-frames, the reason that its mean has; variance of second order (2.5 % at most) is put on the centre's noise.
-
-Thesis boards (flat, blind, 20 mm, 200 mm, none behind), 150 averages of 50 frames drawn at once over 150 of frames, by
-tests/validation/at_once.py; deviations of the ratios by chance are some 0.005 (even), 0.01 (others), 0.05 (beyond 3):
-
-| camera | pixels | variance of the average | share beyond 3 deviations | correlation at lags 1, 2, 3, 4 |
-|---|---|---|---|---|
-| Azure | even, 30,000 | 1.001 1.000 1.000 0.999 1.000 | 1.00 1.00 1.01 0.98 1.00 | .58 .42 .28 .14, both ways |
-| Azure | uneven, 2,000 to 4,000 | 0.995 0.996 1.002 1.004 1.002 | 0.94 0.94 1.00 1.05 0.99 | equal to 0.01 |
-| Azure | listed, 900 to 1,500 | 1.008 1.008 1.006 0.999 1.000 | 1.07 1.07 1.03 0.93 0.95 | equal to 0.01 |
-| Kinect v2 | even, 20,000 | 0.998 0.998 0.997 1.001 0.999 | 1.00 0.99 0.98 1.01 1.01 | .60 .28 .00 .00, both ways |
-| Kinect v2 | uneven, 400 to 900 | 1.008 1.012 1.004 0.992 1.002 | 1.11 1.00 0.95 1.06 0.90 | equal to 0.01 |
-| Kinect v2 | listed, 900 to 1,500 | 1.005 1.017 0.986 0.997 0.992 | 1.06 1.06 0.97 1.00 1.00 | equal to 0.01 |
-
-Means differ by 0.92 to 1.04 standard errors (root mean square over pixels), counts of listed pixels by 0.97 to 1.07.
+order, z is a moving sum of one normal a pixel, displaced and rounded in each frame; where a gate is sure to stop it,
+nothing is drawn; all others, at rims mostly, go through the whole chain with the windows that they need. Frames are
+independent, so sums over parts of a capture add up. Not as in a frame: amplitudes have their own noise, independent of
+that of z (in frames their correlation is 0.1 at most); a pixel without a range has, in all its frames, the reason that
+its mean has; variance of second order (2.5 % at most) is put on the centre's noise. tests/validation/at_once.py
+measures the accuracy: the variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven)
+and 0.017 (listed).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.capture import Reason
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw import kernels, ranging
-from scenes.sensor.amcw.certainty import Certainty, certainty
-from scenes.sensor.amcw.even import even_pixels, fill_even, shares_of
-from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.kernels import LANES
-from scenes.sensor.amcw.linear import DEVIATIONS, FilterWindow, Light, light_of_samples, linearised, unknown_filtered
-from scenes.sensor.amcw.linear_frames import EVEN, NONE, UNEVEN, Linear, add_bytes, add_linear_frames
-from scenes.sensor.frames import N_REASONS, FrameTotals
-from scenes.sensor.normals import FAST, standard_normals
+from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
+from scenes.sensor.amcw.kernels import LANES, FilterSettings
+from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
+from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
+from scenes.sensor.unit import N_REASONS, FrameTotals
 
 if TYPE_CHECKING:
-    from scenes.sensor.amcw.imager import AmcwImager
+    from scenes.sensor.amcw.imager import AmcwExposure, AmcwImager
 
 f4 = np.float32
-MOST_LISTED = 0.25
-"""Share of pixels simulated one by one above which whole frames cost less."""
+NONE, EVEN, UNEVEN = 0, 1, 2
+
+
+class Linear(NamedTuple):
+    """Pixels of a view, (n,) float32 but for ``kind`` (uint8) and ``row`` (int32); z in steps of the output.
+
+    ``noise``: one deviation of a pixel's noise, in any unit. ``z``: the mean less ``base``, a whole number.
+    ``by_path``: by how much a step of half path moves z. EVEN pixels: ``each``: by how much a neighbour's noise moves z
+    at weight 1, ``more``: the centre's own beyond its weight's part. UNEVEN pixels: ``row`` in ``moved`` (m, k), the
+    same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row.
+    """
+
+    kind: np.ndarray
+    noise: np.ndarray
+    base: np.ndarray
+    z: np.ndarray
+    by_path: np.ndarray
+    each: np.ndarray
+    more: np.ndarray
+    row: np.ndarray
+    moved: np.ndarray
+    taps: np.ndarray
+
+
+def _bend() -> tuple[float, float]:
+    """Return (b, scale): u = scale v (1 + b v^2) of 256 even v in -1..1 has variance 1 and a normal's kurtosis."""
+    v = (np.arange(-128, 128) + 0.5) / 128
+    low, high = 1.0, 6.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        u = v * (1 + middle * v**2)
+        low, high = (middle, high) if (u**4).mean() < 3 * (u**2).mean() ** 2 else (low, middle)
+    return low, float(1 / np.sqrt((v**2 * (1 + low * v**2) ** 2).mean()))
+
+
+BEND, SCALE = _bend()
+
+
+@numba.njit(**FAST)
+def _noise_row(y, words, given, given_at, noise, w, half, row):  # type: ignore[no-untyped-def]
+    """Write noise of picture row y into ``row`` ((w + 2 half) lanes,), zeros beside the picture."""
+    bend, centre, size = f4(BEND), f4(0.5 / 128), f4(1 / 128)
+    for x in range(w):
+        i = y * w + x
+        start, first = np.uint64((x + half) * LANES), np.uint64(i * LANES)
+        if given_at[i] >= 0:
+            for t in range(LANES):
+                row[start + np.uint64(t)] = noise[i] * given[given_at[i], t]
+        else:
+            deviation = noise[i] * f4(SCALE)
+            for t in range(np.uint64(LANES)):
+                v = f4(words[first + t]) * size + centre
+                row[start + t] = deviation * v * (f4(1) + bend * v * v)
+
+
+@numba.njit(**FAST)
+def _pair_sum(above, below, tap, shift, other_shift, length, total):  # type: ignore[no-untyped-def]
+    for k in range(np.uint64(length)):
+        total[k] += tap * (above[np.uint64(shift) + k] + below[np.uint64(other_shift) + k])
+
+
+@numba.njit(**FAST)
+def _window_sums(rows, blank, y, h, taps, w, down, across):  # type: ignore[no-untyped-def]
+    """Write weighted sums over the window of each pixel of picture row y, (w lanes,), into ``across``."""
+    side = taps.size
+    half = side // 2
+    length = w * LANES
+    down[:] = taps[half] * rows[y % side]
+    for d in range(1, half + 1):
+        above = rows[(y - d) % side] if y - d >= 0 else blank
+        below = rows[(y + d) % side] if y + d < h else blank
+        _pair_sum(above, below, taps[half - d], 0, 0, down.size, down)
+    across[:] = taps[half] * down[half * LANES : half * LANES + length]
+    for d in range(1, half + 1):
+        _pair_sum(down, down, taps[half - d], (half - d) * LANES, (half + d) * LANES, length, across)
+
+
+@numba.njit(**FAST)
+def _round(z, by_path, errors, each, moved, start, more, own, own_start, rounded):  # type: ignore[no-untyped-def]
+    half = f4(0.5)
+    for t in range(np.uint64(LANES)):
+        noise = each * moved[np.uint64(start) + t] + more * own[np.uint64(own_start) + t]
+        rounded[t] = np.floor(z + by_path * errors[t] + noise + half)
+
+
+@numba.njit(**EXACT_SUMS)
+def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
+    """Return sums of z and z^2 over the frames that are ``counted`` (lanes,) 0 or 1: whole numbers, below 2^24."""
+    total, squares = f4(0), f4(0)
+    for t in range(np.uint64(LANES)):
+        r = counted[t] * rounded[t]
+        total += r
+        squares += r * r
+    return total, squares
+
+
+@numba.njit(**FAST)
+def add_linear_frames(  # type: ignore[no-untyped-def]
+    shape, linear, words, given, given_at, errors, counted, total, squares
+):
+    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear``: z less base, and its square, in steps, (n,).
+
+    ``words`` (n lanes,) int8: random bytes, in whose place ``given`` (g, lanes) normals stand where ``given_at`` (n,)
+    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps of half
+    path.
+    """
+    h, w = shape
+    side = linear.taps.size
+    half = side // 2
+    width = (w + 2 * half) * LANES
+    rows = np.zeros((side, width), np.float32)
+    blank, down, across = np.zeros(width, np.float32), np.empty(width, np.float32), np.empty(w * LANES, np.float32)
+    sums, rounded = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    for y in range(-half, h):
+        if y + half < h:
+            _noise_row(y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side])
+        if y < 0:
+            continue
+        _window_sums(rows, blank, y, h, linear.taps, w, down, across)
+        own = rows[y % side]
+        for x in range(w):
+            i = y * w + x
+            z, by_path = linear.z[i], linear.by_path[i]
+            if linear.kind[i] == EVEN:
+                start, mine = x * LANES, (x + half) * LANES
+                _round(z, by_path, errors, linear.each[i], across, start, linear.more[i], own, mine, rounded)
+            elif linear.kind[i] == UNEVEN:
+                sums[:] = f4(0)
+                for q in range(side * side):
+                    pull = linear.moved[linear.row[i], q]
+                    if pull != f4(0):
+                        source, first = rows[(y + q // side - half) % side], np.uint64((x + q % side) * LANES)
+                        for t in range(np.uint64(LANES)):
+                            sums[t] += pull * source[first + t]
+                _round(z, by_path, errors, f4(1), sums, 0, f4(0), sums, 0, rounded)
+            else:
+                continue
+            a, b = _sums_of(rounded, counted)
+            total[i] += a
+            squares[i] += b
+
+
+@numba.njit(**EXACT_SUMS)
+def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None:
+    """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the frames that count, as numbers of variance 1."""
+    scale = f4(1 / np.sqrt((256.0**2 - 1) / 12))
+    for i in range(total.size):
+        sum_of_all = f4(0)
+        for t in range(np.uint64(LANES)):
+            sum_of_all += counted[t] * (f4(words[np.uint64(i * LANES) + t]) + f4(0.5))
+        total[i] += scale * sum_of_all
+
+
+MOST_LISTED = 0.25  # share of pixels simulated one by one above which whole frames cost less
 LEAST_DITHER = 0.6
 """Noise of a sample over the converter's step from which rounding is noise of step^2/12: what the rounding's first
 harmonic leaves of it, exp(-2 pi^2 0.6^2), is below 1e-3."""
-JITTERS = 6.0
-"""Deviations of a frame's displacement that limits of range are kept clear of."""
+JITTERS = 6.0  # deviations of a frame's displacement that limits of range are kept clear of
 
 
 class Listed(NamedTuple):
-    """Pixels to simulate, by flat indices and by places in them.
-
-    ``halo`` (g,): pixels whose light is needed; ``range`` (m,): those that get a range; ``wanted`` (p,): places in
-    ``range`` of those whose verdict is wanted. ``window`` (m, k): places in ``halo`` of each range's window; ``near``
-    (p, 9): places in ``range`` of the neighbours of each wanted one; -1 for none.
-    """
+    """Pixels to simulate. ``halo`` (g,) flat indices: pixels whose light is needed; ``range`` (m,): those that get a
+    range; ``wanted`` (p,): places in ``range`` of those whose verdict is wanted. ``window`` (m, k): places in ``halo``
+    of each range's window; ``near`` (p, 9): places in ``range`` of the neighbours of each wanted one; -1 for none."""
 
     halo: np.ndarray
     range: np.ndarray
@@ -72,28 +205,14 @@ class Listed(NamedTuple):
     near: np.ndarray
 
 
-def list_pixels(wanted: np.ndarray, side: int, flying: bool) -> Listed:
-    """List the pixels ``wanted`` (h, w) bool and those that they need, for a filter window of ``side``; ``flying``:
-    whether the engine looks at the finished image's neighbours."""
-
-    def grown(mask: np.ndarray, by: int) -> np.ndarray:
-        return np.asarray(ndimage.binary_dilation(mask, np.ones((2 * by + 1,) * 2, bool)))
-
-    def places(mask: np.ndarray) -> np.ndarray:
-        """Number the pixels of a mask (h, w) row by row, int32; -1 elsewhere."""
-        return np.where(mask, np.cumsum(mask).reshape(mask.shape) - 1, -1).astype(np.int32)
-
-    ranges = grown(wanted, 1) if flying else wanted
-    halo = grown(ranges, side // 2)
-    in_range, in_halo = places(ranges), places(halo)
+def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
+    ranges = ndimage.binary_dilation(wanted, np.ones((3, 3), bool)) if flying else wanted
+    halo = ndimage.binary_dilation(ranges, np.ones((side, side), bool))
+    # numbers of the pixels row by row, -1 elsewhere
+    in_range, in_halo = (np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo))
     range_, wanted_ = np.flatnonzero(ranges), np.flatnonzero(wanted)
-    return Listed(
-        np.flatnonzero(halo),
-        range_,
-        in_range.ravel()[wanted_],
-        np.ascontiguousarray(windows_of(in_halo, side, -1)[range_]),
-        np.ascontiguousarray(windows_of(in_range, 3, -1)[wanted_]),
-    )
+    window, near = windows_of(in_halo, side, -1)[range_], windows_of(in_range, 3, -1)[wanted_]
+    return Listed(np.flatnonzero(halo), range_, in_range.ravel()[wanted_], window, near)
 
 
 def windows_of(image: np.ndarray, side: int, beyond: float) -> np.ndarray:
@@ -103,8 +222,8 @@ def windows_of(image: np.ndarray, side: int, beyond: float) -> np.ndarray:
 
 
 def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
-    """Return what sums frames of an exposure at the pixels ``asked`` (h, w) bool. None where frames are to be drawn one
-    by one: without noise, where a sample may saturate or may not, or where many pixels hang on a gate."""
+    """Return what sums frames at the pixels ``asked`` (h, w) bool; None where frames must be drawn: without noise that
+    hides the converter's steps, where a sample may saturate or not, or where many pixels hang on a gate."""
     largest = np.abs(exposure.means).max(axis=(0, 1))
     lost = largest - DEVIATIONS * exposure.sigma > exposure.limit
     wild = (largest + DEVIATIONS * exposure.sigma > exposure.limit) & ~lost
@@ -113,7 +232,9 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     # without noise that hides the converter's steps frames are not what the linear model says
     if wild.any() or not (exposure.sigma > LEAST_DITHER * step).all():
         return None
-    window, shape, n, unit = imager.linear_window, exposure.shape, exposure.sigma.size, imager.camera.unit
+    space, concentration, dim, *rules = imager.filter_settings
+    window = FilterSettings(space.astype(float), float(concentration), float(dim), *rules)
+    shape, n, unit = exposure.shape, exposure.sigma.size, imager.camera.unit
     light = light_of_samples(exposure, float(knee), imager.gains)
 
     # each pixel that is asked for after the filter, and how noise moves it
@@ -124,7 +245,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     edge = edge32.reshape(len(edge32), n).astype(float)
     even = even_pixels(edge, light, window, shape, wild | lost)
     filtered = unknown_filtered(len(light.turn), n)
-    of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, shares_of(window), filtered)
+    of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, filtered)
     # what the engine looks at in the finished image of the pixels asked for is one pixel farther
     rest = np.flatnonzero(~even & ndimage.binary_dilation(asked, np.ones((3, 3), bool)).ravel())
     moved = linearised(rest, light, window, shape, wild, lost, filtered)
@@ -140,17 +261,17 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     if window.by_amplitude:
         pull = metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
     linear = _linear(imager, light, window, certain, np.flatnonzero(even), of_even, rest, moved, pull)
-    listing = list_pixels(wanted.reshape(shape), window.space.shape[0], imager.engine.flying is not None)
+    listing = _listed(wanted.reshape(shape), space.shape[0], imager.engine.flying is not None)
     halo = Light(*(np.ascontiguousarray(part[:, listing.halo]) for part in light))
     each = (pull[:, listing.halo] * halo.turn).T
     shares = (each / np.sqrt((each**2).sum(axis=1, keepdims=True))).astype(f4)
-    return AtOnce(imager, exposure, halo, shares, linear, certain, listing, farthest_m)
+    return AtOnce(imager, shape, halo, shares, linear, certain, listing, farthest_m)
 
 
 def _linear(
     imager: AmcwImager,
     light: Light,
-    window: FilterWindow,
+    window: FilterSettings,
     certain: Certainty,
     even: np.ndarray,
     of_even: tuple[np.ndarray, np.ndarray],
@@ -158,8 +279,6 @@ def _linear(
     moved: np.ndarray,
     pull: np.ndarray,
 ) -> Linear:
-    """Return the pixels that always have a range, as `add_linear_frames` takes them: ``even`` (e,) with what
-    `fill_even` returned, and the ``rest`` (m,) with ``moved`` (f, m, k) of `linearised`."""
     n, step_m, side = light.turn.shape[1], imager.camera.z_step_m, window.space.shape[0]
     metres = imager.engine.lattice.metres_per_turn.astype(float)[:, None] / (2 * np.pi)
     by_path, always, (of_each, of_centre) = certain.z_by_path, certain.always, of_even
@@ -188,52 +307,65 @@ def _linear(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
 class AtOnce:
-    """Sums of frames of an exposure, from some 4 MB for 30,000 pixels; equal in distribution to those of single frames,
-    for a fraction of their cost.
+    """Sums of frames of an exposure, equal in distribution to those of single frames, for a fraction of their cost.
 
     ``light`` and ``shares`` (g, f) of the list's halo: before the filter, and each frequency's in the noise that moves
-    z. ``listed`` (h, w) bool: pixels that are simulated one by one. ``sure_pixels``: how many have a range in every
-    frame; over these, the medians ``noise_m``, of the deviation of a frame's z, before rounding and without what frames
-    share, and ``z_by_error``, by how much z moves with a frame's displacement; it may be ``farthest_error_m`` at most.
+    z. A frame may be displaced by ``farthest_error_m`` at most.
     """
 
-    def __init__(
-        self,
-        imager: AmcwImager,
-        exposure: AmcwExposure,
-        light: Light,
-        shares: np.ndarray,
-        linear: Linear,
-        certain: Certainty,
-        listing: Listed,
-        farthest_error_m: float,
-    ) -> None:
-        self.imager, self.exposure, self.light, self.shares, self.linear = imager, exposure, light, shares, linear
-        self.certain, self.list, self.farthest_error_m = certain, listing, farthest_error_m
-        always, n, engine = certain.always, exposure.sigma.size, imager.engine
-        self.sure_pixels = int(always.sum())
-        self.noise_m = float(np.median(certain.deviation_m[always])) if self.sure_pixels else 0.0
-        self.z_by_error = float(np.median(certain.z_by_path[always])) if self.sure_pixels else 1.0
-        self._asked = listing.range[listing.wanted]
-        self.listed = np.zeros(n, bool)
-        self.listed[self._asked] = True
-        self.listed = self.listed.reshape(exposure.shape)
-        self._given_at = np.full(n, -1, np.int32)
-        self._given_at[listing.halo] = np.arange(len(listing.halo))
-        # geometry, mask and saturation of the listed pixels, once for each lane
-        outside = np.repeat(engine.outside_mask[listing.range], LANES)
-        geometry = np.repeat(engine.geometry[:, listing.range], LANES, axis=1)
-        self._geometry = np.zeros(outside.size, np.uint8), geometry, outside
+    imager: AmcwImager
+    shape: tuple[int, int]
+    light: Light
+    shares: np.ndarray
+    linear: Linear
+    certain: Certainty
+    list: Listed
+    farthest_error_m: float
+
+    @property
+    def sure_pixels(self) -> int:
+        """Number of pixels that have a range in every frame."""
+        return int(self.certain.always.sum())
+
+    @cached_property
+    def noise_m(self) -> float:
+        """Median deviation of a frame's z over the sure pixels, before rounding and without what frames share."""
+        return float(np.median(self.certain.deviation_m[self.certain.always])) if self.sure_pixels else 0.0
+
+    @cached_property
+    def z_by_error(self) -> float:
+        """Movement of z by that of a frame: the median over the sure pixels."""
+        return float(np.median(self.certain.z_by_path[self.certain.always])) if self.sure_pixels else 1.0
+
+    @cached_property
+    def listed(self) -> np.ndarray:
+        """(h, w) bool: pixels that are simulated one by one."""
+        listed = np.zeros(self.shape, bool)
+        listed.flat[self._asked] = True
+        return listed
+
+    @cached_property
+    def _asked(self) -> np.ndarray:
+        return np.asarray(self.list.range[self.list.wanted])
+
+    @cached_property
+    def _engine(self) -> ranging.DepthEngine:
+        """The engine of the listed pixels, once for each lane."""
+        engine, at = self.imager.engine, self.list.range
+        geometry, outside = engine.geometry[:, at], engine.outside_mask[at]
+        return engine._replace(geometry=np.repeat(geometry, LANES, axis=1), outside_mask=np.repeat(outside, LANES))
 
     def totals(
         self, frames: np.ndarray, errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
     ) -> FrameTotals:
         """Sum the frames of numbers ``frames`` (t,), which ``errors_m`` (t,) displace. The noise of frames `LANES` k to
         `LANES` (k + 1) - 1 is from ``stream`` (k), whichever of them are asked for."""
-        n, p, shape = self.exposure.sigma.size, len(self._asked), self.exposure.shape
+        n, p, shape = self.linear.z.size, len(self._asked), self.shape
         step_m = self.imager.camera.z_step_m
-        total, squares, sway = np.zeros(n), np.zeros(n), np.zeros(n, f4)
+        total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
+        given_at[self.list.halo] = np.arange(len(self.list.halo))
         sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)
         for block in np.unique(frames // LANES):
             chosen = frames // LANES == block
@@ -243,9 +375,7 @@ class AtOnce:
             given = self._add_one_by_one(errors, counted, rng, sums)
             words = rng.bit_generator.random_raw(2 * n * LANES // 8).view(np.int8)
             steps = (errors / f4(step_m)).astype(f4)
-            add_linear_frames(
-                shape, self.linear, words[: n * LANES], given, self._given_at, steps, counted, total, squares
-            )
+            add_linear_frames(shape, self.linear, words[: n * LANES], given, given_at, steps, counted, total, squares)
             add_bytes(words[n * LANES :], counted, sway)
 
         certain, taps, noise = self.certain, self.linear.taps, sway.reshape(shape)
@@ -259,24 +389,16 @@ class AtOnce:
         reasons[certain.reason[never], never] = len(frames)
         reasons[Reason.VALID, certain.always] = len(frames)
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
-        base = self.linear.base.astype(float)
         return FrameTotals(
-            len(frames),
-            step_m,
-            base.reshape(shape),
-            count.reshape(shape),
-            total.reshape(shape),
-            squares.reshape(shape),
-            amplitude.reshape(shape),
-            reasons.reshape(-1, *shape),
-        )
+            len(frames), step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
+            total.reshape(shape), squares.reshape(shape), amplitude.reshape(shape), reasons.reshape(-1, *shape),
+        )  # fmt: skip
 
     def _add_one_by_one(
         self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
     ) -> np.ndarray:
-        """Add the listed pixels of a block to ``sums``; return (g, lanes) standard normals of the pixels in their
-        windows: the combination of their noise that moves z."""
-        light, engine, wanted = self.light, self.imager.engine, self.list.wanted
+        """Add the listed pixels of a block to ``sums``."""
+        light, flying_gate, wanted = self.light, self.imager.engine.flying, self.list.wanted
         g, m, n_frequencies = len(self.list.halo), len(self.list.range), len(light.turn)
         normals = standard_normals(rng, (g, n_frequencies, 2, LANES))
         if m == 0:
@@ -284,18 +406,14 @@ class AtOnce:
         planes = np.empty((g, n_frequencies, kernels.BLOCK), f4)
         kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
         filtered, edge = np.empty((n_frequencies, 3, m, LANES), f4), np.empty((n_frequencies, m, LANES), f4)
-        space, settings = self.imager.filter_settings
-        kernels.filter_listed(planes, self.list.window, space, settings, filtered, edge)
-        z_m, total, reason = np.empty((m, LANES), f4), np.empty((m, LANES), f4), np.empty((m, LANES), np.uint8)
-        saturated, geometry, outside = self._geometry
-        ranging.range_and_gates(
-            filtered.reshape(n_frequencies, 3, -1), edge.reshape(n_frequencies, -1), saturated, geometry, outside,
-            engine.lattice, engine.gates, np.tile(errors_m.astype(f4), m), z_m.reshape(-1), reason.reshape(-1),
-            total.reshape(-1),
-        )  # fmt: skip
+        kernels.filter_listed(planes, self.list.window, self.imager.filter_settings, filtered, edge)
+        flat, unsaturated = filtered.reshape(n_frequencies, 3, -1), np.zeros(m * LANES, np.uint8)
+        errors = np.tile(errors_m, m)
+        ranges = ranging.ranges_of(flat, edge.reshape(n_frequencies, -1), unsaturated, self._engine, errors)
+        z_m, reason, total = (plane.reshape(m, LANES) for plane in ranges)
         flying = np.zeros((len(wanted), LANES), bool)
-        if engine.flying is not None:
-            ranging.find_flying(z_m, total, reason, wanted, self.list.near, engine.flying, flying)
+        if flying_gate is not None:
+            ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
         base, step_m = self.linear.base[self._asked], f4(self.imager.camera.z_step_m)
         _add_listed(z_m, reason, total, flying, wanted, counted, 1.0 / n_frequencies, step_m, base, *sums)
         return np.asarray((self.shares[:, :, None] * normals[:, :, 1]).sum(axis=1))
@@ -305,18 +423,15 @@ class AtOnce:
 def _add_listed(  # type: ignore[no-untyped-def]
     z_m, reason, strength, flying, wanted, counted, share, step_m, base, count, total, squares, amplitude, reasons
 ):
-    """Add the frames that are ``counted`` (t,) of listed pixels to sums (p,), and to ``reasons`` (r, p).
-
-    ``z_m``, ``reason``, ``strength`` (amplitudes, times ``share``) (m, t), of which ``wanted`` (p,) count; ``flying``
-    (p, t): gated on the finished image. z is rounded to whole steps, less ``base`` (p,)."""
+    """Add the frames that are ``counted`` (t,) of listed pixels to sums (p,), and to ``reasons`` (r, p)."""
     for p in range(wanted.size):
         for t in range(counted.size):
-            if counted[t] == np.float32(0):
+            if counted[t] == f4(0):
                 continue
             code = np.uint8(ranging.EDGE) if flying[p, t] else reason[wanted[p], t]
             reasons[code, p] += 1
             if code == ranging.VALID:
-                steps = np.floor(z_m[wanted[p], t] / step_m + np.float32(0.5)) - base[p]
+                steps = np.floor(z_m[wanted[p], t] / step_m + f4(0.5)) - base[p]
                 count[p] += 1
                 total[p] += steps
                 squares[p] += steps * steps

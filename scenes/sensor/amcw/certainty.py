@@ -2,38 +2,35 @@
 
 Each gate's quantity has a mean and a deviation to first order in the noise (`scenes.sensor.amcw.linear`); a pixel is
 sure where the engine's table of gates (`ranging.first_failed`) says the same of the worst and of the best values within
-`DEVIATIONS`. Where the noise is too much for that, only bounds that hold at any noise count: of the edge sum, and of a
-dim pixel's amplitude.
+`DEVIATIONS`. Where the noise is too much for that, bounds that hold at any noise count. Where a window holds one even
+surface, nearly all of a view, noise takes the same share off the weight of each neighbour and gives it to the centre;
+it hangs on the phase noise only and is read from a table.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from scenes.sensor.amcw import ranging
-from scenes.sensor.amcw.linear import DEVIATIONS, Filtered
-from scenes.sensor.amcw.unwrap import Lattice
+from scenes.sensor.amcw.kernels import FilterSettings
+from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
 
 f4 = np.float32
 MOST_LEFT_OUT = 0.025
 """Share of the variance that is not of first order, above which a pixel is simulated frame by frame: up to it (phase
 noise of 0.13 rad on a face) the variance is right to 1 %, at half the noise to 0.2 %."""
-STEP_M = 1e-3
-"""Displacement of half a path by which that of z is found."""
+STEP_M = 1e-3  # displacement of half a path by which that of z is found
 MOST_TURNED, MOST_SPREAD = 1e3, 1e9
 """Stand-ins for an unknown deviation: of a phase in radians, of an amplitude in units."""
 
 
-@dataclass(frozen=True)
-class Certainty:
-    """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a range.
-
-    Without noise, (n,) float64: ``z_m`` without rounding and by how much a metre of half path moves it;
-    ``deviation_m`` of a frame's z; ``amplitude``, mean over frequencies, and its deviation; ``reason`` uint8.
-    """
+class Certainty(NamedTuple):
+    """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a range. Without noise, (n,)
+    float64: ``z_m`` without rounding and by how much a metre of half path moves it; ``deviation_m`` of a frame's z;
+    ``amplitude``, mean over frequencies, and its deviation; ``reason`` uint8."""
 
     always: np.ndarray
     never: np.ndarray
@@ -45,19 +42,8 @@ class Certainty:
     reason: np.ndarray
 
 
-@dataclass(frozen=True)
-class DepthEngine:
-    """Everything that decides after the filter, as `ranging.range_and_gates` takes it; ``flying`` None for no gate."""
-
-    geometry: np.ndarray
-    outside_mask: np.ndarray
-    lattice: Lattice
-    gates: ranging.Gates
-    flying: ranging.FlyingGate | None
-
-
 def certainty(
-    filtered: Filtered, engine: DepthEngine, lost: np.ndarray, shape: tuple[int, int], farthest_error_m: float
+    filtered: Filtered, engine: ranging.DepthEngine, lost: np.ndarray, shape: tuple[int, int], farthest_error_m: float
 ) -> Certainty:
     """Sort the pixels of a view of ``shape``; frames are displaced by ``farthest_error_m`` at most."""
     gates, lattice, amplitude = engine.gates, engine.lattice, filtered.amplitude
@@ -68,13 +54,11 @@ def certainty(
     # the engine on the mean phasors, and what half a path's change does to z
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1).astype(f4)
     edge = np.where(np.isfinite(filtered.edge), filtered.edge, filtered.edge_least).astype(f4)
-    z_m, reason = np.empty((3, n), f4), np.empty((3, n), np.uint8)
-    for row, error_m in enumerate((0.0, STEP_M, -STEP_M)):
-        ranging.range_and_gates(
-            planes, edge, lost.astype(np.uint8), engine.geometry, engine.outside_mask, lattice, gates,
-            np.full(n, error_m, f4), z_m[row], reason[row], np.empty(n, f4),
-        )  # fmt: skip
-    mean_m, up_m, down_m = z_m.astype(float)
+    (z_m, reason, _), up, down = (
+        ranging.ranges_of(planes, edge, lost.astype(np.uint8), engine, np.full(n, error_m))
+        for error_m in (0.0, STEP_M, -STEP_M)
+    )
+    mean_m, up_m, down_m = (each.astype(float) for each in (z_m, up[0], down[0]))
     by_path = (up_m - down_m) / (2 * STEP_M)
     weights = lattice.metres_per_turn.astype(float)[:, None]
     deviation_m = by_path * np.sqrt(((weights * turns) ** 2).sum(axis=0))
@@ -88,37 +72,30 @@ def certainty(
     ranging.half_path(turn, n, lattice, np.empty(n, f4), residual2)
     residual, unwraps = np.sqrt(residual2.astype(float)), margin & np.isfinite(residual2)
 
-    # each gate at the worst and at the best of what noise and displacements leave
-    low, high = amplitude - DEVIATIONS * spread, amplitude + DEVIATIONS * spread
-    total, both = amplitude.sum(axis=0), DEVIATIONS * np.sqrt((spread**2).sum(axis=0))
+    # each gate at the worst (-1) and at the best (+1) of what noise and displacements leave
+    both = DEVIATIONS * np.sqrt((spread**2).sum(axis=0))
     reach = DEVIATIONS * turns.max(axis=0)
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
     range_m = mean_m / engine.geometry[2]
     far_m = mean_m if gates.axial > 0 else range_m
-    worst = ranging.GateInputs(
-        edge=(filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0),
-        least=low.min(axis=0),
-        greatest=high.max(axis=0),
-        total=total - both,
-        residual2=(residual + reach) ** 2,
-        brightest=np.maximum(low.max(axis=0), 1e-9),
-        range_m=np.maximum(range_m - slack_m, 0.0),
-        low_m=far_m - slack_m,
-        high_m=far_m + slack_m,
-    )
-    best = ranging.GateInputs(
-        edge=np.full(n, -np.inf),
-        least=high.min(axis=0),
-        greatest=low.max(axis=0),
-        total=total + both,
-        residual2=np.maximum(residual - reach, 0.0) ** 2,
-        brightest=high.max(axis=0),
-        range_m=range_m + slack_m,
-        low_m=far_m + slack_m,
-        high_m=far_m - slack_m,
-    )
-    at_worst, at_best = (ranging.first_failed_each(gates, inputs) for inputs in (worst, best))
+    steepest = (filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0)
 
+    def first_failed(end: int) -> np.ndarray:
+        low, high = amplitude + end * DEVIATIONS * spread, amplitude - end * DEVIATIONS * spread
+        inputs = ranging.GateInputs(
+            edge=steepest if end < 0 else np.full(n, -np.inf),
+            least=low.min(axis=0),
+            greatest=high.max(axis=0),
+            total=amplitude.sum(axis=0) + end * both,
+            residual2=np.maximum(residual - end * reach, 0.0) ** 2,
+            brightest=np.maximum(low.max(axis=0), 1e-9),
+            range_m=np.maximum(range_m + end * slack_m, 0.0),
+            low_m=far_m + end * slack_m,
+            high_m=far_m - end * slack_m,
+        )
+        return np.asarray(ranging.first_failed_each(gates, inputs))
+
+    at_worst, at_best = first_failed(-1), first_failed(1)
     known = np.asarray((filtered.left_out <= MOST_LEFT_OUT).all(axis=0))
     # a dim pixel's mean over its window, brightest as it may be
     dim = np.isfinite(filtered.edge).all(axis=0) & (at_best == ranging.LOW_AMPLITUDE)
@@ -130,14 +107,11 @@ def certainty(
     if engine.flying is not None:
         always &= ~_may_fly(mean_m, deviation_m, engine.flying, known, unmeasured, shape)
     of_amplitude = np.sqrt((spread**2).sum(axis=0)) / f
-    return Certainty(always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason[0])
+    return Certainty(always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason)
 
 
 def _edge_fails(filtered: Filtered, limit: float) -> np.ndarray:
-    """Find pixels whose edge sum is above the limit in some frequency, always.
-
-    At any noise the frequencies' sums are independent, so their deviations from the limit add in squares.
-    """
+    """Find pixels whose edge sum is above the limit in some frequency, always."""
     if np.isinf(limit):
         return np.zeros(filtered.edge.shape[1], bool)
     spread = np.where(np.isfinite(filtered.edge), filtered.edge_spread, 0.0)
@@ -154,19 +128,109 @@ def _may_fly(
     unmeasured: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Find pixels (n,) that the gate on the finished image may mark in some frame.
-
-    It takes a neighbour that is nearer by ``near_m`` and another that is farther by ``far_m``. A neighbour that may
-    have any range counts as one of the two, two of them as both.
-    """
-    square = np.ones((3, 3), bool)
+    """Find pixels (n,) that the gate on the finished image may mark in some frame."""
     slack_m, z_m = np.nan_to_num(DEVIATIONS * deviation_m), np.nan_to_num(z_m)
-    wild = (~known & ~unmeasured).reshape(shape)
-    low = np.where(known & ~unmeasured, z_m - slack_m, np.inf).reshape(shape)
-    high = np.where(known & ~unmeasured, z_m + slack_m, -np.inf).reshape(shape)
-    nearest = ndimage.minimum_filter(low, footprint=square, mode="constant", cval=np.inf).ravel()
-    farthest = ndimage.maximum_filter(high, footprint=square, mode="constant", cval=-np.inf).ravel()
-    count = ndimage.convolve(wild.astype(int), square.astype(int), mode="constant").ravel()
+    measured = known & ~unmeasured
+    low, high = np.where(measured, z_m - slack_m, np.inf), np.where(measured, z_m + slack_m, -np.inf)
+    nearest = ndimage.minimum_filter(low.reshape(shape), 3, mode="constant", cval=np.inf).ravel()
+    farthest = ndimage.maximum_filter(high.reshape(shape), 3, mode="constant", cval=-np.inf).ravel()
+    wild = (~known & ~unmeasured).reshape(shape).astype(int)
+    count = ndimage.convolve(wild, np.ones((3, 3), int), mode="constant").ravel()
     before = z_m + slack_m - nearest > gate.near_m
     behind = farthest - z_m + slack_m > gate.far_m
     return np.asarray(before.astype(int) + behind + count >= 2)
+
+
+MOST_EDGE = 0.004
+"""Edge sum up to which a window is even: one neighbour 0.13 rad off (15 mm at 200 MHz) changes its weight by 3 %."""
+MOST_UNLIKE = 0.005  # difference of c s^2 within a window up to which its noise is even: that share of a weight
+MOST_NOISE = 0.15  # phase noise in radians up to which the table goes, beyond what `certainty` takes
+NOISES = np.linspace(0.0, MOST_NOISE, 33)
+
+
+def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Return a neighbour's share and the variance of higher order over the noise's, by phase noise `NOISES`."""
+    side = window.space.shape[0]
+    k, middle = side * side, side * side // 2
+    weights = window.space.ravel() / window.space.sum()
+    neighbours, rest = np.ones(len(NOISES)), np.zeros(len(NOISES))
+    bright = np.full((1, k), 1e3 * max(window.dim, 1.0))
+    none = np.zeros(k, bool)
+    for row, noise in enumerate(NOISES[1:], 1):
+        each = np.full((1, k), noise)
+        out = unknown_filtered(1, k)
+        light = Light(np.ones((1, k), complex), bright, bright, each, each / 1e3)
+        moved = linearised(np.array([middle]), light, window, (side, side), none, none, out)[0, 0] / noise
+        neighbours[row] = moved[0] / weights[0]
+        rest[row] = out.left_out[0, middle] * (out.turned[0, middle] / noise) ** 2
+    return neighbours, rest
+
+
+def even_pixels(
+    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], unsure: np.ndarray
+) -> np.ndarray:
+    """Find pixels (n,) bool before one even surface. ``edge`` (f, n): noise-free edge sum; ``unsure`` (n,) bool."""
+    size = window.space.shape[0]
+    half = size // 2
+    unlike = unsure | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
+    unlike |= (light.turn > MOST_NOISE).any(axis=0)
+    even = ~ndimage.binary_dilation(unlike.reshape(shape), np.ones((size, size), bool), border_value=1)
+    even[:half], even[-half:], even[:, :half], even[:, -half:] = False, False, False, False
+    for f, plane in enumerate(window.concentration * light.turn.reshape(-1, *shape) ** 2):
+        even &= ndimage.maximum_filter(plane, size) - ndimage.minimum_filter(plane, size) < MOST_UNLIKE
+        even &= edge[f].reshape(shape) < MOST_EDGE
+    return even.ravel()
+
+
+def fill_even(
+    even: np.ndarray,
+    filtered: np.ndarray,
+    edge: np.ndarray,
+    light: Light,
+    window: FilterSettings,
+    shape: tuple[int, int],
+    out: Filtered,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n) and ``edge`` (f, n).
+
+    Return (f, m) each: what one deviation of a neighbour's noise at weight 1 and amplitude 1 moves the phase by, over
+    that deviation, and what one of the centre's does in all.
+    """
+
+    def summed(values: np.ndarray, space: np.ndarray) -> np.ndarray:
+        """Values (f, n) summed over each window with weights ``space``, which are a product of rows and columns."""
+        middle = space.shape[0] // 2
+        planes, across = values.reshape(-1, *shape), space[middle] / np.sqrt(space[middle, middle])
+        for axis in (1, 2):
+            planes = ndimage.correlate1d(planes, across, axis=axis, mode="constant")
+        return np.asarray(planes.reshape(values.shape)[:, even])
+
+    own = light.turn[:, even]
+    carried = light.amplitude if window.by_amplitude else np.ones(light.amplitude.shape)
+    of_neighbours, of_rest = _shares_of(window)
+    weights = summed(carried, window.space)
+    share = np.interp(own, NOISES, of_neighbours)
+    squares = summed((carried * light.turn) ** 2, window.space**2)
+    spreads = summed((light.amplitude * light.swell) ** 2, window.space**2)
+    middle = window.space.ravel()[window.space.size // 2]
+    each = share / weights
+    mine = middle * carried[:, even] / weights
+    rest = np.interp(own, NOISES, of_rest) * own**2
+    centre = np.sqrt((1 - share * (1 - mine)) ** 2 * own**2 + rest)
+    variance = each**2 * (squares - (middle * carried[:, even] * own) ** 2) + centre**2
+    alone = filtered[:, 0, even] + 1j * filtered[:, 1, even]
+    # noise brings the mean nearer to the centre's own phase, as it does the shares
+    mean = light.phasor[:, even] * (1 - share) + alone * (share / np.abs(alone))
+    out.phasor[:, even] = mean / np.abs(mean)
+    # noise across a mean phasor makes it longer
+    out.amplitude[:, even] = filtered[:, 2, even] * (1 + 0.5 * variance if window.by_amplitude else 1.0)
+    out.turned[:, even] = np.sqrt(variance)
+    out.spread[:, even] = np.sqrt(spreads) / window.space.sum()
+    out.left_out[:, even] = rest / variance
+    kept = window.space.size - 1
+    out.edge[:, even] = edge[:, even] + 0.5 * kept * (1 - np.exp(-(own**2)))
+    quadratic = (kept * 6 / 16 + kept**2 / 8) * own**4
+    out.edge_spread[:, even] = np.sqrt(quadratic + (1 + kept) * edge[:, even] * own**2)
+    out.edge_least[:, even] = 0.0
+    out.edge_loose[:, even] = np.sqrt(kept / 8)
+    return each, centre

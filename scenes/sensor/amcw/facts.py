@@ -1,58 +1,117 @@
-"""The numbers of a continuous-wave imager, as its file holds them."""
+"""The numbers of a continuous-wave imager, as its file holds them, and the unwrapping that its frequencies allow."""
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import Annotated, Literal
+from functools import cached_property, lru_cache
+from itertools import product
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.units import MM
+from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics, PixelFootprint
-from scenes.sensor.amcw.unwrap import unwrap_table
-from scenes.sensor.facts import (
-    CameraFacts,
-    Fact,
-    HalfAngle,
-    LengthPx,
-    NonNegative,
-    Positive,
-    PositiveInt,
-    Share,
-    above_zero,
-    checked,
-    share,
-)
+from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, PositiveInt, checked
 
-PositiveEach = Annotated[Fact[tuple[float, ...]], above_zero]
+
+class UnwrapTable(NamedTuple):
+    """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path, as compiled code takes them.
+
+    ``lattice`` (f,) float32: integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal
+    to m; they sum the wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f
+    - 1,) int32 of the keys, ``wraps`` (f, keys) float32, -1 where no distance has them. ``metres_per_turn`` (f,)
+    float32. ``unambiguous_m``: R = c / 2 f_0.
+    """
+
+    lattice: np.ndarray
+    combination: np.ndarray
+    sizes: np.ndarray
+    offset: np.ndarray
+    wraps: np.ndarray
+    metres_per_turn: np.ndarray
+    unambiguous_m: float
+
+
+@lru_cache(maxsize=64)
+def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
+    """Return the table for one to three frequencies. Raises UserError where they have no common base."""
+    lattice, base_hz = _integer_ratios(frequencies_hz)
+    combination = _orthogonal_rows(lattice)
+    counts = _wrap_counts(lattice)
+    keys = counts @ combination.T
+    offset = -keys.min(axis=0)
+    sizes = keys.max(axis=0) + offset + 1
+    # a single frequency has no keys: then the table's one entry is the count 0
+    strides = np.array([np.prod(sizes[row + 1 :], dtype=int) for row in range(sizes.size)], int)
+    table = np.full((np.prod(sizes, dtype=int), lattice.size), -1, np.float32)
+    table[(keys + offset) @ strides] = counts
+    unambiguous_m = SPEED_OF_LIGHT_AIR / (2 * base_hz)
+    weights = lattice / (lattice**2).sum() if fusion == "least_squares" else np.full(lattice.size, 1 / lattice.sum())
+    return UnwrapTable(
+        lattice.astype(np.float32),
+        combination.astype(np.float32),
+        sizes.astype(np.int32),
+        offset.astype(np.int32),
+        np.ascontiguousarray(table.T),
+        (unambiguous_m * weights).astype(np.float32),
+        unambiguous_m,
+    )
+
+
+def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, float]:
+    """Return smallest integers m and base frequency with f = m * base, to 1e-6."""
+    frequencies = np.array(frequencies_hz)
+    lowest = frequencies.min()
+    for divisor in range(1, 65):
+        multiples = frequencies / (lowest / divisor)
+        if np.abs(multiples - np.round(multiples)).max() < 1e-6 * divisor:
+            return np.round(multiples).astype(np.int64), float(lowest / divisor)
+    raise UserError(
+        f"modulation frequencies {[f / 1e6 for f in frequencies_hz]} MHz share no base frequency",
+        legal="frequencies that are integer multiples (the lowest at most 64 times) of a common one",
+    )
+
+
+def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
+    """Return (n, f) wrap counts that occur within the unambiguous range."""
+    distance = (np.arange(0, 1, 1 / (64 * int(lattice.max()))) + 1e-9)[:, None] * lattice
+    errors = sorted(
+        product((-noise_turns, 0.0, noise_turns), repeat=lattice.size), key=lambda e: -sum(abs(x) for x in e)
+    )
+    wraps = np.concatenate([np.floor(distance + np.array(error)) for error in errors]).astype(np.int64)
+    return wraps[(wraps >= 0).all(axis=1) & (wraps < lattice).all(axis=1)]
+
+
+def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
+    """Return (f - 1, f): the shortest independent integer rows t with t . m = 0 that tell all wrap counts apart."""
+    if lattice.size < 3:
+        return np.array([[-lattice[1], lattice[0]]]) if lattice.size == 2 else np.empty((0, 1), np.int64)
+    rows = [np.array(t) for t in product(range(-reach, reach + 1), repeat=3) if any(t) and np.dot(t, lattice) == 0]
+    rows.sort(key=lambda t: (int((t**2).sum()), tuple(-t)))
+    # A pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product would confuse wraps.
+    for second in rows[1:]:
+        if (np.cross(rows[0], second) ** 2).sum() == (lattice**2).sum():
+            return np.stack([rows[0], second])
+    raise UserError(f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns")
+
+
+SHARE = checked("from 0 to 1", lambda value: 0 <= value <= 1)
+PositiveEach = Annotated[Fact[tuple[float, ...]], checked("above 0", lambda value: value > 0)]
 Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
-ShareEach = Annotated[Fact[tuple[float, ...]], share]
+ShareEach = Annotated[Fact[tuple[float, ...]], SHARE]
 Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
 Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
 WIDEST_PX = 2128
 """Longest row, the filter's window included: `kernels.STRIDE`, written again so that declarations compile nothing."""
 
 
-def _turns_one_way(corners: np.ndarray) -> bool:
-    """Tell whether corners (n, 2) go round a convex area counter-clockwise in axes x right, y down as the file has
-    them."""
-    if len(corners) < 3:
-        return False
-    sides = np.roll(corners, -1, axis=0) - corners
-    after = np.roll(sides, -1, axis=0)
-    return bool((sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0] > 0).all())
-
-
 class EmitterFacts(Config):
     """The light source: a point beside the lens, uniform intensity in a cone with a linear roll-off.
-
-    ``irradiance_w_m2``: its light on a surface that faces it on the axis at 1 m, averaged over an exposure; only
-    ambient light is measured by it. ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a
-    convex polygon outside which the camera gives no range; None where there is none.
-    """
+    ``irradiance_w_m2``: on a surface that faces it on the axis at 1 m; only ambient light is measured by it.
+    ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a convex polygon outside which the
+    camera gives no range."""
 
     position_mm: Fact[tuple[float, float, float]]
     full_half_angle_deg: HalfAngle
@@ -64,19 +123,21 @@ class EmitterFacts(Config):
     def _rolls_off_outwards(self) -> EmitterFacts:
         if self.cutoff_half_angle_deg.value <= self.full_half_angle_deg.value:
             raise ValueError("cutoff_half_angle_deg must be above full_half_angle_deg")
-        if self.mask_slopes is not None and not _turns_one_way(np.array(self.mask_slopes.value)):
-            raise ValueError(
-                "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
-            )
+        if self.mask_slopes is not None:
+            # corners of a convex area turn one way, counter-clockwise in axes x right, y down as the file has them
+            corners = np.array(self.mask_slopes.value)
+            sides = np.roll(corners, -1, axis=0) - corners
+            after = np.roll(sides, -1, axis=0)
+            if len(corners) < 3 or not (sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0] > 0).all():
+                what = "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
+                raise ValueError(what)
         return self
 
 
 class ModulationFacts(Config):
-    """Continuous-wave modulation: one value per frequency but for ``phases``.
-
-    ``contrast``: amplitude of the fundamental by the light's mean. ``wiggling_residual``: what is left, after limited
-    bandwidth and factory calibration, of the harmonics that square light under square demodulation would show.
-    """
+    """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: amplitude of the
+    fundamental by the light's mean. ``wiggling_residual``: what factory calibration and bandwidth leave of square
+    light's harmonics."""
 
     frequencies_hz: PositiveEach
     phases: Phases
@@ -86,13 +147,11 @@ class ModulationFacts(Config):
     @model_validator(mode="after")
     def _one_value_each(self) -> ModulationFacts:
         count = len(self.frequencies_hz.value)
-        if not 1 <= count <= 3:
-            raise ValueError(f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3")
+        if not 1 <= count <= 3 or len(set(self.frequencies_hz.value)) != count:
+            raise ValueError(f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3, all different")
         for key in ("contrast", "wiggling_residual"):
             if len(getattr(self, key).value) != count:
                 raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
-        if len(set(self.frequencies_hz.value)) != count:
-            raise ValueError("frequencies_hz names a frequency twice")
         try:
             unwrap_table(self.frequencies_hz.value, "least_squares")
         except UserError as mistake:
@@ -101,11 +160,8 @@ class ModulationFacts(Config):
 
 
 class PhotonFacts(Config):
-    """The photon budget: one gain, calibrated at one point; the rest is physics.
-
-    ``signal_electrons``: of both wells in one exposure, albedo 1, facing, on the axis at 1 m. ``full_well_electrons``
-    of one well (None: only the converter saturates). ``band_nm``: width of the band-pass filter before the sensor.
-    """
+    """The photon budget: one gain, calibrated at one point. ``signal_electrons``: of both wells in one exposure, albedo
+    1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates)."""
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive
@@ -118,10 +174,7 @@ class PhotonFacts(Config):
 
 
 class ConverterFacts(Config):
-    """Companding converter of a sample's size: unit steps below twice the knee, doubling with each octave above.
-
-    A knee of half the full scale or more makes a linear converter.
-    """
+    """Companding converter: unit steps below twice the knee, doubling per octave above."""
 
     knee_units: PositiveInt
     full_scale_units: PositiveInt
@@ -136,8 +189,8 @@ class FixedPatternFacts(Config):
 
 
 class ResidualByAmplitudeFacts(Config):
-    """Lattice residual that dim pixels may have: ``scale_turns`` A^``slope`` of the amplitude A of the brightest
-    frequency, at most ``greatest_turns`` and at least the engine's ``lattice_residual_turns``."""
+    """Lattice residual that dim pixels may have: ``scale_turns`` A^``slope`` of the brightest frequency's amplitude A,
+    at most ``greatest_turns`` and at least the engine's ``lattice_residual_turns``."""
 
     scale_turns: Positive
     slope: Fact[float]
@@ -162,8 +215,8 @@ class EngineFacts(Config):
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
-    ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: whether the limits of
-    range are meant along the ray or along the optical axis.
+    ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: of the limits of
+    range.
     """
 
     window_px: Window
@@ -177,7 +230,7 @@ class EngineFacts(Config):
     edge_threshold: Positive | None = None
     lattice_residual_turns: Positive | None = None
     residual_by_amplitude: ResidualByAmplitudeFacts | None = None
-    amplitude_ratio: Share | None = None
+    amplitude_ratio: Annotated[Fact[float], SHARE] | None = None
     min_amplitude_units: NonNegative
     min_amplitude_sum_units: NonNegative
     min_reflectivity_units_mm2: NonNegative | None = None

@@ -1,8 +1,6 @@
 """Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter.
 
-Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32. Numba,
-because on one core it does a frame of 30,000 pixels in a few milliseconds; tests/benchmarks/bench_sensor.py compares it
-with Dr.Jit and NumPy.
+Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32.
 """
 
 from __future__ import annotations
@@ -14,8 +12,11 @@ import numpy as np
 
 from scenes.sensor.normals import FAST, bits_float, float_bits
 
-OUTSIDE = np.float32(-1)
-"""Amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped."""
+f4 = np.float32
+ZERO, HALF, ONE = f4(0), f4(0.5), f4(1)
+C2, C3, C4, C5 = HALF, f4(1 / 6), f4(1 / 24), f4(1 / 120)
+SMALLEST = f4(1e-30)
+OUTSIDE = f4(-1)  # amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped
 
 STRIDE = 2128
 """Longest padded row of an image; not a power of two, whose multiples share the cache's lines (a factor of 4 in time
@@ -23,8 +24,7 @@ where memory lands badly)."""
 LANES = 32
 """Frames of a listed pixel that are drawn together, whether they all count or not: a loop of 32 becomes vector code,
 a shorter one, of 16, a list of single steps, five times as slow."""
-BLOCK = 3 * LANES
-"""Numbers of one listed pixel and frequency: re, im and amplitude of all frames."""
+BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
 
 
 @numba.njit(**FAST)
@@ -34,28 +34,21 @@ def expose(  # type: ignore[no-untyped-def]
     """Convert samples to unit phasors and amplitudes.
 
     ``means`` (f, k, n) noise-free samples, ``sigma`` (n,) their deviation and ``limit`` (n,) the largest that fits, in
-    converter units; ``normals`` (f, k, n) standard normals; ``gains`` (f,) of the amplitudes; ``cosines`` and ``sines``
-    (k,) of the phases. Writes ``unit`` (2, f, n), ``amplitude`` (f, n) and ``saturated`` (n,).
-    Each sample is the difference of two wells: Poisson shot noise of both and two read noises, as a normal (beyond
-    20 electrons a difference of Poissons is one to 1e-3 in distribution), cut off at the limit, then companded. A pixel
-    with a saturated sample has no phasor, so that the filter takes nothing from it.
+    converter units; ``normals`` (f, k, n); ``gains`` (f,); ``cosines`` and ``sines`` (k,) of the phases. Writes
+    ``unit`` (2, f, n), ``amplitude`` (f, n) and ``saturated`` (n,). The difference of two wells, with Poisson shot
+    noise and read noise of both, is taken as a normal, cut off at the limit, then companded. A pixel with a saturated
+    sample has no phasor.
     """
     n_frequencies, n_phases, n = means.shape
-    per_knee = np.float32(1) / knee
+    per_knee = ONE / knee
     saturated[:] = 0
     for f in range(n_frequencies):
-        re = unit[0, f]
-        im = unit[1, f]
-        amp = amplitude[f]
+        re, im, amp = unit[0, f], unit[1, f], amplitude[f]
         scale = gains[f] * np.float32(2.0) / np.float32(n_phases)
-        for i in range(n):
-            re[i] = np.float32(0)
-            im[i] = np.float32(0)
+        re[:] = ZERO
+        im[:] = ZERO
         for k in range(n_phases):
-            c = cosines[k]
-            s = sines[k]
-            mean = means[f, k]
-            normal = normals[f, k]
+            c, s, mean, normal = cosines[k], sines[k], means[f, k], normals[f, k]
             for i in range(n):
                 sample = mean[i] + sigma[i] * normal[i]
                 size = abs(sample)
@@ -63,29 +56,27 @@ def expose(  # type: ignore[no-untyped-def]
                 size = min(size, limit[i])
                 # the step is the power of two at or below size / knee, and 1 below the knee: the bits without mantissa
                 word: Any = float_bits(size * per_knee)  # type: ignore[call-arg]
-                step = max(bits_float(word & np.uint32(0x7F800000)), np.float32(1))
-                code = step * np.floor(size / step + np.float32(0.5))
-                sample = code if sample >= np.float32(0) else -code
+                step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
+                code = step * np.floor(size / step + HALF)
+                sample = code if sample >= ZERO else -code
                 re[i] += c * sample
                 im[i] += s * sample
         for i in range(n):
             a = np.sqrt(re[i] * re[i] + im[i] * im[i])
-            inverse = np.float32(1) / a if a > np.float32(0) else np.float32(0)
+            inverse = ONE / a if a > ZERO else ZERO
             re[i] *= inverse
             im[i] *= inverse
             amp[i] = scale * a
     for i in range(n):
         if saturated[i]:
-            unit[:, :, i] = np.float32(0)
+            unit[:, :, i] = ZERO
             amplitude[:, i] = OUTSIDE
 
 
 @numba.njit(**FAST)
-def noisy_phasors(  # type: ignore[no-untyped-def]
-    phasor, amplitude, turn, swell, normals, planes
-):
-    """Write phasors of pixels (f, g) with noise across and along each from ``normals`` (g, f, 2, lanes) into ``planes``
-    (g, f, 3 lanes): re and im of length 1, and amplitude."""
+def noisy_phasors(phasor, amplitude, turn, swell, normals, planes):  # type: ignore[no-untyped-def]
+    """Write phasors of pixels (f, g) with noise from ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re
+    and im of length 1, and amplitude."""
     g, n_frequencies, _, _ = normals.shape
     p1, p2 = np.uint64(LANES), np.uint64(2 * LANES)
     for j in range(g):
@@ -99,28 +90,22 @@ def noisy_phasors(  # type: ignore[no-untyped-def]
                 along = size + beside * normals[j, f, 0, t]
                 across = over * normals[j, f, 1, t]
                 length = np.sqrt(along * along + across * across)
-                inverse = np.float32(1) / max(length, np.float32(1e-30))
+                inverse = ONE / max(length, SMALLEST)
                 out[t] = (c * along - s * across) * inverse
                 out[p1 + t] = (s * along + c * across) * inverse
                 out[p2 + t] = length
 
 
 def _filter_of(stride: int) -> Any:
-    """Compile the filter of one window for ``stride`` values side by side: pixels of a row, or frames of a pixel.
-
-    The stride is a compile-time constant: the compiler turns a loop into vector code only where it can see that the few
-    arrays in it do not overlap, which it does for planes a constant apart.
-    """
+    """Compile the filter of one window for ``stride`` values side by side: pixels of a row, or frames of a pixel."""
 
     @numba.njit(**FAST)
-    def filter_window(planes, centre, starts, space, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
+    def filter_window(planes, centre, starts, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
         """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart; ``centre`` and
-        ``starts`` (k,): where the values and their neighbours begin, -1 for none; ``space`` (k,): weights by distance;
-        ``total``: room for 7 planes. Writes ``filtered`` (3, length) and ``edge`` (length,).
-
-        Indices are unsigned: a signed one might count from the end, and the compiler would gather element by element.
-        """
-        concentration, dim, drop_dim, by_amplitude = settings
+        ``starts`` (k,): where the values and their neighbours begin, -1 for none; ``total``: room for 7 planes. Writes
+        ``filtered`` (3, length) and ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
+        weights, concentration, dim, drop_dim, by_amplitude = settings
+        space = weights.ravel()
         p1, p2, p3, p4 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride), np.uint64(4 * stride)
         p5, p6 = np.uint64(5 * stride), np.uint64(6 * stride)
         middle = np.uint64(centre)
@@ -128,13 +113,9 @@ def _filter_of(stride: int) -> Any:
         # a neighbour that counts
         for x in range(np.uint64(length)):
             bright = planes[middle + p2 + x] > dim
-            total[x] = np.float32(0)
-            total[p1 + x] = np.float32(0)
-            total[p2 + x] = np.float32(0)
-            total[p3 + x] = np.float32(0)
-            total[p4 + x] = np.float32(0)
-            total[p5 + x] = concentration / np.float32(16) if bright else np.float32(0)
-            total[p6 + x] = dim if bright and drop_dim else np.float32(0)
+            total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = ZERO, ZERO, ZERO, ZERO, ZERO
+            total[p5 + x] = concentration / f4(16) if bright else ZERO
+            total[p6 + x] = dim if bright and drop_dim else ZERO
         for q in range(starts.size):
             if starts[q] < 0:
                 continue
@@ -144,28 +125,24 @@ def _filter_of(stride: int) -> Any:
                 r = planes[neighbour + x]
                 i = planes[neighbour + p1 + x]
                 amplitude = planes[neighbour + p2 + x]
-                gap = np.float32(1) - (planes[middle + x] * r + planes[middle + p1 + x] * i)
+                gap = ONE - (planes[middle + x] * r + planes[middle + p1 + x] * i)
                 # exp(16 t) as the sixteenth power of five terms of the series: for -0.46 <= t <= 0 the relative error
                 # is below 2e-4 at the smallest value (7e-4), and below 1e-6 where the value exceeds 0.1
                 t = -total[p5 + x] * gap
-                e = np.float32(1 / 24) + t * np.float32(1 / 120)
-                e = np.float32(1 / 6) + t * e
-                e = np.float32(0.5) + t * e
-                e = np.float32(1) + t * e
-                e = np.float32(1) + t * e
+                e = ONE + t * (ONE + t * (C2 + t * (C3 + t * (C4 + t * C5))))
                 e = e * e
                 e = e * e
                 e = e * e
                 e = e * e
                 kept = amplitude >= total[p6 + x]
-                e = weight * e if kept else np.float32(0)
+                e = weight * e if kept else ZERO
                 a = e * amplitude
                 v = a if by_amplitude else e
                 total[x] += v * r
                 total[p1 + x] += v * i
                 total[p2 + x] += a
                 total[p3 + x] += e
-                total[p4 + x] += gap if kept else np.float32(0)
+                total[p4 + x] += gap if kept else ZERO
         for x in range(np.uint64(length)):
             a = total[x]
             b = total[p1 + x]
@@ -173,8 +150,8 @@ def _filter_of(stride: int) -> Any:
             filtered[0, x] = a
             filtered[1, x] = b
             # nothing is kept where the whole window is saturated
-            filtered[2, x] = size / max(total[p3 + x], np.float32(1e-30))
-            edge[x] = np.float32(0.5) * total[p4 + x]
+            filtered[2, x] = size / max(total[p3 + x], SMALLEST)
+            edge[x] = HALF * total[p4 + x]
 
     return filter_window
 
@@ -183,32 +160,29 @@ _filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
 
 
 class FilterSettings(NamedTuple):
-    """Settings of the joint bilateral filter; a centre not brighter than ``dim`` takes all by distance alone, before a
-    brighter one neighbours below ``dim`` are dropped where ``drop_dim``. Phasors count by their amplitude as well where
-    ``by_amplitude``, and the filtered amplitude is then the length of their mean; else unit phasors are averaged, and
-    their amplitudes beside them."""
+    """Settings of the joint bilateral filter, float32 in its kernels: ``space`` (k, k), weights by distance. A centre
+    not brighter than ``dim`` takes all by distance alone, before a brighter one neighbours below ``dim`` are dropped
+    where ``drop_dim``. Phasors count by their amplitude as well where ``by_amplitude``; else unit phasors are
+    averaged."""
 
-    concentration: np.float32
-    dim: np.float32
+    space: np.ndarray
+    concentration: Any
+    dim: Any
     drop_dim: bool
     by_amplitude: bool
 
 
 @numba.njit(**FAST)
-def filter_image(  # type: ignore[no-untyped-def]
-    unit, amplitude, space, settings, filtered, edge
-):
-    """Filter the phasors of one frequency by a joint bilateral filter.
-
-    ``unit`` (2, h, w), ``amplitude`` (h, w), ``space`` (2 k + 1, 2 k + 1) weights by distance. Weight of a neighbour:
-    space exp(-concentration (1 - cos dphi)). Writes ``filtered`` (3, h, w): phasor (re, im; any length) and amplitude,
-    and ``edge`` (h, w): the sum over kept neighbours of (1 - cos dphi)/2. The window is clipped at the border.
-    """
+def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-untyped-def]
+    """Filter the phasors of one frequency, ``unit`` (2, h, w) and ``amplitude`` (h, w), by a joint bilateral filter
+    with weights space exp(-concentration (1 - cos dphi)); the window is clipped at the border. Writes ``filtered`` (3,
+    h, w): phasor (re, im; any length) and amplitude, and ``edge`` (h, w): the sum over kept neighbours of (1 - cos
+    dphi)/2."""
     h, w = amplitude.shape
-    side = space.shape[0]
+    side = settings.space.shape[0]
     half = side // 2
     rows = np.zeros(3 * side * STRIDE, np.float32)
-    weights, starts = space.ravel(), np.empty(side * side, np.int64)
+    starts = np.empty(side * side, np.int64)
     for dy in range(side):
         rows[(3 * dy + 2) * STRIDE : (3 * dy + 3) * STRIDE] = OUTSIDE
         for dx in range(side):
@@ -227,23 +201,21 @@ def filter_image(  # type: ignore[no-untyped-def]
             else:
                 rows[amp : amp + w] = OUTSIDE
         centre = 3 * half * STRIDE + half
-        _filter_row(rows, centre, starts, weights, w, settings, total, filtered[:, y], edge[y])
+        _filter_row(rows, centre, starts, w, settings, total, filtered[:, y], edge[y])
 
 
 @numba.njit(**FAST)
-def filter_listed(  # type: ignore[no-untyped-def]
-    planes, window, space, settings, filtered, edge
-):
+def filter_listed(planes, window, settings, filtered, edge):  # type: ignore[no-untyped-def]
     """Filter listed pixels as `filter_image` does: ``planes`` (g, f, 3 lanes) of `noisy_phasors`, ``window`` (m, k)
     places among them, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and ``edge`` (f, m, lanes)."""
     n_frequencies, _, m, _ = filtered.shape
     flat = planes.reshape(planes.size)
     k = window.shape[1]
-    weights, starts = space.ravel(), np.empty(k, np.int64)
+    starts = np.empty(k, np.int64)
     total = np.empty(7 * LANES, np.float32)
     for p in range(m):
         for f in range(n_frequencies):
             for q in range(k):
                 starts[q] = (window[p, q] * n_frequencies + f) * BLOCK if window[p, q] >= 0 else -1
             centre = starts[k // 2]
-            _filter_frames(flat, centre, starts, weights, LANES, settings, total, filtered[f, :, p], edge[f, p])
+            _filter_frames(flat, centre, starts, LANES, settings, total, filtered[f, :, p], edge[f, p])

@@ -11,28 +11,29 @@ Terms of second and third order are left out and estimated; a pixel where they c
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 from scipy import special
 
-from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.normals import FAST
+
+if TYPE_CHECKING:
+    from scenes.sensor.amcw.imager import AmcwExposure
 
 DEVIATIONS = 5.5
 """Distance from a limit, in deviations, at which it is never met: 2e-8 a frame, and few pixels are just so far off."""
-NOISY = 0.35
-"""Phase noise in radians above which a pixel's phase is no longer a normal about its mean."""
-LITTLE = 0.004
-"""c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work."""
+NOISY = 0.35  # phase noise in radians above which a pixel's phase is no longer a normal about its mean
+LITTLE = 0.004  # c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work
 SMALLEST = 1e-12
 
 
 class Light(NamedTuple):
     """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise and
-    ``bright``, its mean with it, times the gains; ``turn``: deviation of the phase in radians; ``swell``: that of the
-    amplitude, over the amplitude."""
+    ``bright``, its mean with it; ``turn``: deviation of the phase in radians; ``swell``: that of the amplitude, over
+    it."""
 
     phasor: np.ndarray
     amplitude: np.ndarray
@@ -41,11 +42,48 @@ class Light(NamedTuple):
     swell: np.ndarray
 
 
-def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
-    """Return the light of an exposure, ``gains`` (f,) those of the amplitudes.
+class Near(NamedTuple):
+    """A pixel's window, (k,) each: ``at``: flat indices; ``between``: exp(i t) of their phases less its own;
+    ``weight`` in the filter, without noise; ``slopes`` and ``bends``: room for derivatives. ``kept`` and ``others``:
+    places of the neighbours that count, with the centre and without it; ``c``: the concentration that holds here."""
 
-    Each sample has its own variance: the exposure's, and step^2/12 of the converter's rounding.
-    """
+    space: np.ndarray
+    at: np.ndarray
+    between: np.ndarray
+    weight: np.ndarray
+    slopes: np.ndarray
+    bends: np.ndarray
+    kept: np.ndarray
+    others: np.ndarray
+    c: float
+
+
+class Filtered(NamedTuple):
+    """Each pixel after the filter, (f, n) float64: mean ``phasor`` (complex, length 1) and ``amplitude``; ``turned``
+    and ``spread``: deviations of the phase in radians and of the amplitude. ``left_out``: share of the phase's variance
+    that is not of first order; infinite where neighbours are too noisy, or may or may not count. ``edge``,
+    ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, infinite where unknown.
+    ``edge_least``: what the mean is at least, and ``edge_loose``, a bound of its deviation then: right at any noise."""
+
+    phasor: np.ndarray
+    amplitude: np.ndarray
+    turned: np.ndarray
+    spread: np.ndarray
+    left_out: np.ndarray
+    edge: np.ndarray
+    edge_spread: np.ndarray
+    edge_least: np.ndarray
+    edge_loose: np.ndarray
+
+
+def unknown_filtered(frequencies: int, n: int) -> Filtered:
+    """Return n pixels of which nothing is known."""
+    start = (1.0 + 0.0j, 0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
+    return Filtered(*(np.full((frequencies, n), value) for value in start))
+
+
+def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
+    """Return the light of an exposure: each sample has its own variance and step^2/12 of the converter's rounding."""
     frequencies, phases, n = exposure.means.shape
     angle = 2 * np.pi * np.arange(phases) / phases
     phasor = np.empty((frequencies, n), complex)
@@ -75,8 +113,7 @@ def _moments(means, sigma, knee, cosines, sines, phasor, size, across, along):  
             if length > SMALLEST:
                 re /= length
                 im /= length
-            else:
-                # no light has no direction: any will do
+            else:  # no light has no direction: any will do
                 re, im, length = 1.0, 0.0, SMALLEST
             over, beside = 0.0, 0.0
             for k in range(phases):
@@ -93,145 +130,18 @@ def _moments(means, sigma, knee, cosines, sines, phasor, size, across, along):  
             along[f, i] = np.sqrt(beside)
 
 
-class FilterWindow(NamedTuple):
-    """The filter, as `kernels.filter_image` has it; ``flat`` (k,): its ``space``, row by row."""
-
-    space: np.ndarray
-    flat: np.ndarray
-    concentration: float
-    dim: float
-    drop_dim: bool
-    by_amplitude: bool
-
-
-class Near(NamedTuple):
-    """Room for a pixel's window, (k,): ``at``: flat indices of the neighbours that count, -1 of others; ``between``:
-    exp(i t) of their phases less its own; ``weight`` in the filter, without noise."""
-
-    at: np.ndarray
-    between: np.ndarray
-    weight: np.ndarray
-
-
-class Filtered(NamedTuple):
-    """Each pixel after the filter, (f, n) float64.
-
-    ``phasor`` (complex, length 1) and ``amplitude`` in the mean, ``turned`` and ``spread``: deviations of the phase in
-    radians and of the amplitude. ``left_out``: share of the phase's variance that is not of first order; infinite where
-    neighbours are too noisy, or may or may not count. ``edge``, ``edge_spread``: mean and deviation of the sum over
-    neighbours of (1 - cos)/2, infinite where unknown. ``edge_least``: what the mean is at least, whatever the centre's
-    noise does, and ``edge_loose``, a bound of its deviation then: right at any noise.
-    """
-
-    phasor: np.ndarray
-    amplitude: np.ndarray
-    turned: np.ndarray
-    spread: np.ndarray
-    left_out: np.ndarray
-    edge: np.ndarray
-    edge_spread: np.ndarray
-    edge_least: np.ndarray
-    edge_loose: np.ndarray
-
-
-def unknown_filtered(frequencies: int, n: int) -> Filtered:
-    """Return n pixels of which nothing is known."""
-    start = (1.0, 0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
-    kinds = (complex,) + (float,) * 8
-    return Filtered(*(np.full((frequencies, n), value, kind) for value, kind in zip(start, kinds, strict=True)))
-
-
-@numba.njit(**FAST)
-def _edge_of(i, light, near, out):  # type: ignore[no-untyped-def]
-    """Write the edge sum's mean, deviation and bounds; return whether a pixel of the window is too noisy for the
-    former."""
-    own = light.turn[i]
-    noisy = own > NOISY
-    kept = 0
-    mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
-    longest, loose = 0.0j, 0.0
-    for q in range(near.at.size):
-        j = near.at[q]
-        if j < 0 or j == i:
-            continue
-        kept += 1
-        turn = light.turn[j]
-        noisy = noisy or turn > NOISY
-        between = near.between[q]
-        shrunk = 1.0 - 0.5 * (turn * turn + own * own)
-        mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
-        sines += 0.5 * between.imag
-        cosines += 0.25 * between.real
-        variance += (0.5 * between.imag * turn) ** 2
-        variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
-        # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
-        longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
-        # of any phase (1 - cos)/2 scatters no wider than that of an even one, 1/8; of a known one by half its noise
-        loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
-    out.edge[i] = mean
-    out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
-    # the centre's own noise turns it at most as far as that, and where it is large anywhere
-    away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-    out.edge_least[i] = 0.5 * (kept - abs(longest) * np.cos(away))
-    out.edge_loose[i] = np.sqrt(loose)
-    return noisy
-
-
-@numba.njit(**FAST)
-def _amplitude_of(i, light, by_amplitude, c, near, out):  # type: ignore[no-untyped-def]
-    """Write the filtered amplitude and its deviation, and the filtered phasor where noise leaves the phases alone."""
-    total = 0.0j
-    weights, amplitudes, spread = 0.0, 0.0, 0.0
-    for q in range(near.at.size):
-        j = near.at[q]
-        if j < 0:
-            continue
-        between = near.between[q]
-        variance = 0.0 if j == i else light.turn[j] ** 2 + light.turn[i] ** 2
-        curved = (c * between.imag) ** 2 - c * between.real
-        weight = near.weight[q]
-        mean = weight * (1.0 + 0.5 * min(variance, 0.25) * curved)
-        weights += mean
-        amplitudes += mean * light.bright[j]
-        # noise across makes a phasor longer by what it takes of its mean
-        total += mean * light.amplitude[j] * between
-        spread += (mean * light.amplitude[j] * light.swell[j]) ** 2
-    weights = max(weights, SMALLEST)
-    out.amplitude[i] = (abs(total) if by_amplitude else amplitudes) / weights
-    out.phasor[i] = total * light.phasor[i] / max(abs(total), SMALLEST)
-    # noise of phases changes weights, and how phasors add up: its variance, times the weights' sum squared
-    along = total.conjugate() / max(abs(total), SMALLEST)
-    common = 0.0
-    for q in range(near.at.size):
-        j = near.at[q]
-        if j < 0 or j == i:
-            continue
-        between = near.between[q]
-        weight = near.weight[q]
-        change = -c * between.imag * weight * (light.bright[j] - out.amplitude[i])
-        if by_amplitude:
-            value = weight * light.amplitude[j] * between * complex(-c * between.imag, 1.0)
-            change = (along * value).real + c * between.imag * weight * out.amplitude[i]
-        spread += (change * min(light.turn[j], 0.5)) ** 2
-        common += change
-    out.spread[i] = np.sqrt(spread + (common * min(light.turn[i], 0.5)) ** 2) / weights
-
-
 def linearised(
     pixels: np.ndarray,
     light: Light,
-    window: FilterWindow,
+    window: FilterSettings,
     shape: tuple[int, int],
     wild: np.ndarray,
     lost: np.ndarray,
     out: Filtered,
 ) -> np.ndarray:
     """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``; return (f, m, k): by how many radians one deviation
-    of each neighbour's noise moves a pixel's phase.
-
-    ``wild`` and ``lost`` (n,) bool: pixels whose samples may saturate, and those where they always do. A neighbour's
-    phase and amplitude are independent, so what both do is put together in squares.
-    """
+    of each neighbour's noise moves a pixel's phase. ``window``: the filter, in float64. ``wild`` and ``lost`` (n,)
+    bool: pixels whose samples may saturate, and those where they always do."""
     moved = np.zeros((len(light.turn), len(pixels), window.space.size))
     for f, plane in enumerate(moved):
         ours, theirs = Light(*(part[f] for part in light)), Filtered(*(part[f] for part in out))
@@ -239,32 +149,32 @@ def linearised(
     return moved
 
 
-@numba.njit(inline="always", **FAST)
-def _turned(c, between, v):  # type: ignore[no-untyped-def]
-    """Return F, F' and F'' at an angle whose exp(i t) is ``between``, in the mean over a normal of the angle of
-    variance v: the first two to v^2."""
-    cosine = c * between.real
-    sine = c * between.imag
-    value = np.exp(cosine - c) * between
-    # of ln F: g, and its derivatives -cosine, sine, cosine, -sine
-    g = complex(-sine, 1.0)
-    g2 = g * g
-    second = g2 - cosine
-    third = g * (g2 - 3.0 * cosine) + sine
-    if c * v < LITTLE:
-        return value * (1.0 + 0.5 * v * second), value * (g + 0.5 * v * third), value * second
-    fourth = g2 * (g2 - 6.0 * cosine) + 4.0 * g * sine + 3.0 * cosine * cosine + cosine
-    fifth = g * (g2 * (g2 - 10.0 * cosine) + 15.0 * cosine * cosine + 5.0 * cosine)
-    fifth += 10.0 * sine * (g2 - cosine) - sine
-    mean = value * (1.0 + 0.5 * v * (second + 0.25 * v * fourth))
-    first = value * (g + 0.5 * v * (third + 0.25 * v * fifth))
-    return mean, first, value * (second + 0.5 * v * fourth)
+@numba.njit(**FAST)
+def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: ignore[no-untyped-def]
+    """`linearised` for one frequency: all without their first axis."""
+    k, space, none = window.space.size, window.space.ravel(), np.empty(0, np.int64)
+    at, weight, between = np.empty(k, np.int64), np.empty(k), np.empty(k, np.complex128)
+    room = Near(space, at, between, weight, np.empty_like(between), np.empty_like(between), none, none, 0.0)
+    for row in range(pixels.size):
+        i = pixels[row]
+        near, sure, rule_known = _look_around(i, light, window, shape, wild, lost, room)
+        noisy = _edge_of(i, light, near, out)
+        _amplitude_of(i, light, window.by_amplitude, near, out)
+        out.turned[i] = np.inf
+        out.left_out[i] = np.inf
+        if sure and rule_known and not (noisy or lost[i]):
+            _moves_of(i, light, window.by_amplitude, near, out, moved[row])
+            _rest_of(i, light, window.by_amplitude, near, out, moved[row])
+        if lost[i] or noisy or not sure:
+            out.edge[i] = np.inf
+            out.edge_spread[i] = np.inf
+        if not sure:
+            out.edge_least[i] = 0.0
 
 
 @numba.njit(**FAST)
 def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-untyped-def]
-    """Fill ``near``; return whether it is sure which neighbours count, whether it is sure if the centre is bright, and
-    the concentration that then holds."""
+    """Return the window, whether it is sure which neighbours count, and whether it is sure if the centre is bright."""
     h, w = shape
     side = window.space.shape[0]
     half = side // 2
@@ -291,43 +201,99 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
         between = light.phasor[j] * light.phasor[i].conjugate()
         near.at[q] = j
         near.between[q] = between
-        near.weight[q] = window.flat[q] * (np.exp(c * (between.real - 1.0)) if j != i else 1.0)
-    return sure, rule_known, c
+        near.weight[q] = near.space[q] * (np.exp(c * (between.real - 1.0)) if j != i else 1.0)
+    kept, others = np.flatnonzero(near.at >= 0), np.flatnonzero((near.at >= 0) & (near.at != i))
+    room = near.space, near.at, near.between, near.weight, near.slopes, near.bends
+    return Near(*room, kept, others, c), sure, rule_known
 
 
 @numba.njit(**FAST)
-def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: ignore[no-untyped-def]
-    """`linearised` for one frequency: all without their first axis."""
-    k = window.flat.size
-    near = Near(np.empty(k, np.int64), np.empty(k, np.complex128), np.empty(k))
-    slopes, bends = np.empty(k, np.complex128), np.empty(k, np.complex128)
-    for row in range(pixels.size):
-        i = pixels[row]
-        sure, rule_known, c = _look_around(i, light, window, shape, wild, lost, near)
-        noisy = _edge_of(i, light, near, out)
-        _amplitude_of(i, light, window.by_amplitude, c, near, out)
-        known = sure and rule_known and not (noisy or lost[i])
-        out.turned[i] = np.inf
-        out.left_out[i] = np.inf
-        if known:
-            _moves_of(i, light, window, c, near, slopes, bends, out, moved[row])
-            _rest_of(i, light, window.by_amplitude, c, near, slopes, out, moved[row])
-        if lost[i] or noisy or not sure:
-            out.edge[i] = np.inf
-            out.edge_spread[i] = np.inf
-        if not sure:
-            out.edge_least[i] = 0.0
-
-
-@numba.njit(**FAST)
-def _moves_of(i, light, window, c, near, slopes, bends, out, moved):  # type: ignore[no-untyped-def]
-    """Write the mean phasor, and into ``moved`` (k,) how far each neighbour's phase moves its.
-
-    The centre's noise is in all differences, so the mean is taken over it last, by Gauss and Hermite's three nodes, of
-    little noise by two.
-    """
+def _edge_of(i, light, near, out):  # type: ignore[no-untyped-def]
+    """Write the edge sum's mean, deviation and bounds; return whether the window is too noisy for the former."""
     own = light.turn[i]
-    little = c * own * own < LITTLE
+    noisy = own > NOISY
+    mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
+    longest, loose = 0.0j, 0.0
+    for q in near.others:
+        turn, between = light.turn[near.at[q]], near.between[q]
+        noisy = noisy or turn > NOISY
+        shrunk = 1.0 - 0.5 * (turn * turn + own * own)
+        mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
+        sines += 0.5 * between.imag
+        cosines += 0.25 * between.real
+        variance += (0.5 * between.imag * turn) ** 2
+        variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
+        # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
+        longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
+        # of any phase (1 - cos)/2 scatters no wider than that of an even one, 1/8; of a known one by half its noise
+        loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
+    out.edge[i] = mean
+    out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
+    # the centre's own noise turns it at most as far as that, and where it is large anywhere
+    away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
+    out.edge_least[i] = 0.5 * (near.others.size - abs(longest) * np.cos(away))
+    out.edge_loose[i] = np.sqrt(loose)
+    return noisy
+
+
+@numba.njit(**FAST)
+def _amplitude_of(i, light, by_amplitude, near, out):  # type: ignore[no-untyped-def]
+    """Write the filtered amplitude and its deviation, and the filtered phasor where noise leaves the phases alone."""
+    total, c = 0.0j, near.c
+    weights, amplitudes, spread = 0.0, 0.0, 0.0
+    for q in near.kept:
+        j, between = near.at[q], near.between[q]
+        variance = 0.0 if j == i else light.turn[j] ** 2 + light.turn[i] ** 2
+        curved = (c * between.imag) ** 2 - c * between.real
+        mean = near.weight[q] * (1.0 + 0.5 * min(variance, 0.25) * curved)
+        weights += mean
+        amplitudes += mean * light.bright[j]
+        # noise across makes a phasor longer by what it takes of its mean
+        total += mean * light.amplitude[j] * between
+        spread += (mean * light.amplitude[j] * light.swell[j]) ** 2
+    weights = max(weights, SMALLEST)
+    out.amplitude[i] = (abs(total) if by_amplitude else amplitudes) / weights
+    out.phasor[i] = total * light.phasor[i] / max(abs(total), SMALLEST)
+    # noise of phases changes weights, and how phasors add up: its variance, times the weights' sum squared
+    along = total.conjugate() / max(abs(total), SMALLEST)
+    common = 0.0
+    for q in near.others:
+        j, between, weight = near.at[q], near.between[q], near.weight[q]
+        change = -c * between.imag * weight * (light.bright[j] - out.amplitude[i])
+        if by_amplitude:
+            value = weight * light.amplitude[j] * between * complex(-c * between.imag, 1.0)
+            change = (along * value).real + c * between.imag * weight * out.amplitude[i]
+        spread += (change * min(light.turn[j], 0.5)) ** 2
+        common += change
+    out.spread[i] = np.sqrt(spread + (common * min(light.turn[i], 0.5)) ** 2) / weights
+
+
+@numba.njit(inline="always", **FAST)
+def _turned(c, between, v):  # type: ignore[no-untyped-def]
+    """Return F, F' and F'' at an angle whose exp(i t) is ``between``."""
+    cosine = c * between.real
+    sine = c * between.imag
+    value = np.exp(cosine - c) * between
+    # of ln F: g, and its derivatives -cosine, sine, cosine, -sine
+    g = complex(-sine, 1.0)
+    g2 = g * g
+    second = g2 - cosine
+    third = g * (g2 - 3.0 * cosine) + sine
+    if c * v < LITTLE:
+        return value * (1.0 + 0.5 * v * second), value * (g + 0.5 * v * third), value * second
+    fourth = g2 * (g2 - 6.0 * cosine) + 4.0 * g * sine + 3.0 * cosine * cosine + cosine
+    fifth = g * (g2 * (g2 - 10.0 * cosine) + 15.0 * cosine * cosine + 5.0 * cosine)
+    fifth += 10.0 * sine * (g2 - cosine) - sine
+    mean = value * (1.0 + 0.5 * v * (second + 0.25 * v * fourth))
+    first = value * (g + 0.5 * v * (third + 0.25 * v * fifth))
+    return mean, first, value * (second + 0.5 * v * fourth)
+
+
+@numba.njit(**FAST)
+def _moves_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyped-def]
+    """Write the mean phasor, and into ``moved`` (k,) how far each neighbour's phase moves its."""
+    own = light.turn[i]
+    little = near.c * own * own < LITTLE
     far = own if little else np.sqrt(3.0) * own
     phasor = 0.0j
     for node in range(2 if little else 3):
@@ -335,59 +301,46 @@ def _moves_of(i, light, window, c, near, slopes, bends, out, moved):  # type: ig
         share = 0.5 if little else (2.0 / 3.0 if node == 2 else 1.0 / 6.0)
         turn = complex(np.cos(away), np.sin(away))
         total = 0.0j
-        for q in range(near.at.size):
-            j = near.at[q]
-            if j < 0:
-                continue
-            size = window.flat[q]
-            if window.by_amplitude:
+        for q in near.kept:
+            j, size = near.at[q], near.space[q]
+            if by_amplitude:
                 # a phasor with noise across is longer: a cos t keeps its mean only with that
                 size *= light.amplitude[j] * (1.0 + 0.5 * light.turn[j] ** 2)
             if j == i:
                 total += size
                 continue
-            value, first, second = _turned(c, near.between[q] * turn.conjugate(), light.turn[j] ** 2)
+            value, first, second = _turned(near.c, near.between[q] * turn.conjugate(), light.turn[j] ** 2)
             total += size * value
-            slopes[q] = size * first
-            bends[q] = size * second
+            near.slopes[q] = size * first
+            near.bends[q] = size * second
         inverse = _inverse(total)
         squares = 0.0j
-        for q in range(near.at.size):
-            j = near.at[q]
-            if j >= 0 and j != i:
-                step = slopes[q] * inverse * light.turn[j]
-                squares += step * step
-        for q in range(near.at.size):
-            j = near.at[q]
-            if j < 0 or j == i:
-                continue
+        for q in near.others:
+            step = near.slopes[q] * inverse * light.turn[near.at[q]]
+            squares += step * step
+        for q in near.others:
             # E[d arg S], S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
-            slope = slopes[q] * inverse
-            slope *= 1.0 + squares - bends[q] * inverse * light.turn[j] ** 2
-            moved[q] += share * slope.imag * light.turn[j]
+            own_turn = light.turn[near.at[q]]
+            slope = near.slopes[q] * inverse
+            slope *= 1.0 + squares - near.bends[q] * inverse * own_turn**2
+            moved[q] += share * slope.imag * own_turn
         # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
         phasor += share * total * abs(inverse) * turn * complex(1.0, -0.5 * squares.imag)
     out.phasor[i] = phasor * light.phasor[i] / max(abs(phasor), SMALLEST)
 
 
 @numba.njit(**FAST)
-def _rest_of(i, light, by_amplitude, c, near, values, out, moved):  # type: ignore[no-untyped-def]
-    """Write the phase's deviation, and the share of its variance that is not of first order in phases; puts what the
-    centre and amplitudes do into ``moved``. ``values`` (k,) is room."""
-    own2 = light.turn[i] * light.turn[i]
+def _rest_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyped-def]
+    """Write the phase's deviation, and the share of its variance that is not of first order in phases."""
+    own2, c, values = light.turn[i] * light.turn[i], near.c, near.slopes
     total = 0.0j
-    for q in range(near.at.size):
-        j = near.at[q]
-        if j >= 0:
-            values[q] = near.weight[q] * (light.amplitude[j] if by_amplitude else 1.0) * near.between[q]
-            total += values[q]
+    for q in near.kept:
+        values[q] = near.weight[q] * (light.amplitude[near.at[q]] if by_amplitude else 1.0) * near.between[q]
+        total += values[q]
     inverse = _inverse(total)
     common, bends, rest, variance = 0.0, 0.0, 0.0, 0.0
-    for q in range(near.at.size):
-        j = near.at[q]
-        if j < 0 or j == i:
-            continue
-        value = values[q] * inverse
+    for q in near.others:
+        j, value = near.at[q], values[q] * inverse
         turn2 = light.turn[j] * light.turn[j]
         cosine, g = c * near.between[q].real, complex(-c * near.between[q].imag, 1.0)
         bend = (value * (g * g - cosine)).imag

@@ -1,8 +1,5 @@
-"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round.
-
-Compiled loops for one core, float32, in blocks of pixels that stay in the nearest cache, a few arrays a loop so that
-most are vector code.
-"""
+"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops, float32, in
+blocks."""
 
 from __future__ import annotations
 
@@ -12,30 +9,31 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from harness.vocabulary.capture import Reason
-from scenes.sensor.amcw.unwrap import Lattice
+from harness.vocabulary.geometry import Reason
+from scenes.sensor.amcw.facts import UnwrapTable
 from scenes.sensor.normals import FAST
 
-TWO_PI = np.float32(2.0 * math.pi)
+f4 = np.float32
+HALF, ONE, TWO, FOUR, INFINITE, NAN = (f4(x) for x in (0.5, 1, 2, 4, np.inf, np.nan))
+PI, HALF_PI, TWO_PI = f4(math.pi), f4(0.5 * math.pi), f4(2.0 * math.pi)
+ATAN = tuple(map(f4, (-0.0040540580, 0.0218612288, -0.0559098861, 0.0964200441)))
+ATAN += tuple(map(f4, (-0.1390853351, 0.1994653599, -0.3332985605, 0.9999993329)))
+"""Minimax odd polynomial of the arctangent on 0..1, highest power first (Remez, |error| < 1.2e-7 rad)."""
 BLOCK = 1024
-
-VALID, SATURATED, LOW_AMPLITUDE, AMPLITUDE_RATIO, UNWRAP, EDGE, OUT_OF_RANGE, OUTSIDE_MASK, LOW_REFLECTIVITY = (
-    int(reason)
-    for reason in (
-        Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.AMPLITUDE_RATIO, Reason.UNWRAP, Reason.EDGE,
-        Reason.OUT_OF_RANGE, Reason.OUTSIDE_MASK, Reason.LOW_REFLECTIVITY,
-    )
-)  # fmt: skip
+VALID, SATURATED, LOW_AMPLITUDE, AMPLITUDE_RATIO = map(
+    np.int32, (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.AMPLITUDE_RATIO)
+)
+UNWRAP, EDGE, OUT_OF_RANGE, OUTSIDE_MASK, LOW_REFLECTIVITY = map(
+    np.int32, (Reason.UNWRAP, Reason.EDGE, Reason.OUT_OF_RANGE, Reason.OUTSIDE_MASK, Reason.LOW_REFLECTIVITY)
+)
 
 
 class Gates(NamedTuple):
-    """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0.
-
-    ``edge``: sum of (1 - cos dphi)/2. Residual limit in turns: ``residual``, or ``residual_scale`` A^``residual_slope``
-    of the brightest frequency's amplitude A within ``residual`` and ``residual_most``. ``ratio``: (greatest - least) /
-    greatest amplitude. ``least`` amplitude and ``total`` of amplitudes in units, ``reflectivity`` in units m^2.
-    ``nearest_m`` and ``farthest_m``, along the optical axis where ``axial`` is 1, along the ray where it is 0.
-    """
+    """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``: sum of (1 - cos
+    dphi)/2. Residual limit in turns: ``residual``, or ``residual_scale`` A^``residual_slope`` of the brightest
+    frequency's amplitude A within ``residual`` and ``residual_most``. ``ratio``: (greatest - least) / greatest
+    amplitude. ``least`` amplitude and ``total`` in units, ``reflectivity`` in units m^2. Limits of range: along the
+    optical axis where ``axial`` is 1, else along the ray."""
 
     edge: np.float32
     residual: np.float32
@@ -61,29 +59,33 @@ class FlyingGate(NamedTuple):
     most_m: np.float32
 
 
+class DepthEngine(NamedTuple):
+    """Everything that decides after the filter. ``geometry`` (3, n) of each pixel's unit ray u and the emitter at e:
+    u.e, e.e, u_z; ``outside_mask`` (n,) bool: pixels that the emitter's polygon leaves out."""
+
+    geometry: np.ndarray
+    outside_mask: np.ndarray
+    lattice: UnwrapTable
+    gates: Gates
+    flying: FlyingGate | None
+
+
 @numba.njit(inline="always", **FAST)
 def turns(re: np.float32, im: np.float32) -> np.float32:
     """Return the phase of (re, im) in turns, 0 <= t < 1; polynomial arctangent, error below 2e-7 turns."""
     ax = abs(re)
     ay = abs(im)
     big = max(ax, ay)
-    q = min(ax, ay) / big if big > np.float32(0) else np.float32(0)
+    q = min(ax, ay) / big if big > f4(0) else f4(0)
     s = q * q
-    # minimax odd polynomial of atan on 0..1, degree 15 (Remez, |error| < 1.2e-7 rad)
-    p = np.float32(-0.0040540580)
-    p = p * s + np.float32(0.0218612288)
-    p = p * s + np.float32(-0.0559098861)
-    p = p * s + np.float32(0.0964200441)
-    p = p * s + np.float32(-0.1390853351)
-    p = p * s + np.float32(0.1994653599)
-    p = p * s + np.float32(-0.3332985605)
-    p = p * s + np.float32(0.9999993329)
+    p = ((ATAN[0] * s + ATAN[1]) * s + ATAN[2]) * s + ATAN[3]
+    p = (((p * s + ATAN[4]) * s + ATAN[5]) * s + ATAN[6]) * s + ATAN[7]
     a = p * q
-    a = np.float32(0.5 * math.pi) - a if ay > ax else a
-    a = np.float32(math.pi) - a if re < np.float32(0) else a
+    a = HALF_PI - a if ay > ax else a
+    a = PI - a if re < f4(0) else a
     t = a / TWO_PI
-    t = np.float32(1) - t if im < np.float32(0) else t
-    return t - np.float32(1) if t >= np.float32(1) else t
+    t = ONE - t if im < f4(0) else t
+    return t - ONE if t >= ONE else t
 
 
 @numba.njit(**FAST)
@@ -99,29 +101,29 @@ def _add_scaled(scale: np.float32, plane: np.ndarray, total: np.ndarray) -> None
 
 
 @numba.njit(**FAST)
-def half_path(turn: np.ndarray, n: int, lattice: Lattice, half: np.ndarray, residual2: np.ndarray) -> None:
-    """Convert wrapped phases (f, >= n) in turns to half the light's path (n,) in metres, with the squared lattice
-    residual (n,) in turns^2, infinite where no wrap counts fit. Unwraps the first n columns of ``turn`` in place."""
+def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray) -> None:
+    """Convert wrapped phases (f, >= n) in turns, unwrapped in place, to half the light's path (n,) in metres, with the
+    squared lattice residual (n,) in turns^2, infinite where no wrap counts fit."""
     n_frequencies = turn.shape[0]
     key = np.zeros(n, np.int32)
     sums = np.empty(n, np.float32)
     for row in range(n_frequencies - 1):
-        sums[:] = np.float32(0)
+        sums[:] = f4(0)
         for f in range(n_frequencies):
             _add_scaled(lattice.combination[row, f], turn[f, :n], sums)
         # one more whole number of the key of each pixel, -1 where it names no entry of the table
         size, offset = lattice.sizes[row], lattice.offset[row]
         for i in range(np.uint64(n)):
-            digit = offset - np.int32(np.floor(sums[i] + np.float32(0.5)))
+            digit = offset - np.int32(np.floor(sums[i] + HALF))
             outside = (digit < np.int32(0)) | (digit >= size) | (key[i] < np.int32(0))
             key[i] = np.int32(-1) if outside else key[i] * size + digit
-    half[:] = np.float32(0)
+    half[:] = f4(0)
     common = np.zeros(n, np.float32)
     norm = (lattice.lattice * lattice.lattice).sum()
     first_wraps = lattice.wraps[0]
     for i in range(n):
-        unknown = key[i] < 0 or first_wraps[key[i]] < np.float32(0)
-        residual2[i] = np.float32(np.inf) if unknown else np.float32(0)
+        unknown = key[i] < 0 or first_wraps[key[i]] < f4(0)
+        residual2[i] = INFINITE if unknown else f4(0)
         key[i] = np.int32(0) if unknown else key[i]
     for f in range(n_frequencies):
         wraps, ours = lattice.wraps[f], turn[f, :n]
@@ -137,13 +139,10 @@ def half_path(turn: np.ndarray, n: int, lattice: Lattice, half: np.ndarray, resi
 
 
 class GateInputs(NamedTuple):
-    """Quantities of a pixel that the gates look at: the steepest ``edge`` sum; ``least``, ``greatest`` and ``total``
-    amplitude; the squared lattice residual, infinite where no wrap counts fit, and the ``brightest`` amplitude, on
-    which its limit hangs; range, and what is limited, along the ray or the axis.
-
-    A frame has each quantity once. Where noise leaves an interval, each gate is given the end that is worse for it (or
-    better), hence ``greatest`` beside ``brightest`` and ``low`` beside ``high``.
-    """
+    """Quantities of a pixel that the gates look at: amplitudes; the squared lattice residual, infinite where no wrap
+    counts fit; range, and what is limited, along the ray or the axis. Where noise leaves an interval, each gate is
+    given the end that is worse for it (or better), hence ``greatest`` beside ``brightest`` and ``low`` beside
+    ``high``."""
 
     edge: Any
     least: Any
@@ -160,19 +159,17 @@ class GateInputs(NamedTuple):
 def first_failed(gates, at):  # type: ignore[no-untyped-def]
     """Return the code of the first gate that a pixel fails, VALID where it passes all: the engine's table of gates."""
     limit = gates.residual
-    if gates.residual_slope != np.float32(0):
+    if gates.residual_slope != f4(0):
         by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(at.brightest))
         limit = min(gates.residual_most, max(limit, np.float32(by_amplitude)))
     # The first gate that fails names the reason, so gates are tried from the last to the first.
-    code = np.int32(VALID)
-    code = np.int32(LOW_REFLECTIVITY) if at.total * at.range_m * at.range_m < gates.reflectivity else code
-    code = code if (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m) else np.int32(OUT_OF_RANGE)
+    code = LOW_REFLECTIVITY if at.total * at.range_m * at.range_m < gates.reflectivity else VALID
+    code = code if (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m) else OUT_OF_RANGE
     # an infinite residual says that no wrap counts fit: no gate may let it through
-    fits = (at.residual2 < np.float32(np.inf)) & (at.residual2 <= limit * limit)
-    code = code if fits else np.int32(UNWRAP)
-    code = np.int32(AMPLITUDE_RATIO) if at.greatest - at.least > gates.ratio * at.greatest else code
-    code = np.int32(EDGE) if at.edge >= gates.edge else code
-    return np.int32(LOW_AMPLITUDE) if (at.least < gates.least) | (at.total < gates.total) else code
+    code = code if (at.residual2 < INFINITE) & (at.residual2 <= limit * limit) else UNWRAP
+    code = AMPLITUDE_RATIO if at.greatest - at.least > gates.ratio * at.greatest else code
+    code = EDGE if at.edge >= gates.edge else code
+    return LOW_AMPLITUDE if (at.least < gates.least) | (at.total < gates.total) else code
 
 
 @numba.njit(**FAST)
@@ -188,17 +185,23 @@ def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
     return codes
 
 
+def ranges_of(
+    filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, engine: DepthEngine, errors_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres, of invalid pixels too, the first gate
+    that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m`` (n,) is added to half the path."""
+    n = len(errors_m)
+    z_m, reason, total = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
+    parts = engine.geometry, engine.outside_mask, engine.lattice, engine.gates
+    _range_and_gates(filtered, edge, saturated, *parts, errors_m.astype(f4), z_m, reason, total)
+    return z_m, reason, total
+
+
 @numba.njit(**FAST)
-def range_and_gates(  # type: ignore[no-untyped-def]
+def _range_and_gates(  # type: ignore[no-untyped-def]
     filtered, edge, saturated, geometry, outside_mask, lattice, gates, errors_m, z_m, reason, total
 ):
-    """Convert filtered phasors (f, 3, n) to z in metres, with the first gate that each pixel fails and the sum of
-    amplitudes.
-
-    Half the path s of light from the emitter at e by the point at range r along the unit ray u is
-    (r + |r u - e|)/2, so r = (4 s^2 - e.e) / (4 s - 2 u.e). ``geometry`` (3, n) is u.e, e.e, u_z. ``errors_m`` (n,) is
-    added to half the path. z is written for invalid pixels too.
-    """
+    """Run `ranges_of`: r = (4 s^2 - e.e) / (4 s - 2 u.e) of half the path s by the emitter at e, along u."""
     n_frequencies, _, n = filtered.shape
     turn = np.empty((n_frequencies, BLOCK), np.float32)
     half = np.empty(BLOCK, np.float32)
@@ -210,9 +213,7 @@ def range_and_gates(  # type: ignore[no-untyped-def]
         half_path(turn, length, lattice, half[:length], residual2[:length])
         for i in range(start, start + length):
             least = filtered[0, 2, i]
-            greatest = least
-            sum_of_all = least
-            steepest = edge[0, i]
+            greatest, sum_of_all, steepest = least, least, edge[0, i]
             for f in range(1, n_frequencies):
                 a = filtered[f, 2, i]
                 least = min(least, a)
@@ -220,32 +221,25 @@ def range_and_gates(  # type: ignore[no-untyped-def]
                 sum_of_all += a
                 steepest = max(steepest, edge[f, i])
             path = half[i - start] + errors_m[i]
-            range_m = (np.float32(4) * path * path - geometry[1, i]) / (
-                np.float32(4) * path - np.float32(2) * geometry[0, i]
-            )
+            range_m = (FOUR * path * path - geometry[1, i]) / (FOUR * path - TWO * geometry[0, i])
             z = range_m * geometry[2, i]
-            limited = z if gates.axial > np.float32(0) else range_m
+            limited = z if gates.axial > f4(0) else range_m
             at = GateInputs(
                 steepest, least, greatest, sum_of_all, residual2[i - start], greatest, range_m, limited, limited
             )
             code = first_failed(gates, at)
-            code = np.int32(SATURATED) if saturated[i] != np.uint8(0) else code
-            code = np.int32(OUTSIDE_MASK) if outside_mask[i] else code
+            code = SATURATED if saturated[i] != np.uint8(0) else code
+            code = OUTSIDE_MASK if outside_mask[i] else code
             total[i] = sum_of_all
             reason[i] = np.uint8(code)
             z_m[i] = z
 
 
 @numba.njit(**FAST)
-def find_flying(  # type: ignore[no-untyped-def]
-    z_m, total, reason, pixels, near, gate, flying
-):
-    """Find pixels between a nearer and a farther surface, on the finished image.
-
-    ``z_m``, ``total`` and ``reason`` (m, t): t frames of m pixels. ``pixels`` (p,): those in question; ``near`` (p, 9):
-    their neighbours and themselves, -1 for none. Writes ``flying`` (p, t) bool. Neighbours whose phases fit a distance
-    count, even out of range.
-    """
+def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore[no-untyped-def]
+    """Find pixels between a nearer and a farther surface, on the finished image. ``z_m``, ``total`` and ``reason`` (m,
+    t): t frames of m pixels. ``pixels`` (p,): those in question; ``near`` (p, 9): their neighbours and themselves, -1
+    for none. Writes ``flying`` (p, t) bool. Neighbours whose phases fit a distance count, even out of range."""
     window = np.empty(9, np.float32)
     for p in range(pixels.size):
         i = pixels[p]
@@ -275,5 +269,5 @@ def find_flying(  # type: ignore[no-untyped-def]
 def round_valid(z_m: np.ndarray, reason: np.ndarray, step_m: np.float32) -> None:
     """Round z (n,) to the output's step, NaN where ``reason`` (n,) is not VALID; in place."""
     for i in range(np.uint64(z_m.size)):
-        rounded = np.floor(z_m[i] / step_m + np.float32(0.5)) * step_m
-        z_m[i] = rounded if reason[i] == np.uint8(VALID) else np.float32(np.nan)
+        rounded = np.floor(z_m[i] / step_m + HALF) * step_m
+        z_m[i] = rounded if reason[i] == np.uint8(VALID) else NAN

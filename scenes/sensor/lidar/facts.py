@@ -9,27 +9,12 @@ import numpy as np
 from pydantic import model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.units import MM, SPEED_OF_LIGHT_AIR, UW_CM2
+from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
-from scenes.sensor.facts import (
-    CameraFacts,
-    Fact,
-    HalfAngle,
-    LengthPx,
-    NonNegative,
-    Positive,
-    Share,
-    checked,
-)
+from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, Share, checked
 
-NS = 1e-9
-"""Seconds in a nanosecond."""
-MRAD = 1e-3
-"""Radians in a milliradian."""
-MW = 1e-3
-"""Watts in a milliwatt."""
-SMOOTHING_PX = 1
-"""Half width of the on-device smoothing's window."""
+NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
+SMOOTHING_PX = 1  # half width of the on-device smoothing's window
 
 
 class ReceiverFacts(Config):
@@ -40,34 +25,24 @@ class ReceiverFacts(Config):
     cutoff_half_angle_deg: HalfAngle
 
 
-BeamWidth = Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
-ExcessNoise = Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
-
-
 class BeamFacts(Config):
-    """The beam at rest: round, Gaussian in angle. ``power_mw``: of its light, averaged over the code; only ambient
-    light is measured by it."""
+    """The beam at rest: round, Gaussian in angle. ``power_mw``: averaged over the code, to measure ambient light by."""
 
-    fwhm_mrad: BeamWidth
+    fwhm_mrad: Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
     power_mw: Positive
 
 
 class ScanFacts(Config):
-    """The raster: a column is one sweep of the fast axis, from point to point every ``point_ns``.
-
-    ``sweep_jitter_mm``: standard deviation of an error of range that the points of one sweep in one frame share.
-    """
+    """The raster: a column is one sweep, a point every ``point_ns``; ``sweep_jitter_mm``: error of a whole sweep."""
 
     point_ns: Positive
     sweep_jitter_mm: NonNegative
 
 
 class CodeFacts(Config):
-    """The transmitted code and the pulse that its correlation makes.
-
-    ``correlation_fwhm_ns``: width of the correlation's peak, taken as Gaussian. ``band_floor``: the spectrum ends at
-    the last line above this share of its greatest. ``integration_ns``: how much of the return makes one point.
-    """
+    """The transmitted code and the pulse that its correlation makes. ``correlation_fwhm_ns``: width of its peak, taken
+    as Gaussian. ``band_floor``: the spectrum ends at the last line above this share of its greatest.
+    ``integration_ns``: how much of the return makes one point."""
 
     period_ns: Positive
     correlation_fwhm_ns: Positive
@@ -76,16 +51,13 @@ class CodeFacts(Config):
 
 
 class LidarPhotonFacts(Config):
-    """The photon budget. Electrons are primary ones, before the avalanche, of one point's integration.
-
-    ``signal_electrons``: from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard
-    deviation. ``band_nm``: width of the filter before the detector. ``room_albedo``: mean over its field of view, for
-    the ambient light, which reaches the one detector from the whole field. ``calibration_*``: the two published points
-    to which the gain and the confidence threshold are fitted.
-    """
+    """The photon budget, in primary electrons, before the avalanche, of one point's integration. ``signal_electrons``:
+    from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard deviation. ``room_albedo``:
+    mean over the field of view, whose ambient light reaches the one detector. ``calibration_*``: the published points
+    to which the gain and the confidence threshold are fitted."""
 
     signal_electrons: Positive
-    excess_noise_factor: ExcessNoise
+    excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
     amplifier_electrons: NonNegative
     band_nm: Positive
     room_albedo: Share
@@ -105,12 +77,10 @@ class RippleFacts(Config):
 
 
 class LidarEngineFacts(Config):
-    """Processing on the device: smoothing, confidence, limits and step of the output.
-
-    ``side_weight``: of the pixels beside, above and below in the 3 x 3 smoothing; the corners have its square.
-    ``agree_deviations``: a neighbour joins where its half path differs by at most so many expected deviations.
-    ``least_agreeing``: share of the window's weights that must agree. ``confidence_electrons``: least strength.
-    """
+    """Processing on the device. ``side_weight``: of the pixels beside, above and below in the 3 x 3 smoothing; the
+    corners have its square. ``agree_deviations``: a neighbour joins where its half path differs by at most so many
+    expected deviations. ``least_agreeing``: share of the window's weights that must agree. ``confidence_electrons``:
+    least strength."""
 
     side_weight: Share
     agree_deviations: Positive
@@ -121,10 +91,7 @@ class LidarEngineFacts(Config):
 
 
 class ScannedLidar(CameraFacts):
-    """A lidar that sends one beam per pixel, one after the other: everything that its model needs, as data.
-
-    Co-ordinates are at the transmitter: pixels are directions of the beam.
-    """
+    """A lidar that sends one beam per pixel, one after the other; pixels are directions at the transmitter."""
 
     kind: Literal["scanned_lidar"]
     receiver: ReceiverFacts
@@ -191,11 +158,8 @@ class ScannedLidar(CameraFacts):
         return float((1 / (1 + (slopes**2).sum(axis=-1)) ** 2).sum() / (lens.fx * lens.fy))
 
     def ambient_electrons(self, irradiance_uw_cm2_nm: float) -> float:
-        """Return electrons of an integration from daylight or lamps of that spectral irradiance on the whole field.
-
-        A surface of albedo a under irradiance E has the radiance a E / pi, and sends from the field's solid angle what
-        the beam of power P sends from albedo 1 at 1 m when P a / pi / 1 m^2 equals a E / pi times that angle.
-        """
+        """Return electrons of an integration from daylight or lamps of that irradiance on the whole field: the field's
+        solid angle sends a E / pi times it, the beam of power P from albedo 1 at 1 m P / pi."""
         irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
         by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
         return self.photons.signal_electrons.value * by_beam

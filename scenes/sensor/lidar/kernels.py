@@ -1,27 +1,122 @@
-"""Compiled inner loops of the scanned lidar's frames: which peak wins, smoothing, gates. One core, float32."""
+"""Compiled inner loops of the scanned lidar: peaks of the correlation, which peak wins, smoothing, gates. One core.
+
+A code of period T correlates to a pulse that repeats with T, so its spectrum stands on the lines k / T. The view's
+phasors on that comb are the spectrum H of all paths of light within a beam, hence with weights W of the pulse c(t) =
+sum_k W_k Re(H_k exp(-2 pi i k t / T)) / sum_k W_k, whose single return of light a is a pulse of height a.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from harness.vocabulary.capture import Reason
-from scenes.sensor.normals import FAST
+from harness.vocabulary.geometry import Reason
+from scenes.sensor.normals import FAST, IN_DOUBLE
 
-VALID, SATURATED, LOW_AMPLITUDE, EDGE, OUT_OF_RANGE = (
-    int(Reason[name]) for name in ("VALID", "SATURATED", "LOW_AMPLITUDE", "EDGE", "OUT_OF_RANGE")
+SAMPLES_PER_LINE = 4
+"""Samples of the correlation in a period, per spectral line; two would just hold it, four miss no peak."""
+NEWTON_STEPS = 4
+"""Steps from a sample's parabola: three converge to 1e-7 of a sample even where two pulses are about to part."""
+NO_PEAK = -1e9  # stand-in for the height of a peak that does not exist
+
+
+class Peaks(NamedTuple):
+    """The two strongest peaks of n correlations, the stronger first; all (2, n) float64. ``delay``: in periods, 0..1.
+    ``height``: `NO_PEAK` where there is none. ``curvature``: minus the second derivative by angle 2 pi t / T."""
+
+    delay: np.ndarray
+    height: np.ndarray
+    curvature: np.ndarray
+
+
+def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
+    """Find peaks of correlations with phasors (K, n) on lines 1..K of the comb and the pulse's ``weights`` (K,)."""
+    lines, n = phasor.shape
+    spectrum = np.empty((n, 2 * lines), np.float32)
+    scaled = (phasor * (weights / weights.sum())[:, None].astype(np.float32)).T
+    spectrum[:, :lines] = scaled.real
+    spectrum[:, lines:] = scaled.imag
+    # cosines and sines of the lines at the samples of one period, (2 K, M)
+    samples = SAMPLES_PER_LINE * lines
+    angle = 2 * np.pi * np.outer(np.arange(1, lines + 1), np.arange(samples)) / samples
+    waves = np.concatenate([np.cos(angle), np.sin(angle)]).astype(np.float32)
+    out = np.empty((3, 2, n))
+    _peaks(spectrum @ waves, spectrum, *out)
+    return Peaks(*out)
+
+
+@numba.njit(**IN_DOUBLE)
+def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, float]:
+    """Return the correlation with ``spectrum`` (2 K,) at an angle, its first and its second derivative by angle."""
+    lines = spectrum.size // 2
+    step_re, step_im = np.cos(angle), np.sin(angle)
+    re, im = 1.0, 0.0
+    value, slope, bend = 0.0, 0.0, 0.0
+    for k in range(lines):
+        re, im = re * step_re - im * step_im, re * step_im + im * step_re
+        a, b = spectrum[k], spectrum[lines + k]
+        even = a * re + b * im
+        order = k + 1.0
+        value += even
+        slope += order * (b * re - a * im)
+        bend -= order * order * even
+    return value, slope, bend
+
+
+@numba.njit(**IN_DOUBLE)
+def _refined(spectrum: np.ndarray, start: float, spacing: float) -> tuple[float, float, float]:
+    """Return (angle, height, curvature) of the peak beside the sample at ``start``, within one sample of it."""
+    angle = start
+    for _ in range(NEWTON_STEPS):
+        _, slope, bend = _derivatives(spectrum, angle)
+        # where two pulses merge the curve may be hollow beside its peak: then climb by half a sample
+        step = -slope / bend if bend < 0.0 else np.sign(slope) * 0.5 * spacing
+        angle = min(max(angle + step, start - spacing), start + spacing)
+    value, _, bend = _derivatives(spectrum, angle)
+    return angle, value, -bend
+
+
+@numba.njit(**IN_DOUBLE)
+def _peaks(
+    samples: np.ndarray, spectrum: np.ndarray, delay: np.ndarray, height: np.ndarray, curvature: np.ndarray
+) -> None:
+    """Find peaks among ``samples`` (n, M) and refine them on ``spectrum`` (n, 2 K); outputs (2, n)."""
+    n, m = samples.shape
+    spacing = 2.0 * np.pi / m
+    for i in range(n):
+        row = samples[i]
+        first, second = -1, -1
+        for j in range(m):
+            y = row[j]
+            if y > 0.0 and y > row[j - 1] and y >= row[j + 1 if j + 1 < m else 0]:
+                if first < 0 or y > row[first]:
+                    first, second = j, first
+                elif second < 0 or y > row[second]:
+                    second = j
+        for rank in range(2):
+            at = first if rank == 0 else second
+            angle, top, bend = 0.0, NO_PEAK, 1.0
+            if at >= 0:
+                angle, top, bend = _refined(spectrum[i], at * spacing, spacing)
+            delay[rank, i] = (angle / (2.0 * np.pi)) % 1.0
+            height[rank, i] = top
+            curvature[rank, i] = bend
+        if height[1, i] > height[0, i]:
+            for out in (delay, height, curvature):
+                out[0, i], out[1, i] = out[1, i], out[0, i]
+
+
+VALID, SATURATED, LOW_AMPLITUDE, EDGE, OUT_OF_RANGE = map(
+    np.int32, (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.EDGE, Reason.OUT_OF_RANGE)
 )
-NOWHERE_M = np.float32(1e9)
-"""Half path beyond the picture's border: it agrees with nothing."""
+NOWHERE_M = np.float32(1e9)  # half path beyond the picture's border: it agrees with nothing
 
 
 @numba.njit(**FAST)
 def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
-    """Take the moving sum along axis 1 of ``normals`` (f, h + q, w) with q + 1 ``taps``, in place: rows 0..h-1 are the
-    result.
-
-    A point's sum takes later points only, which are still as they were drawn.
-    """
+    """Take the moving sum along axis 1 of ``normals`` (f, h + q, w) with q + 1 ``taps``, in place, into rows 0..h-1."""
     fields, rows, columns = normals.shape
     q = taps.size - 1
     for f in range(fields):
@@ -40,12 +135,9 @@ def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
 def stronger_peak(  # type: ignore[no-untyped-def]
     height, half_m, deviation_m, noise, normals, sweep_m, won_m, won_height, won_deviation_m
 ):
-    """Choose the higher of two peaks after noise, with the noise of its range.
-
-    ``height``, ``half_m``, ``deviation_m`` (2, h, w) of the two peaks; ``noise`` (h, w) deviation of a height;
-    ``normals`` (3, h or more, w): of the two heights and of the winner's range; ``sweep_m`` (w,) added to a column.
-    Writes half path, height and the expected deviation of the half path into arrays with a border of one pixel.
-    """
+    """Choose the higher of two peaks after noise, with the noise of its range. ``height``, ``half_m``, ``deviation_m``
+    (2, h, w) of the peaks; ``noise`` (h, w): deviation of a height; ``normals`` (3, h or more, w): of the heights and
+    of the winner's range; ``sweep_m`` (w,) added to a column. Writes into arrays with a border of one pixel."""
     h, w = noise.shape
     for v in range(h):
         for u in range(w):
@@ -63,12 +155,10 @@ def stronger_peak(  # type: ignore[no-untyped-def]
 def noise_peaks(  # type: ignore[no-untyped-def]
     weak, noise, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
 ):
-    """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``.
-
-    Rice: a level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period; taken as Poisson, the
-    highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)), which is inverted. It lies anywhere in the period.
-    ``bandwidth_m``: deviation of half the path at a height of one noise deviation.
-    """
+    """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``. A
+    level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period (Rice); taken as Poisson, the
+    highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``bandwidth_m``: deviation of half the path at one noise
+    deviation."""
     w = noise.shape[1]
     for i in range(weak.size):
         v, u = weak[i] // w, weak[i] % w
@@ -87,25 +177,19 @@ def smooth_and_gate(  # type: ignore[no-untyped-def]
     """Average the 3 x 3 neighbours that agree, then range, gates and rounding.
 
     ``won_m``, ``won_height`` and ``gate_m`` (h + 2, w + 2): half path, height, and how far a neighbour's half path may
-    differ. Weights: 1 in the centre, ``side`` beside, above and below it, its square in the corners. ``strength``
-    (h, w): weighted sum of the agreeing heights over the weights of all neighbours in the picture. A pixel whose
-    agreeing weights are a smaller share of all than wanted stands alone and is invalid.
-    Half the path s by a receiver at e gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u;
-    ``along_m`` (h, w) is u.e, ``cosine`` (h, w) u_z. ``limits``: e.e, least strength, least
-    agreeing share, least and greatest range, step.
+    differ. ``strength`` (h, w): weighted sum of the agreeing heights over the weights of all neighbours. A pixel whose
+    agreeing weights are too small a share is invalid. Half the path s by a receiver at e gives the range r = (4 s^2 -
+    e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` (h, w) is u.e, ``cosine`` (h, w) u_z. ``limits``: e.e, least
+    strength, least agreeing share, least and greatest range, step.
     """
     h, w = cosine.shape
     e2, least, alike, nearest, farthest, step = limits
-    one = np.float32(1)
-    zero = np.float32(0)
+    one, zero = np.float32(1), np.float32(0)
     for v in range(h):
         tall = one + (side if v > 0 else zero) + (side if v < h - 1 else zero)
         for u in range(w):
-            centre = won_m[v + 1, u + 1]
-            gate = gate_m[v + 1, u + 1]
-            moved = zero
-            total = zero
-            heights = zero
+            centre, gate = won_m[v + 1, u + 1], gate_m[v + 1, u + 1]
+            moved, total, heights = zero, zero, zero
             for dy in range(3):
                 for dx in range(3):
                     weight = (one if dy == 1 else side) * (one if dx == 1 else side)
@@ -119,12 +203,11 @@ def smooth_and_gate(  # type: ignore[no-untyped-def]
             support = heights / everyone
             half = centre + moved / total + error_m
             range_m = (np.float32(4) * half * half - e2) / (np.float32(4) * half - np.float32(2) * along_m[v, u])
-            code = np.int32(VALID)
-            code = code if (range_m >= nearest) & (range_m <= farthest) else np.int32(OUT_OF_RANGE)
-            code = code if total >= alike * everyone else np.int32(EDGE)
-            code = code if support >= least else np.int32(LOW_AMPLITUDE)
-            code = np.int32(SATURATED) if saturated[v, u] else code
+            code = VALID if (range_m >= nearest) & (range_m <= farthest) else OUT_OF_RANGE
+            code = code if total >= alike * everyone else EDGE
+            code = code if support >= least else LOW_AMPLITUDE
+            code = SATURATED if saturated[v, u] else code
             rounded = np.floor(range_m * cosine[v, u] / step + np.float32(0.5)) * step
-            z_m[v, u] = rounded if code == np.int32(VALID) else np.float32(np.nan)
+            z_m[v, u] = rounded if code == VALID else np.float32(np.nan)
             reason[v, u] = np.uint8(code)
             strength[v, u] = max(support, zero)

@@ -1,54 +1,44 @@
 """The scanned lidar: the correlation's peaks in each beam to range, with a reason for each invalid pixel.
 
-Modelled: one beam per pixel whose light, with all its paths, meets one detector; the correlation of the coded pulse and
-its strongest peak, which decides between returns; shot noise with the avalanche's excess, ambient light and the
-amplifier's noise, as they act on heights and places of peaks; maxima of the noise that exceed a weak return;
-integration over more than one point's time, which smears the beam along the sweep and correlates the noise there; an
-error that a sweep shares; ripples of a unit; smoothing among agreeing neighbours; confidence threshold, least range,
-saturation; the correction for the receiver beside the transmitter; rounding.
-Not modelled: wiggling (there is no continuous wave whose harmonics alias, so that effect changes nothing, nor does the
-configuration's edge gate, which belongs to another engine), side lobes of the real code, the mirror's uneven speed and
-its errors of direction, the beam's own width changing with distance, drift over seconds, light of other lidars, motion,
-walk error with amplitude, and the vendor's own filters beyond these.
+Modelled: one beam per pixel whose light, with all its paths, meets one detector; the coded pulse's strongest peak; shot
+noise with the avalanche's excess, ambient light and the amplifier's noise on heights and places of peaks; maxima of the
+noise; integration over more than one point's time; an error that a sweep shares; ripples of a unit; smoothing among
+agreeing neighbours; confidence threshold, least range, saturation; the receiver beside the transmitter; rounding. Not
+modelled: wiggling and the edge gate (those effects change nothing), side lobes of the real code, the mirror's uneven
+speed and errors of direction, the beam's width changing with distance, drift over seconds, light of other lidars,
+motion, walk error with amplitude, and the vendor's own filters beyond these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import MM, Region
 from harness.vocabulary.seeds import random_stream
-from harness.vocabulary.units import MM
+from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.frames import DecodedFrame
 from scenes.sensor.lidar import kernels
-from scenes.sensor.lidar.correlation import strongest_peaks
 from scenes.sensor.lidar.facts import ScannedLidar
+from scenes.sensor.lidar.kernels import strongest_peaks
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import light_of, smooth_field, unit_error_m
-from scenes.view import NoiseFreeView
+from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, unit_error_m
 
 f4 = np.float32
-BLOCK_ROWS = 16
-"""Rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB."""
+BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB
 CERTAIN_DEVIATIONS = 10.0
 """A return this much above the noise is never beaten by a maximum of the noise (chance below 1e-9)."""
 FACTOR_ROWS = 400
 """Size of the matrix whose Cholesky factor ends in the taps of a moving sum; the taps are good to 0.3 %."""
 
 
-@dataclass(frozen=True)
-class LidarReturns:
-    """Light that a view sends back before noise.
-
-    Of the two strongest peaks, (2, h, w) float32: ``height`` (electrons), ``half_m`` (half the path, with the unit's
-    errors), ``deviation_m`` (of the half path, from noise). ``noise`` (h, w): deviation of a height, electrons.
-    ``saturated`` (h, w) bool. ``weak`` (m,): flat indices of pixels that a maximum of the noise may win.
-    """
+class LidarReturns(NamedTuple):
+    """Light that a view sends back before noise. The two strongest peaks, (2, h, w) float32: ``height`` (electrons),
+    ``half_m`` (half the path, with the unit's errors), ``deviation_m`` of it. ``noise`` (h, w): deviation of a height,
+    electrons. ``saturated`` (h, w) bool. ``weak`` (m,): flat indices of pixels that a maximum of the noise may win."""
 
     height: np.ndarray
     half_m: np.ndarray
@@ -62,25 +52,24 @@ class LidarScanner:
     """A camera of this kind on a region of its raster: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: ScannedLidar, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
-        self.camera = camera
-        self.config = config
-        self.region = region
-        self.slopes = slopes
-
-    @cached_property
-    def smear(self) -> np.ndarray:
-        """Weights of the points along a column whose light one point integrates, linear between points."""
-        return smear_weights(self.camera.integration_points)
-
-    @cached_property
-    def noise_taps(self) -> np.ndarray:
-        """Taps of a moving sum along a column with the correlation that overlapping integrations have."""
-        return overlap_taps(self.camera.integration_points).astype(f4)
+        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+        # weights of the points along a column whose light one point integrates
+        self.smear = smear_weights(camera.integration_points)
+        # a slope's error over the curvature is the place's error; the noise has the pulse's own spectrum
+        self.slope = camera.bandwidth_rad_s * camera.period_s / (2 * np.pi)
+        # electrons of ambient light in one integration, the same in all pixels: one detector sees the whole field
+        ambient = config.effects.ambient
+        self.ambient_electrons = camera.ambient_electrons(config.ambient_uw_cm2_nm) if ambient else 0.0
+        self._noise_taps = overlap_taps(camera.integration_points).astype(f4)
+        # (2, h, w): the receiver's offset along the ray in metres, the ray's cosine to the axis
+        self._geometry, engine = np.stack(rays_of(slopes, camera.receiver_m)).astype(f4), camera.engine
+        least = camera.receiver_m @ camera.receiver_m, engine.confidence_electrons.value, engine.least_agreeing.value
+        range_m = engine.min_range_mm.value * MM, camera.unambiguous_m, camera.z_step_m
+        self._limits = tuple(map(f4, (*least, *range_m)))
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share, as far as they are on; the fixed pattern is cut
-        from a field over the whole raster."""
+        """(h, w): all errors of range that frames of this unit share; the fixed pattern is cut from a field."""
         camera, config = self.camera, self.config
         error = unit_error_m(camera, config, self.slopes[..., 0])
         if not config.effects.fixed_pattern:
@@ -93,59 +82,29 @@ class LidarScanner:
 
     @cached_property
     def gathered(self) -> np.ndarray:
-        """(h, w): signal electrons of a point per unit of the view's light: the receiver's aperture is flat.
-
-        The beam's power is the same in all directions, so nothing else of the field's edge comes in.
-        """
+        """(h, w): signal electrons of a point per unit of the view's light: the receiver's aperture is flat."""
         return np.asarray(self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
 
     def expose(self, view: NoiseFreeView) -> LidarReturns:
-        """Return the two strongest returns of each beam of a view that covers this scanner's region, and their
-        noise."""
-        camera, effects = self.camera, self.config.effects
+        """Return the two strongest returns of each beam of a view that covers this region, and their noise."""
+        effects, photons = self.config.effects, self.camera.photons
         phasor, intensity = light_of(view, effects)
         electrons = self.gathered * self._along_sweeps(intensity)
-        noise = self.noise_electrons(electrons)
+        # the deviation of the correlation: sqrt(F (signal + ambient) + amplifier^2)
+        shot = photons.excess_noise_factor.value * (electrons + self.ambient_electrons)
+        noise = np.sqrt(shot + photons.amplifier_electrons.value**2)
         height, half_m, deviation_m = self._peaks(phasor, noise)
-        full = camera.photons.full_scale_electrons.value if effects.saturation else np.inf
+        full = photons.full_scale_electrons.value if effects.saturation else np.inf
         weak = height[0] < CERTAIN_DEVIATIONS * noise if effects.noise else np.zeros(noise.shape, bool)
-        return LidarReturns(
-            height.astype(f4),
-            (half_m + self.static_error_m).astype(f4),
-            deviation_m.astype(f4),
-            noise.astype(f4),
-            electrons + self.ambient_electrons > full,
-            np.flatnonzero(weak),
-        )
-
-    @cached_property
-    def ambient_electrons(self) -> float:
-        """Electrons of ambient light in one integration, the same in all pixels: one detector sees the whole field."""
-        config = self.config
-        return self.camera.ambient_electrons(config.ambient_uw_cm2_nm) if config.effects.ambient else 0.0
-
-    def noise_electrons(self, signal_electrons: np.ndarray) -> np.ndarray:
-        """Return the deviation of the correlation in a point with that much light: sqrt(F (signal + ambient) +
-        amplifier^2)."""
-        photons = self.camera.photons
-        shot = photons.excess_noise_factor.value * (signal_electrons + self.ambient_electrons)
-        return np.asarray(np.sqrt(shot + photons.amplifier_electrons.value**2))
-
-    @property
-    def metres_at_unit_ratio(self) -> float:
-        """Deviation of half the path of a lone return as high as the noise's deviation.
-
-        The Cramer-Rao bound of a delay in white noise through the matched filter: 1 / (bandwidth * ratio).
-        """
-        return self.camera.unambiguous_m / (self.camera.period_s * self.camera.bandwidth_rad_s)
+        half_m, saturated = half_m + self.static_error_m, electrons + self.ambient_electrons > full
+        height, half_m, deviation_m, noise = (each.astype(f4) for each in (height, half_m, deviation_m, noise))
+        return LidarReturns(height, half_m, deviation_m, noise, saturated, np.flatnonzero(weak))
 
     def _peaks(self, phasor: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights in electrons, half paths and their deviations in metres, each (2, h, w)."""
         camera = self.camera
         h, w = noise.shape
         height, half_m, deviation_m = (np.empty((2, h, w)) for _ in range(3))
-        # a slope's error over the curvature is the place's error; the noise has the pulse's own spectrum
-        slope = camera.bandwidth_rad_s * camera.period_s / (2 * np.pi)
         metres_per_radian = camera.unambiguous_m / (2 * np.pi)
         for row in range(0, h, BLOCK_ROWS):
             rows = slice(row, min(row + BLOCK_ROWS, h))
@@ -156,17 +115,13 @@ class LidarScanner:
             half_m[:, rows] = peaks.delay.reshape(shape) * camera.unambiguous_m
             curvature = peaks.curvature.reshape(shape) * self.gathered[rows]
             with np.errstate(divide="ignore", invalid="ignore"):
-                deviation_m[:, rows] = metres_per_radian * slope * noise[rows] / curvature
+                deviation_m[:, rows] = metres_per_radian * self.slope * noise[rows] / curvature
         # where two pulses are about to part the peak is flat; it still lies within their width
         width_m = camera.unambiguous_m * camera.code.correlation_fwhm_ns.value / camera.code.period_ns.value
         return height, half_m, np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
 
     def _along_sweeps(self, light: np.ndarray, rows: slice | None = None) -> np.ndarray:
-        """Return light (..., h, w) integrated over the points of a column that one point's time spans; only ``rows`` of
-        it.
-
-        At the region's border the nearest row stands for those beyond it; the margin takes them off.
-        """
+        """Return light (..., h, w) integrated over the points of a column that one point's time spans."""
         h = light.shape[-2]
         first, last = (0, h) if rows is None else (rows.start, rows.stop)
         reach = len(self.smear) // 2
@@ -177,71 +132,39 @@ class LidarScanner:
         return total
 
     def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
-        """Draw a frame: noise from ``rng`` on the peaks, then the device's processing; ``error_m`` displaces the
-        frame."""
-        h, w = exposure.noise.shape
-        won_m = np.full((h + 2, w + 2), kernels.NOWHERE_M, f4)
-        won_height = np.zeros((h + 2, w + 2), f4)
-        won_deviation_m = np.zeros((h + 2, w + 2), f4)
+        """Draw a frame: noise from ``rng`` on the peaks, then the processing; ``error_m`` displaces the frame."""
+        camera, (h, w) = self.camera, exposure.noise.shape
+        won_m, won_height, won_deviation_m = np.zeros((3, h + 2, w + 2), f4)
+        won_m[:] = kernels.NOWHERE_M
         # standard normals, correlated along columns, and the sweeps' errors
-        normals, sweep_m, more = np.zeros((3, h, w), f4), np.zeros(w, f4), len(self.noise_taps) - 1
+        normals, sweep_m, taps = np.zeros((3, h, w), f4), np.zeros(w, f4), self._noise_taps
         if self.config.effects.noise:
-            normals = standard_normals(rng, (3, h + more, w))
-            kernels.correlate_along_columns(normals, self.noise_taps)
-            sweep_m = standard_normals(rng, (w,)) * f4(self.camera.scan.sweep_jitter_mm.value * MM)
+            normals = standard_normals(rng, (3, h + len(taps) - 1, w))
+            kernels.correlate_along_columns(normals, taps)
+            sweep_m = standard_normals(rng, (w,)) * f4(camera.scan.sweep_jitter_mm.value * MM)
         won = won_m, won_height, won_deviation_m
         kernels.stronger_peak(
             exposure.height, exposure.half_m, exposure.deviation_m, exposure.noise, normals, sweep_m, *won
         )
-        slope = self.camera.bandwidth_rad_s * self.camera.period_s / (2 * np.pi)
-        rates = slope, self.metres_at_unit_ratio, self.camera.unambiguous_m
+        # the Cramer-Rao bound of a delay in white noise through the matched filter, at a height of one noise deviation
+        bound_m = camera.unambiguous_m / (camera.period_s * camera.bandwidth_rad_s)
+        rates = self.slope, bound_m, camera.unambiguous_m
         kernels.noise_peaks(exposure.weak, exposure.noise, rng.random((2, exposure.weak.size)), *rates, *won)
-        won_deviation_m *= f4(self.camera.engine.agree_deviations.value)
+        won_deviation_m *= f4(camera.engine.agree_deviations.value)
 
         # smoothing, range, gates and rounding
         z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
         along_m, cosine = self._geometry
         kernels.smooth_and_gate(
-            *won, f4(self.camera.engine.side_weight.value), along_m, cosine, exposure.saturated, self._limits,
-            f4(error_m), z_m, reason, strength,
+            *won, f4(camera.engine.side_weight.value), along_m, cosine, exposure.saturated, self._limits, f4(error_m),
+            z_m, reason, strength,
         )  # fmt: skip
         return DecodedFrame(z_m, reason, strength)
 
-    def at_once(self, exposure: LidarReturns, asked: np.ndarray) -> None:
-        """Return None: there is no way to sum frames that is equal in distribution and costs much less than they do.
-
-        A neighbour counts where it agrees within a gate of a few of its own deviations, so what a pixel gives is far
-        from linear in the noise everywhere, face included, and a frame's noise is one array of three fields that a
-        linear camera would need as well.
-        """
-        return None
-
-    @cached_property
-    def _geometry(self) -> np.ndarray:
-        """(2, h, w) float32: the receiver's offset along the ray in metres, the ray's cosine to the axis."""
-        rays = np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
-        length = np.linalg.norm(rays, axis=-1)
-        return np.stack([rays @ self.camera.receiver_m / length, 1 / length]).astype(f4)
-
-    @cached_property
-    def _limits(self) -> tuple[np.float32, ...]:
-        camera = self.camera
-        values = (
-            camera.receiver_m @ camera.receiver_m,
-            camera.engine.confidence_electrons.value,
-            camera.engine.least_agreeing.value,
-            camera.engine.min_range_mm.value * MM,
-            camera.unambiguous_m,
-            camera.z_step_m,
-        )
-        return tuple(f4(value) for value in values)
-
 
 def smear_weights(points: float) -> np.ndarray:
-    """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time.
-
-    The light between two points is taken as linear between them, so a weight is the integral of a hat function.
-    """
+    """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time:
+    the light is taken as linear between points."""
     reach = int(np.ceil(points / 2))
 
     def integral(x: float) -> float:  # of the hat max(0, 1 - |x|) from -1 to x
@@ -254,11 +177,7 @@ def smear_weights(points: float) -> np.ndarray:
 
 def overlap_taps(points: float) -> np.ndarray:
     """Return taps, of sum of squares 1, of a moving sum of white noise that correlates as integrations over ``points``
-    points.
-
-    Windows of length p that start a point apart share 1 - k / p of white noise at lag k. The taps with that
-    autocorrelation are the last row of the Cholesky factor of its matrix (Bauer 1955).
-    """
+    points do, 1 - k / p at lag k: the last row of the Cholesky factor of its matrix (Bauer 1955)."""
     lags = np.arange(int(np.ceil(points)) if points > 1 else 1)
     correlation = np.zeros(FACTOR_ROWS)
     correlation[: len(lags)] = 1 - lags / max(points, 1.0)

@@ -1,0 +1,351 @@
+"""Recordings of cameras by their own programs: Azure Kinects (.mkv), iPhones and iPads (Stray Scanner, Record3D).
+
+k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
+attaches the factory calibration. Colour is sampled at each depth point's place in the colour picture. Phones store
+ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the lens of the colour camera, and poses, by which
+the program warns of movement.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from detectors.recordings.depth_images import depth_files, read_depth_png, read_picture
+from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.intrinsics import (
+    ColourCamera,
+    colour_camera,
+    depth_lens,
+    depth_mode_of_size,
+    lens_for,
+    parse_calibration,
+)
+from detectors.recordings.recording import Asked, Recording, damage_told, slopes_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import FRAME_PIXELS, TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels, strict_json
+from harness.vocabulary.geometry import Frame, Lens, transform_points
+
+TITLES = ("DEPTH", "IR", "COLOR")
+LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
+SEGMENT_ID = bytes.fromhex("18538067")
+WAITING = 4
+"""Captures held while their other pictures may still come; the recorder interleaves its tracks within one frame."""
+
+
+def open_mkv(path: Path, asked: Asked) -> Recording:
+    """Open a recording with its own calibration, or the lens given. Raises UserError where it has no depth."""
+    _refuse_truncated(path)
+    with _opened(path) as container:
+        tracks = _tracks(container)
+        if "DEPTH" not in tracks:
+            found = ", ".join(sorted(tracks)) or "none"
+            raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
+        sizes = {title: (t.codec_context.width, t.codec_context.height) for title, t in tracks.items()}
+        for title in sizes:
+            refuse_pixels(f"{path}: its track {title}", *sizes[title])
+        width, height = sizes["DEPTH"]
+        # recorders of other makers (Orbbec's Femto) may leave the tag out; each mode has its own size
+        stated = tracks["DEPTH"].metadata.get("K4A_DEPTH_MODE") or container.metadata.get("K4A_DEPTH_MODE")
+        attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
+        calibration = bytes(attached[0].data) if attached else None
+    cameras = None if calibration is None else parse_calibration(f"{path} (calibration.json)", calibration)
+
+    def own() -> tuple[Lens | None, None]:
+        mode = stated or depth_mode_of_size(width, height) or "(not stated)"
+        return None if cameras is None else depth_lens(str(path), cameras, mode), None
+
+    lens, lens_files = lens_for(str(path), asked, width, height, own)
+    colour = colour_camera(str(path), cameras, *sizes["COLOR"]) if cameras is not None and "COLOR" in sizes else None
+    note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
+    scale_m = asked.scale_m or UNITS_M["mm"]
+    read, notes = partial(_frames, path, scale_m, lens, colour), () if colour is None else (note,)
+    more = {"files": (path, *lens_files), "lens": lens, "notes": notes}
+    return Recording.begun(path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **more)
+
+
+def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
+    """Yield a frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
+    slopes = slopes_of(lens, lens.whole)
+    for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
+        infrared = pictures.get("IR")
+        amplitude = infrared.astype(np.float32) if infrared is not None else None
+        frame = frame_of(f"{path.name} frame {number}", pictures["DEPTH"], scale_m, amplitude=amplitude)
+        if colour is not None and "COLOR" in pictures:
+            frame = replace(frame, rgb=colour_on_depth(frame.z_m, slopes, colour, pictures["COLOR"]))
+        yield frame
+
+
+def colour_on_depth(z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, picture: np.ndarray) -> np.ndarray:
+    """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour is missing. Not
+    modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect)."""
+    points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1) * z_m[..., None]
+    points_colour = transform_points(colour.T_colour_depth, points)
+    seen = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
+    at = np.full((*z_m.shape, 2), -1e3, np.float32)
+    at[seen] = colour.lens.project(points_colour[seen])
+    # Beyond the frame the rational distortion may fold back into it; true rays there are steeper than the corner's.
+    corner = np.abs(colour.lens.slopes(np.array([0, colour.lens.width - 1]), np.array([0, colour.lens.height - 1])))
+    steep = np.abs(points_colour[..., :2] / np.where(seen, points_colour[..., 2], 1.0)[..., None]) > 1.2 * corner.max(0)
+    at[steep.any(axis=-1)] = -1e3
+    return cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _opened(path: Path) -> Any:
+    import av
+
+    # Without these the decoder guesses the form by content: a playlist or a script called .mkv would open other files,
+    # and addresses.
+    only = {"protocol_whitelist": "file", "format_whitelist": "matroska,webm"}
+    with damage_told(f"{path}: cannot be opened as a recording", LEGAL_MKV):
+        return av.open(f"file:{path}", format="matroska", options=only)
+
+
+def _tracks(container: Any) -> dict[str, Any]:
+    return {s.metadata["title"]: s for s in container.streams.video if s.metadata.get("title") in TITLES}
+
+
+def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
+    """Yield the pictures of one instant (within half a frame period) by track title, in order of time."""
+    waiting: list[tuple[float, dict[str, np.ndarray]]] = []
+    for title, time_s, period_s, picture in _pictures(path, with_colour):
+        home = next((held for at_s, held in waiting if abs(at_s - time_s) < period_s / 2 and title not in held), None)
+        if home is None:
+            home = {}
+            waiting = sorted([*waiting, (time_s, home)], key=lambda capture: capture[0])
+        home[title] = picture
+        if len(waiting) > WAITING and "DEPTH" in (ready := waiting.pop(0)[1]):
+            yield ready
+    yield from (held for _, held in waiting if "DEPTH" in held)
+
+
+def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
+    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError where it breaks."""
+    with _opened(path) as container:
+        tracks = {title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"}
+        title_of = {s.index: title for title, s in tracks.items()}
+        period_s = 1.0 / float(tracks["DEPTH"].average_rate or 30)
+        for track in tracks.values():
+            # A picture may state another size than its track.
+            track.codec_context.options = {"max_pixels": str(FRAME_PIXELS)}
+        try:
+            delay_s = int(container.metadata.get("K4A_DEPTH_DELAY_NS", 0)) * 1e-9
+            for packet in container.demux(*tracks.values()):
+                title = title_of[packet.stream.index]
+                for picture in packet.decode():
+                    form = "rgb24" if title == "COLOR" else "gray16le"
+                    # The depth camera may be set to fire after the colour camera; both belong to one capture.
+                    shift_s = 0.0 if title == "COLOR" else delay_s
+                    yield title, float(picture.time or 0.0) - shift_s, period_s, picture.to_ndarray(format=form)
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: cannot be decoded ({error})", legal=LEGAL_MKV, fix="record it again") from error
+
+
+def _refuse_truncated(path: Path) -> None:
+    """Compare the file's length with what its Segment element states (Matroska: an ID, then a variable-length size)."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    at = head.find(SEGMENT_ID) + len(SEGMENT_ID)
+    if at < len(SEGMENT_ID) or at >= len(head) or head[at] == 0:
+        raise UserError(f"{path}: is no Matroska file, or is truncated", legal=LEGAL_MKV, fix="copy or record it again")
+    length = 9 - head[at].bit_length()
+    bits = 7 * length
+    size = int.from_bytes(head[at : at + length], "big") & ((1 << bits) - 1)
+    expected, found = at + length + size, path.stat().st_size
+    if size != (1 << bits) - 1 and found < expected:
+        what = f"{path}: is truncated: {found} of {expected} bytes"
+        raise UserError(what, legal="a whole recording", fix="copy or record it again")
+
+
+LEGAL_STRAY = "Stray Scanner's folder: depth/*.png, confidence/*.png, camera_matrix.csv, odometry.csv"
+LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
+COLOUR_WIDTHS = (1920, 1280, 640, 3840)
+"""Widths of the pictures that ARKit's lens may be of; all are 4 : 3, as its depth is."""
+BLUR_PX = 0.5  # motion over this much of a pixel spreads an edge further than the sensor itself does
+
+
+def _recording(
+    path: Path,
+    asked: Asked,
+    read: Callable[[], Iterator[Frame]],
+    size: tuple[int, int],
+    scaled_lens: Callable[[], tuple[Lens, None]],
+    files: tuple[Path, ...],
+    poses: tuple[np.ndarray, np.ndarray, str],
+    scale_m: float,
+    writer: str,
+) -> Recording:
+    """Return the recording of either program. ``size``: width, height; ``poses``: places, quaternions, their source."""
+    lens, lens_files = lens_for(str(path), asked, *size, scaled_lens)
+    notes = () if lens_files or asked.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
+    first_m = next(read()).z_m
+    median_m = float(np.median(first_m[np.isfinite(first_m)])) if np.isfinite(first_m).any() else 1.0
+    warnings = _motion_warnings(*poses, asked.frames, lens, median_m)
+    more = {"files": (*files, *lens_files), "lens": lens, "notes": notes, "warnings": warnings}
+    return Recording.begun(path.name, read, scale_m, "milli" in writer, unit_from=writer, **more)
+
+
+def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m: float) -> Frame:
+    if confidence is not None:
+        if confidence.shape != stored.shape:
+            raise UserError(f"{name}: its confidence has {confidence.shape} pixels, the depth {stored.shape}")
+        stored = np.where(confidence > 0, stored, stored.dtype.type(0))
+    return frame_of(name, stored, scale_m)
+
+
+def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> tuple[Lens, None]:
+    """Scale the lens of a colour picture to the depth picture of the same view."""
+    across, down = size[0] / max(colour[0], 1), size[1] / max(colour[1], 1)
+    fx, fy, cx, cy = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
+    good = np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
+    if not good or not (0 < cx < colour[0] and 0 < cy < colour[1] and fy > 0):
+        what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is no lens of {size} pixels"
+        raise UserError(f"{name}: {what}", fix="pass --intrinsics FILE with the lens of the depth pictures")
+    # positions count from the first pixel's centre
+    return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5), None
+
+
+def _motion_warnings(
+    places_m: np.ndarray, turns: np.ndarray, source: str, frames: slice | None, lens: Lens, median_m: float
+) -> tuple[str, ...]:
+    """Warn where the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
+    chosen = frames or slice(None)
+    places_m, turns = places_m[chosen], turns[chosen]
+    if len(places_m) < 2 or not np.isfinite([*places_m.ravel(), *turns.ravel()]).all():
+        return ()
+    moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
+    unit = turns / np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-12)
+    turned = float(2 * np.arccos(np.clip(np.abs(unit @ unit[0]), 0, 1)).max())
+    blur_px = lens.fx * (turned + moved_m / median_m)
+    if blur_px <= BLUR_PX:
+        return ()
+    return (
+        f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees during the {len(places_m)}"
+        f" frames ({source}), up to {blur_px:.2g} pixels on the target, so their average is blurred: --max-frames 1"
+        " takes the first frame alone",
+    )
+
+
+def is_stray(folder: Path) -> bool:
+    """Return whether a folder is Stray Scanner's."""
+    return (folder / "camera_matrix.csv").is_file() and (folder / "depth").is_dir()
+
+
+def open_stray(folder: Path, asked: Asked) -> Recording:
+    """Open Stray Scanner's folder. Raises UserError where a file is broken or the lens' resolution cannot be told."""
+    depths = depth_files(folder / "depth")
+    height, width = read_depth_png(depths[0]).shape
+    beside = [folder / "confidence" / path.name for path in depths]
+    confidences = tuple(path if path.is_file() else None for path in beside)
+    scale_m = asked.scale_m or UNITS_M["mm"]
+    matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
+
+    def scaled_lens() -> tuple[Lens, None]:
+        k = _table(matrix)
+        if k.shape != (3, 3):
+            raise UserError(f"{matrix}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
+        across = next((w for w in COLOUR_WIDTHS if abs(2 * k[0, 2] - w) < 0.05 * w), None)
+        if across is None:
+            what = f"cx = {k[0, 2]:g} is the centre of no picture of ARKit"
+            raise UserError(f"{matrix}: {what}", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
+        return _scaled(str(matrix), k, (across, across * 3 // 4), (width, height))
+
+    # x y z, then the quaternion
+    poses = _table(odometry)[:, 2:9] if odometry.is_file() else np.zeros((0, 7))
+    files = (path for path in (*depths, *confidences, matrix, odometry) if path and path.is_file())
+    read = partial(_stray_frames, depths, confidences, scale_m)
+    motion, writer = (poses[:, :3], poses[:, 3:], odometry.name), "Stray Scanner, which writes millimetres"
+    return _recording(folder, asked, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer)
+
+
+def _stray_frames(depths: tuple[Path, ...], confidences: tuple[Path | None, ...], scale_m: float) -> Iterator[Frame]:
+    for depth, confidence in zip(depths, confidences, strict=True):
+        sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
+        yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
+
+
+def _table(path: Path) -> np.ndarray:
+    """Return the numbers of a small CSV, (rows, columns), without its line of names."""
+    with damage_told(f"{path}: cannot be read as a table of numbers", LEGAL_STRAY):
+        text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
+        lines = (line.strip(" ,\r") for line in text.splitlines() if re.match(r"\s*[-+.\d]", line))
+        table = np.array([[float(cell) for cell in re.split(r"[,;\s]+", line) if cell] for line in lines], float)
+        if table.ndim != 2 or (path.stem == "odometry" and table.shape[1] < 9):
+            raise ValueError("its lines differ in length or are too short")
+    return table
+
+
+def open_r3d(path: Path, asked: Asked) -> Recording:
+    """Open Record3D's .r3d. Raises UserError where it is broken or pyliblzfse, which unpacks its depth, is missing."""
+    with _archive(path) as archive:
+        if "metadata" not in archive.namelist() or not _depth_names(archive):
+            held = ", ".join(archive.namelist()[:6]) or "nothing"
+            raise UserError(f"{path}: holds no capture of Record3D ({held[:200]})", legal=LEGAL_R3D)
+        content = _content(path, archive, "metadata")
+    with damage_told(f"{path}: its metadata cannot be read", LEGAL_R3D):
+        told = strict_json(content)
+        k = np.array([float(x) for x in told["K"]]).reshape(3, 3).T
+        width, height = int(told.get("dw", 192)), int(told.get("dh", 256))
+        colour = int(told["w"]), int(told["h"])
+        poses = np.array(told.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
+    refuse_pixels(str(path), width, height)
+    scale_m = asked.scale_m or UNITS_M["m"]
+    scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))
+    read = partial(_r3d_frames, path, (width, height), scale_m)
+    motion, writer = (poses[:, 4:], poses[:, :4], "its metadata"), "Record3D, which writes metres"
+    return _recording(path, asked, read, (width, height), scaled_lens, (path,), motion, scale_m, writer)
+
+
+def _r3d_frames(path: Path, size: tuple[int, int], scale_m: float) -> Iterator[Frame]:
+    """Yield the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
+    width, height = size
+    with _archive(path) as archive:
+
+        def plane(name: str, kind: str) -> np.ndarray:
+            expected = np.dtype(kind).itemsize * width * height
+            unpacked = _lzfse(f"{path}: {name}", _content(path, archive, name), expected)
+            return np.frombuffer(unpacked, kind).reshape(height, width)
+
+        for name in _depth_names(archive):
+            beside = f"{name.removesuffix('.depth')}.conf"
+            sure = plane(beside, "u1") if beside in archive.namelist() else None
+            yield _frame(f"{path.name} {name}", plane(name, "<f4"), sure, scale_m)
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    with damage_told(f"{path}: is no archive of Record3D, or is cut off", LEGAL_R3D):
+        return zipfile.ZipFile(path)
+
+
+def _depth_names(archive: zipfile.ZipFile) -> list[str]:
+    found = [name for name in archive.namelist() if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
+    return sorted(found, key=lambda name: int(Path(name).stem))
+
+
+def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return an entry's bytes, no more than `files.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
+    refuse_bytes(f"{path}: {name}", archive.getinfo(name).file_size, TEXT_BYTES)
+    with damage_told(f"{path}: {name} cannot be read", LEGAL_R3D), archive.open(name) as stream:
+        return stream.read(TEXT_BYTES)
+
+
+def _lzfse(name: str, packed: bytes, expected: int) -> bytes:
+    """Unpack Apple's LZFSE. Raises UserError where it does not unpack to as many bytes as expected."""
+    try:
+        import liblzfse  # type: ignore[import-not-found]
+    except ImportError as error:
+        what = f"{name}: is compressed by LZFSE, and the package that unpacks it is not installed"
+        raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
+    with damage_told(f"{name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
+        unpacked: bytes = liblzfse.decompress(packed)
+        if len(unpacked) != expected:
+            raise ValueError(f"{len(unpacked)} bytes, not {expected}")
+    return unpacked

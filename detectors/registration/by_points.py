@@ -1,0 +1,439 @@
+"""Registration of clouds: iterative closest point, rigid coherent point drift, RGB-D odometry.
+
+ICP goes coarse to fine from the guess. Point to point is what MATLAB's `pcregistericp` does by default; here pairs are
+limited in distance, MATLAB's are not.
+
+Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the moving cloud's points are
+centres of Gaussians of one width, together with a uniform component for outliers; the fixed cloud is drawn from them.
+As MATLAB's `pcregistercpd` with Transform "Rigid": both clouds are set to zero mean, the start is the width of all
+pairs, the iteration stops after so many steps or when the log likelihood changes by no more than a share. The two
+clouds share one unit of length, and the start is the guess, of which only the turn matters.
+
+Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) sets each view against the one before it, starting from
+no motion, by colour and depth together; steps are composed to the first view, so that errors add up. Only the target is
+shown to it: on a turntable the room does not move with the target. No loop is closed, no map is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import factorial
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+
+from detectors.average import CORRELATED_PIXELS
+from detectors.marks.pairing import kabsch
+from detectors.open3d_library import open3d_on_one_thread
+from detectors.registration.registered import (
+    MIN_OVERLAP,
+    SLIDES,
+    Registration,
+    clouds_of,
+    clustered_sandwich,
+    displacement_jacobian,
+    failed,
+    local_normals,
+    moved_by,
+    moved_m,
+    sampling_of,
+    still_moving,
+)
+from detectors.registration.settings import CpdRegistration, IcpRegistration
+from detectors.surface import SurfaceConfig, fit_surface
+from detectors.views import PreparedView
+from harness.vocabulary.geometry import MM, Lens, Region, transform_points
+
+GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
+"""Usual error of a nominal pose; first pairs may lie twice as far apart as it moves the outermost point."""
+FINEST_PITCHES = 3.0
+"""Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
+STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
+"""A stage ends after so many iterations, or with a smaller change of the share of points that have a partner and of
+the partners' root mean square distance in metres."""
+CONVERGED_PITCHES = 0.05
+SLOPE_STEP_M = 1 * MM
+
+
+def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> Registration:
+    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets. ``covariance``:
+    see `_covariance`."""
+    from scipy.spatial import cKDTree
+
+    fixed, moving, start, notes, few = clouds_of(reference, view, config.points)
+    if few:
+        return failed(view, "icp", start, few, *notes)
+    sampling = sampling_of(view)
+    tree = cKDTree(fixed)
+    local, real = _normals(reference, fixed) if config.estimation == "point_to_plane" else (None, None)
+    T, moved, iterations, step_m = np.eye(4) if start is None else start, moving, 0, np.inf
+    for limit_m in stages_m(sampling.pitch_m, sampling.extent_m):
+        last = np.full(2, np.inf)
+        for _ in range(STAGE_ITERATIONS):
+            moved = transform_points(T, moving)
+            apart, paired, _ = _pairs(tree, local, moved, limit_m)
+            if paired.sum() < 3:
+                failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
+                return failed(view, "icp", start, failure, *notes)
+            change = _step(moved[paired], apart[paired], to_plane=local is not None)
+            T, step_m = change @ T, moved_m(change, moved)
+            iterations += 1
+            now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
+            if np.abs(now - last).max() < LEAST_CHANGE:
+                break
+            last = now
+    left, _, right = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = left @ right
+    moved = transform_points(T, moving)
+    apart, paired, _ = _pairs(tree, local, moved, limit_m)
+    covariance = _covariance(tree, real, moved, limit_m, sampling.pitch_m)
+    return Registration(
+        view=view.view.name,
+        method="icp",
+        T_reference_view=T,
+        covariance=covariance,
+        centre_m=moved.mean(axis=0),
+        residual_m=float(np.sqrt(np.sum(apart**2) / max(paired.sum(), 1))),
+        pairs=int(paired.sum()),
+        iterations=iterations,
+        converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
+        failure=still_moving(step_m, sampling.pitch_m) or ("" if np.isfinite(covariance).all() else SLIDES),
+        notes=notes,
+    )
+
+
+def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
+    """Return the greatest distance of a pair in each stage: from twice a usual guess error, halved to three pitches."""
+    finest = FINEST_PITCHES * pitch_m
+    limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
+    while limits[-1] > finest:
+        limits.append(max(limits[-1] / 2, finest))
+    return tuple(limits)
+
+
+def _pairs(
+    tree: Any, normals: np.ndarray | None, moved_m: np.ndarray, limit_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vectors (n, 3) to the partners that the method minimises, along the partners' ``normals`` if there are any (zero
+    without a partner), the mask (n,) of points that have a partner, and the partners' indices (n,)."""
+    distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
+    paired = np.isfinite(distances)
+    nearest = np.where(paired, nearest, 0)
+    apart = np.where(paired[:, None], moved_m - tree.data[nearest], 0.0)
+    if normals is not None:
+        apart = np.einsum("ni,ni->n", apart, normals[nearest])[:, None] * normals[nearest]
+    return apart, paired, nearest
+
+
+def _step(moved_m: np.ndarray, apart_m: np.ndarray, to_plane: bool) -> np.ndarray:
+    """(4, 4) motion that brings points (n, 3) to their partners."""
+    if not to_plane:
+        return kabsch(moved_m, moved_m - apart_m, np.ones(len(moved_m)))
+    size = np.linalg.norm(apart_m, axis=1)
+    some = size > 0
+    centre = moved_m.mean(axis=0)
+    normals = apart_m[some] / size[some, None]
+    rows = np.einsum("ni,nij->nj", normals, displacement_jacobian(moved_m[some], centre))
+    return moved_by(np.linalg.lstsq(rows, -size[some], rcond=1e-6)[0], centre)
+
+
+def _covariance(
+    tree: Any, normals: np.ndarray | None, moved_m: np.ndarray, limit_m: float, pitch_m: float
+) -> np.ndarray:
+    """(6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid: H^-1 S H^-1. Point
+    to point: H is the cost's curvature with pairs found anew, by differences over one pitch (Bengtsson & Baerveldt,
+    Robotics and Autonomous Systems 44:29, 2003), because with pairs held fixed the inside of a flat mark would seem to
+    resist sliding. Point to plane: H is the closed form with pairs held fixed (Censi, ICRA 2007). S is the scatter of
+    the gradients, summed within cubes of 5 pixels whose errors are common. Not in it: that the iteration may stop at
+    one of many near minima. NaN where a motion costs nothing."""
+    arm = moved_m - moved_m.mean(axis=0)
+    jacobian = displacement_jacobian(arm, np.zeros(3))
+    apart, paired, nearest = _pairs(tree, normals, moved_m, limit_m)
+    scores = np.einsum("nij,ni->nj", jacobian, apart)
+    if normals is not None:
+        rows = np.einsum("ni,nij->nj", normals[nearest[paired]], jacobian[paired])
+        return clustered_sandwich(rows.T @ rows, scores - scores.mean(axis=0), moved_m, pitch_m)
+
+    def half_cost(motion: np.ndarray) -> float:
+        # a point without a partner counts as if it were at the limit
+        off, has, _ = _pairs(tree, None, moved_m + jacobian @ motion, limit_m)
+        return float(np.sum(off**2) + limit_m**2 * np.sum(~has)) / 2
+
+    # a step moves the points by a pitch, root mean square; a turn about an axis moves points by their distance from it
+    squares = np.mean(arm**2, axis=0)
+    sizes = pitch_m / np.sqrt(np.maximum([*(squares.sum() - squares), 1.0, 1.0, 1.0], 1e-12))
+    sizes = np.minimum(sizes, [0.1] * 3 + [pitch_m] * 3)
+    steps, curvature = np.diag(sizes), np.empty((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            part = 0.5 if i == j else 1.0
+            both, across = part * (steps[i] + steps[j]), part * (steps[i] - steps[j])
+            mixed = half_cost(both) + half_cost(-both) - half_cost(across) - half_cost(-across)
+            curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
+    return clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
+
+
+def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (n, 3) of the reference's target at its points: of the 25 nearest points, with their noise, as ICP uses
+    them; and what holds the pose, of the robust cubic through the target, and the local one only where it departs from
+    that by more than noise makes any of them depart (one cloud in a thousand). A noisy normal seems to hold a flat mark
+    in its plane, where nothing does."""
+    from scipy.spatial import cKDTree
+
+    target, (px, py, _) = reference.points_m, fixed_m.T
+    x, y, z = target.T
+    surface = fit_surface(x, y, z, SurfaceConfig(method="bisquare", degree=3 if len(target) >= 100 else 1))
+    slopes = [
+        (surface.evaluate(px + dx, py + dy) - surface.evaluate(px - dx, py - dy)) / (2 * SLOPE_STEP_M)
+        for dx, dy in ((SLOPE_STEP_M, 0.0), (0.0, SLOPE_STEP_M))
+    ]
+    smooth = np.stack([*slopes, -np.ones(len(px))], axis=1)
+    smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
+    count = min(CORRELATED_PIXELS, len(target))
+    local = local_normals(target[cKDTree(target).query(fixed_m, k=count)[1]].reshape(len(fixed_m), count, 3))
+    local *= np.where(np.einsum("ni,ni->n", local, smooth) < 0, -1.0, 1.0)[:, None]
+    squared = np.sum((local - smooth) ** 2, axis=1)
+    # two axes: a squared length has a median of 2 ln 2 variances and exceeds 2 ln(1 / p) with chance p
+    variance = float(np.median(squared)) / (2 * np.log(2))
+    departs = squared > 2 * np.log(len(fixed_m) / 1e-3) * variance
+    return local, np.where(departs[:, None], local, smooth)
+
+
+LEAST_VARIANCE = 10 * float(np.finfo(np.float64).eps)
+"""Variance in squared normalised units at which the clouds coincide (the authors' own criterion)."""
+# reductions may be reordered, which is what lets them run in parallel lanes; always the same way on one machine
+FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
+EXPONENTIAL = tuple(1.0 / factorial(k) for k in range(13, -1, -1))
+"""exp(x) = exp(x / 64)^64: a series to degree 13 sees -1 to 0 only, without branches, so that it runs in lanes."""
+LEAST_EXPONENT, GREATEST_EXPONENT = -64.0, 700.0
+"""Weights below exp(-64) of the nearest component's are negligible; beyond exp(700) of it all is an outlier."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m`` the Gaussians' width; ``matched`` the
+    expected number of fixed points that are no outliers; ``step_m`` how far the last iteration moved the points, root
+    mean square; ``background`` as `posterior_moments` takes it: a share, without unit."""
+
+    T_fixed_moving: np.ndarray
+    sigma_m: float
+    matched: float
+    iterations: int
+    converged: bool
+    step_m: float
+    background: float
+
+
+def coherent_point_drift(
+    fixed_m: np.ndarray, moving_m: np.ndarray, config: CpdRegistration, T_start: np.ndarray | None = None
+) -> Drift:
+    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three. ``T_start`` (4, 4): moving to
+    fixed; the identity where not given."""
+    start = np.eye(4) if T_start is None else T_start
+    centre = fixed_m.mean(axis=0)
+    scale = max(float(np.sqrt(np.sum(np.var(fixed_m, axis=0)))), 1e-12)
+    fixed = (fixed_m - centre) / scale
+    turned = transform_points(start, moving_m)
+    moving = (turned - turned.mean(axis=0)) / scale
+    turn, shift = np.eye(3), np.zeros(3)
+    # a third of the mean squared distance of all pairs; both clouds have zero mean
+    variance = float((np.sum(fixed**2) / len(fixed) + np.sum(moving**2) / len(moving)) / 3)
+    outliers = config.outlier_ratio / (1 - config.outlier_ratio) * len(moving) / len(fixed)
+    last, change, step, matched, iterations = 0.0, np.inf, np.inf, 0.0, 0
+    while iterations < config.max_iterations and change > config.tolerance and variance > LEAST_VARIANCE:
+        iterations += 1
+        moments, objective = posterior_moments(fixed, moving, variance, outliers * (2 * np.pi * variance) ** 1.5)
+        objective += 1.5 * len(fixed) * np.log(variance)
+        change, last = abs((objective - last) / objective), objective
+        # the maximisation, with the scale held at 1
+        weight, total = moments[:, 3, 3], moments.sum(axis=0)
+        matched = float(total[3, 3])
+        mean_x, mean_y = weight @ fixed / matched, total[:3, 3] / matched
+        cross = fixed.T @ moments[:, :3, 3] - matched * np.outer(mean_x, mean_y)
+        left, _, right = np.linalg.svd(cross)
+        d_turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        d_shift = mean_x - d_turn @ mean_y
+        spread_x = float(weight @ np.sum(fixed**2, axis=1)) - matched * float(mean_x @ mean_x)
+        spread_y = float(np.trace(total[:3, :3])) - matched * float(mean_y @ mean_y)
+        variance = (spread_x + spread_y - 2 * float(np.sum(cross * d_turn))) / (3 * matched)
+        variance = max(variance, LEAST_VARIANCE / 2)
+        moved = moving @ d_turn.T + d_shift
+        step = float(np.sqrt(np.mean(np.sum((moved - moving) ** 2, axis=1)))) * scale
+        moving, turn, shift = moved, d_turn @ turn, d_turn @ shift + d_shift
+    T = np.eye(4)
+    T[:3, :3] = turn
+    T[:3, 3] = centre + scale * shift - turn @ turned.mean(axis=0)
+    background = outliers * (2 * np.pi * variance) ** 1.5
+    converged = bool(change <= config.tolerance or variance <= LEAST_VARIANCE)
+    return Drift(T @ start, float(np.sqrt(variance)) * scale, matched, iterations, converged, step, background)
+
+
+def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> Registration:
+    """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
+    Few iterations are the rule, so one that stops by their number fails only where its last step still moved the
+    points."""
+    fixed, moving, start, notes, few = clouds_of(reference, view, config.points)
+    if few:
+        return failed(view, "cpd", start, few, *notes)
+    drift = coherent_point_drift(fixed, moving, config, start)
+    pitch = sampling_of(view).pitch_m
+    covariance = drift_covariance(fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch)
+    failure = "" if drift.converged else still_moving(drift.step_m, pitch)
+    if not failure and not np.isfinite(covariance).all():
+        failure = SLIDES
+    if not drift.converged:
+        notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
+    return Registration(
+        view=view.view.name,
+        method="cpd",
+        T_reference_view=drift.T_fixed_moving,
+        covariance=covariance,
+        centre_m=fixed.mean(axis=0),
+        residual_m=drift.sigma_m * np.sqrt(3.0),
+        pairs=round(drift.matched),
+        iterations=drift.iterations,
+        converged=drift.converged,
+        failure=failure,
+        notes=notes,
+    )
+
+
+def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
+    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid. The
+    pixels of a surface are no independent draws, so it is H^-1 S H^-1 with H the observed information (complete
+    information less that which is missing because the correspondence is not known; Louis, JRSS B 44:226, 1982) and S
+    the scatter of the scores, summed within cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13,
+    1986). The moving cloud's noise is taken to be as large. Both are taken at a Gaussian width of no less than a pitch,
+    below which the likelihood shows how two grids of pixels beat. NaN where H is not positive definite."""
+    centre = fixed_m.mean(axis=0)
+    x = fixed_m - centre
+    variance = max(drift.sigma_m, pitch_m) ** 2
+    moments, _ = posterior_moments(
+        x, moved_m - centre, variance, drift.background * (variance / drift.sigma_m**2) ** 1.5
+    )
+    # the score of a pair is J'(x - y) / variance = (y x x, x - y) / variance, linear in (y, 1)
+    linear = np.zeros((len(x), 6, 4))
+    linear[:, :3, :3] = np.swapaxes(np.cross(np.eye(3)[None], x[:, None]), 1, 2)
+    linear[:, 3:, :3], linear[:, 3:, 3] = -np.eye(3), x
+    scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
+    within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
+    # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
+    parts = displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
+    parts[:3] -= parts[3]
+    complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
+    information = complete - (within - scores.T @ scores)
+    both = 1 + len(fixed_m) / len(moved_m)
+    return clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m) * both
+
+
+def posterior_moments(
+    fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
+) -> tuple[np.ndarray, float]:
+    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3), where they stand now, for each
+    fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the Gaussians' factor.
+    ``background``: the uniform component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n.
+    The nearest component's weight is divided out, so that nothing underflows at w = 0."""
+    sums, objective = _expectation(fixed, np.ascontiguousarray(moving.T), variance, background)
+    return sums[:, [0, 1, 2, 3, 1, 4, 5, 6, 2, 5, 7, 8, 3, 6, 8, 9]].reshape(-1, 4, 4), objective
+
+
+@numba.njit(**FAST)
+def _expectation(fixed: np.ndarray, moving: np.ndarray, variance: float, background: float) -> tuple[np.ndarray, float]:
+    """Upper triangles (n, 10) of the moments, one row of posteriors at a time; ``moving`` (3, m)."""
+    count, half = moving.shape[1], 0.5 / variance
+    sums, weight = np.empty((len(fixed), 10)), np.empty(count)
+    objective = 0.0
+    for i in range(len(fixed)):
+        x, y, z = fixed[i]
+        least = np.inf
+        for m in range(count):
+            d = (x - moving[0, m]) ** 2 + (y - moving[1, m]) ** 2 + (z - moving[2, m]) ** 2
+            weight[m] = d
+            least = min(least, d)
+        total = 0.0
+        for m in range(count):
+            u = max((least - weight[m]) * half, LEAST_EXPONENT) / 64.0
+            e = 0.0
+            for c in EXPONENTIAL:
+                e = e * u + c
+            for _ in range(6):
+                e = e * e
+            weight[m] = e
+            total += weight[m]
+        xx = xy = xz = sx = yy = yz = sy = zz = sz = 0.0
+        for m in range(count):
+            e, p, q, r = weight[m], moving[0, m], moving[1, m], moving[2, m]
+            xx, xy, xz, sx = xx + e * p * p, xy + e * p * q, xz + e * p * r, sx + e * p
+            yy, yz, sy, zz, sz = yy + e * q * q, yz + e * q * r, sy + e * q, zz + e * r * r, sz + e * r
+        exponent = least * half
+        full = total
+        if background > 0.0:
+            full += background * np.exp(min(exponent, GREATEST_EXPONENT))
+        sums[i] = np.array([xx, xy, xz, sx, yy, yz, sy, zz, sz, total]) / full
+        far = background > 0.0 and exponent > GREATEST_EXPONENT
+        objective -= np.log(background) if far else np.log(full) - exponent
+    return sums, objective
+
+
+DEPTH_DIFFERENCE_M = 0.03
+"""Largest difference in depth of a pair of pixels (Open3D's own default)."""
+DRIFTS = "no covariance: what Open3D's odometry gives counts its pairs, and does not know how far it slid"
+
+
+def register_by_odometry(views: Sequence[PreparedView]) -> list[Registration]:
+    """Register views but the first to the first, in the order given: that of the walk. A view that odometry loses
+    (Open3D says so, or less than a tenth of the target's pixels pair) is a failure, and so is every view after it.
+    ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
+    T_reference_view, lost, found = np.eye(4), "", []
+    canvas = _canvas_of(views)
+    lens = canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy
+    with open3d_on_one_thread() as o3d:
+        methods, camera = o3d.pipelines.odometry, o3d.camera.PinholeCameraIntrinsic(*lens)
+        option = methods.OdometryOption(depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3)
+        term = methods.RGBDOdometryJacobianFromHybridTerm()
+        images = [_image(o3d, view, canvas) for view in views]
+        for before, now, view in zip(images, images[1:], views[1:], strict=False):
+            if not lost:
+                success, step, information = methods.compute_rgbd_odometry(now, before, camera, np.eye(4), term, option)
+                # the information's last diagonal element is the sum of 1 over pairs
+                pairs = round(float(information[5, 5])) if success and np.isfinite(step).all() else 0
+                pixels = max(int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before))
+                if pairs < MIN_OVERLAP * pixels:
+                    lost = f"odometry lost its way at {view.view.name}: {pairs} pixels match the view before it"
+            if lost:
+                found.append(failed(view, "odometry", None, lost))
+                continue
+            T_reference_view = T_reference_view @ step
+            found.append(Registration(view.view.name, "odometry", T_reference_view, pairs=pairs, notes=(DRIFTS,)))
+    return found
+
+
+def _canvas_of(views: Sequence[PreparedView]) -> Lens:
+    """One pinhole for all: the first lens's focal lengths, and room for every target's points."""
+    lens = views[0].view.cloud.lens
+    assert lens is not None
+    slopes = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views])
+    focal = np.array([lens.fx, lens.fy])
+    low = np.floor((slopes * focal).min(axis=0)) - 1
+    width, height = (np.ceil((slopes * focal).max(axis=0)) + 2 - low).astype(int)
+    return Lens(int(width), int(height), lens.fx, lens.fy, -float(low[0]), -float(low[1]))
+
+
+def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
+    """The view's target as Open3D's intensity and depth on the canvas, both without distortion."""
+    cloud = view.view.cloud
+    lens = cloud.lens
+    assert lens is not None and cloud.rgb is not None
+    slopes = canvas.region_slopes(Region(0, canvas.height, 0, canvas.width))
+    pixels = lens.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1))
+    u, v = (pixels - [cloud.region.col0, cloud.region.row0]).astype(np.float32).transpose(2, 0, 1)
+    z = np.where(view.inside, cloud.points_m[..., 2], 0.0).astype(np.float32)
+    # depth is not interpolated, because the mean of target and nothing is neither
+    depth = cv2.remap(z, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    colour = cv2.remap(cloud.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    images = (o3d.geometry.Image(np.ascontiguousarray(image)) for image in (colour, depth))
+    return o3d.geometry.RGBDImage.create_from_color_and_depth(
+        *images, depth_scale=1.0, depth_trunc=float(depth.max()) + 1.0, convert_rgb_to_intensity=True
+    )

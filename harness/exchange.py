@@ -1,0 +1,328 @@
+"""Simulated captures in the forms that other people's programs read: TUM RGB-D sequences, ROS 2 bags, MCAP."""
+
+from __future__ import annotations
+
+import errno
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import FrameSource, Lens, invert
+
+START_NS = 1_000_000_000 * 10**9
+"""Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
+PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
+BOARD_FRAME = "board"
+"""Name of the world's frame: x along the row of holes, y up the face, z out of it to the camera, origin at its centre.
+"""
+
+
+@dataclass(frozen=True)
+class ExportedView:
+    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_camera_board`` (4, 4) is the true pose."""
+
+    name: str
+    source: FrameSource
+    T_camera_board: np.ndarray
+    n_frames: int
+    frames_per_second: float
+    start_ns: int
+
+    @property
+    def lens(self) -> Lens:
+        """The lens of the whole sensor."""
+        lens = self.source.lens
+        assert lens is not None, "only simulated cameras are exported, and they have a lens"
+        return lens
+
+    @property
+    def T_board_camera(self) -> np.ndarray:
+        """(4, 4): where the camera stands in the board's frame."""
+        return invert(self.T_camera_board)
+
+    def stamp_ns(self, frame: int) -> int:
+        """Return the time of a frame."""
+        return self.start_ns + round(frame * 1e9 / self.frames_per_second)
+
+    def exposures(self) -> Iterator[Exposure]:
+        """Yield the frames, each on the whole sensor: no range, black and no amplitude outside the simulated region."""
+        lens, region = self.lens, self.source.region
+
+        def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
+            whole = np.full((lens.height, lens.width, *values.shape[2:]), outside, values.dtype)
+            whole[region.row0 : region.row1, region.col0 : region.col1] = values
+            return whole
+
+        for number, frame in enumerate(self.source.frames()):
+            rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
+            amplitude = frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
+            yield Exposure(
+                stamp_ns=self.stamp_ns(number),
+                z_m=on_sensor(frame.z_m.astype(np.float32), np.nan),
+                rgb=on_sensor(rgb, 0),
+                amplitude=on_sensor(amplitude.astype(np.float32), np.nan),
+            )
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One frame on the whole sensor: ``z_m`` (h, w) float32, NaN where invalid; ``rgb`` (h, w, 3) uint8; ``amplitude``
+    (h, w) float32; ``stamp_ns`` since the epoch."""
+
+    stamp_ns: int
+    z_m: np.ndarray
+    rgb: np.ndarray
+    amplitude: np.ndarray
+
+
+def in_turn(
+    sources: Sequence[FrameSource], poses: Sequence[np.ndarray], n_frames: int, frames_per_second: float
+) -> tuple[ExportedView, ...]:
+    """Place views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    digits = max(2, len(str(len(sources) - 1)))
+    length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
+    return tuple(
+        ExportedView(
+            f"view_{number:0{digits}d}", source, pose, n_frames, frames_per_second, START_NS + number * length_ns
+        )
+        for number, (source, pose) in enumerate(zip(sources, poses, strict=True))
+    )
+
+
+def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
+    """Return (x, y, z, w) of a rigid transform's rotation, w >= 0, of unit length."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True).tolist()
+    return x, y, z, w
+
+
+# ---------------------------------------------------------------- TUM RGB-D
+
+
+UNITS_PER_M = 5000  # the benchmark's depth scale
+FARTHEST_M = (2**16 - 1) / UNITS_PER_M
+CALIBRATION = "rtabmap_calib.yaml"
+OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
+"""(3, 4): RTAB-Map's base (x forward, z up) from the camera's optical frame (z forward, y down)."""
+
+
+def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
+    """Write a sequence of all views into an empty folder. Raises UserError where two views have different lenses."""
+    lens = views[0].lens
+    if any(view.lens != lens for view in views):
+        raise UserError("the TUM RGB-D layout has one lens for all frames, and these views have several")
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir()
+        (folder / f"{name}_sync").symlink_to(name, target_is_directory=True)
+    rows, columns, inside = nearest_pixels(lens)
+    lines: dict[str, list[str]] = {
+        "rgb.txt": ["# color images", "# timestamp filename"],
+        "depth.txt": ["# depth maps, 5000 to the metre, 0: none", "# timestamp filename"],
+        "groundtruth.txt": ["# camera in the board's frame", "# timestamp tx ty tz qx qy qz qw"],
+        "associations.txt": [],
+    }
+    for view in views:
+        pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
+        place = " ".join(f"{value:.9g}" for value in pose)
+        for exposure in view.exposures():
+            depth = np.where(inside, depth_units(exposure.z_m)[rows, columns], 0).astype(np.uint16)
+            colour = np.where(inside[..., None], exposure.rgb[rows, columns], 0).astype(np.uint8)
+            time = seconds_text(exposure.stamp_ns)
+            for name, picture in (("rgb", colour[..., ::-1]), ("depth", depth)):
+                coded, content = cv2.imencode(".png", np.ascontiguousarray(picture))
+                assert coded
+                (folder / name / f"{time}.png").write_bytes(content.tobytes())
+                lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
+            lines["associations.txt"].append(f"{time} rgb/{time}.png {time} depth/{time}.png")
+            lines["groundtruth.txt"].append(f"{time} {place}")
+    for name, text in lines.items():
+        (folder / name).write_text("\n".join((*text, "")), encoding="utf-8")
+    (folder / CALIBRATION).write_text(calibration_text(lens), encoding="utf-8")
+
+
+def depth_units(z_m: np.ndarray) -> np.ndarray:
+    """Return (h, w) uint16 in 0.2 mm; 0 where there is no range or it lies beyond the 13.1 m that 16 bits hold."""
+    with np.errstate(invalid="ignore"):
+        held = (z_m > 0) & (z_m <= FARTHEST_M)
+    return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
+
+
+def nearest_pixels(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the nearest row and column of the lens' own image for each pixel of the pinhole image (both (h, w) int),
+    and whether that pixel exists (bool)."""
+    matrix, size = lens.matrix, (lens.width, lens.height)
+    u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
+    columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
+    inside = (columns >= 0) & (columns < lens.width) & (rows >= 0) & (rows < lens.height)
+    return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """Return a time as the benchmark writes it: seconds with six digits, exact to the microsecond."""
+    microseconds = (stamp_ns + 500) // 1000
+    return f"{microseconds // 10**6}.{microseconds % 10**6:06d}"
+
+
+def calibration_text(lens: Lens) -> str:
+    """Return the pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
+
+    def matrix(name: str, values: np.ndarray) -> tuple[str, ...]:
+        data = ", ".join(map(repr, values.astype(float).ravel().tolist()))
+        return f"{name}:", f"   rows: {values.shape[0]}", f"   cols: {values.shape[1]}", f"   data: [ {data} ]"
+
+    lines = (
+        *("%YAML:1.0", "---", "camera_name: rtabmap_calib"),
+        *(f"image_width: {lens.width}", f"image_height: {lens.height}"),
+        *matrix("camera_matrix", lens.matrix),
+        "distortion_model: plumb_bob",
+        *matrix("distortion_coefficients", np.zeros((1, 5))),
+        *matrix("rectification_matrix", np.eye(3)),
+        *matrix("projection_matrix", np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1)),
+        *matrix("local_transform", OPTICAL_ROTATION),
+    )
+    return "\n".join((*lines, ""))
+
+
+# ---------------------------------------------------------------- ROS 2 bags
+
+
+Storage = Literal["sqlite3", "mcap"]
+POINTS_TOPIC = "/points2"
+INFO_TOPIC = "/depth/camera_info"
+POSE_TOPIC = "/tf_static"
+BAG_VERSION: Literal[8] = 8
+"""Version of metadata.yaml: the oldest that the library writes; later ROS distributions read it too."""
+FLOAT32 = 7  # sensor_msgs/PointField's code
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
+"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS' convention its field is declared as a float of these bytes."""
+FOREVER = (9223372036, 854775807)  # seconds and nanoseconds that ROS 2 writes for an unlimited duration
+
+
+def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
+    """Write one view's bag into ``folder``, which must not exist. MCAP is compressed. Raises OSError as files do."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    types = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(folder, version=BAG_VERSION, storage_plugin=plugin)
+    if storage == "mcap":
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+
+    def write(topic: str, stamp_ns: int, message: Any) -> None:
+        writer.write(topics[topic], stamp_ns, types.serialize_cdr(message, topics[topic].msgtype))
+
+    try:
+        with writer:
+            topics = {
+                topic: writer.add_connection(topic, kind, typestore=types, offered_qos_profiles=_qos(latched))
+                for topic, kind, latched in (
+                    (POSE_TOPIC, "tf2_msgs/msg/TFMessage", True),
+                    (INFO_TOPIC, "sensor_msgs/msg/CameraInfo", False),
+                    (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
+                )
+            }
+            slopes = _slopes_of(view.lens)
+            write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
+            for exposure in view.exposures():
+                write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
+                write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
+    except sqlite3.OperationalError as error:
+        # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
+        raise OSError(errno.ENOSPC, str(error), str(folder)) from error
+
+
+@lru_cache(maxsize=1)
+def _slopes_of(lens: Lens) -> np.ndarray:
+    """Return (h, w, 2) of the whole sensor: the views of an export share their lens."""
+    return lens.region_slopes(lens.whole)
+
+
+def frame_name(view: ExportedView) -> str:
+    """Return the name of a camera's optical frame; each view has its own, so that bags can be played together."""
+    return f"{view.name}_depth_optical_frame"
+
+
+def packed_points(exposure: Exposure, slopes: np.ndarray) -> np.ndarray:
+    """Return (h, w) of `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
+    points = np.zeros(exposure.z_m.shape, POINT)
+    x_y = slopes * exposure.z_m[..., None].astype(np.float64)
+    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], exposure.z_m
+    red, green, blue = np.moveaxis(exposure.rgb.astype(np.uint32), -1, 0)
+    points["rgb"] = red << 16 | green << 8 | blue
+    points["intensity"] = exposure.amplitude
+    return points
+
+
+# ---- messages --------------------------------------------------------------------------------------------------------
+
+
+def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
+    time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+
+
+def _cloud_message(types: dict[str, Any], view: ExportedView, exposure: Exposure, slopes: np.ndarray) -> Any:
+    points = packed_points(exposure, slopes)
+    field = types["sensor_msgs/msg/PointField"]
+    height, width = points.shape
+    return types["sensor_msgs/msg/PointCloud2"](
+        header=_header(types, frame_name(view), exposure.stamp_ns),
+        height=height,
+        width=width,
+        fields=[field(name=name, offset=i * 4, datatype=FLOAT32, count=1) for i, name in enumerate(POINT.names or ())],
+        is_bigendian=False,
+        point_step=POINT.itemsize,
+        row_step=POINT.itemsize * width,
+        data=points.reshape(-1).view(np.uint8),
+        is_dense=False,
+    )
+
+
+def _info_message(types: dict[str, Any], view: ExportedView, stamp_ns: int) -> Any:
+    """The lens in ROS' terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as the cloud is not rectified."""
+    lens = view.lens
+    distorted = any(lens.distortion)
+    region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return types["sensor_msgs/msg/CameraInfo"](
+        header=_header(types, frame_name(view), stamp_ns),
+        height=lens.height,
+        width=lens.width,
+        distortion_model="rational_polynomial" if distorted else "plumb_bob",
+        d=np.array(lens.distortion if distorted else (0.0,) * 5),
+        k=lens.matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def _pose_message(types: dict[str, Any], view: ExportedView) -> Any:
+    x, y, z, w = quaternion_of(view.T_board_camera)
+    shift = types["geometry_msgs/msg/Vector3"](**dict(zip("xyz", view.T_board_camera[:3, 3].tolist(), strict=True)))
+    turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+    transform = types["geometry_msgs/msg/TransformStamped"](
+        header=_header(types, BOARD_FRAME, view.start_ns),
+        child_frame_id=frame_name(view),
+        transform=types["geometry_msgs/msg/Transform"](translation=shift, rotation=turn),
+    )
+    return types["tf2_msgs/msg/TFMessage"](transforms=[transform])
+
+
+def _qos(latched: bool) -> tuple[Any, ...]:
+    """Reliable, the last ten; a latched topic is kept for those who subscribe later, as tf_static must be."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    endless, history = QosTime(*FOREVER), (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return (Qos(*history, durability, endless, endless, QosLiveliness.AUTOMATIC, endless, False),)

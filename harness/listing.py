@@ -1,0 +1,503 @@
+"""Plug-ins, folders of results and stored renders, as `harness.ls` lists and `harness.clean` removes them: only files
+that tofpod wrote, inside ``--out``. Listing only reads, and no link is followed."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import inspect
+import io
+import os
+import re
+import secrets
+import stat
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from harness.tables.outputs import CAPTURES, EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, REPORT, is_output
+from harness.tables.text import many
+from harness.vocabulary.declaration.yaml_source import read_yaml
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, lock, opened_lock, strict_json
+from harness.vocabulary.path_names import names_of, value_text
+from harness.vocabulary.plug_ins import Offer, PlugIns
+from harness.vocabulary.provenance import RESULTS_VERSION
+from harness.vocabulary.seeds import canonical_json
+from scenes.render.cache import StoredFile, damaged_renders, leftovers, longest_unused, removed, stored_renders
+
+BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
+SECONDS = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+
+
+def table_lines(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
+    """Yield lines with columns below each other; the last cell of a row is as long as it likes."""
+    columns = range(max((len(row) for row in rows), default=0))
+    widths = [max((len(row[k]) for row in rows if k < len(row) - 1), default=0) for k in columns]
+    for row in rows:
+        cells = [cell.ljust(widths[column]) for column, cell in enumerate(row[:-1])]
+        yield (indent + "  ".join([*cells, row[-1]])).rstrip()
+
+
+def size_text(count: float) -> str:
+    """Return a number of bytes with three digits, in powers of ten."""
+    for unit, factor in reversed(BYTES.items()):
+        if count >= 0.9995 * factor:
+            return f"{count / factor:.0f} {unit}" if count >= 99.95 * factor else f"{count / factor:.3g} {unit}"
+    return f"{count:.0f} B"
+
+
+def age_text(seconds: float) -> str:
+    """Return how long ago; what lies in the future, by a clock that was set, is now."""
+    if seconds < 60:
+        return "just now"
+    unit, length = ("min", 60) if seconds < 7200 else ("h", 3600) if seconds < 172_800 else ("days", 86_400)
+    return f"{seconds / length:.0f} {unit} ago"
+
+
+def bytes_of(text: str) -> int:
+    """Read a size such as ``5GB`` or ``500 MB``. Raises UserError."""
+    return round(_quantity(text, BYTES, "a size", "such as 500MB, 5GB or 1.5TB"))
+
+
+def seconds_of(text: str) -> float:
+    """Read an age such as ``30d``. Raises UserError."""
+    return _quantity(text, SECONDS, "an age", "such as 12h, 30d (days) or 4w (weeks)")
+
+
+def _quantity(text: str, units: Mapping[str, float], what: str, legal: str) -> float:
+    found = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
+    factors = {unit.lower(): factor for unit, factor in units.items()}
+    if found is None or found[2].lower() not in factors:
+        raise UserError(f"{text!r} is not {what}", legal=legal)
+    return float(found[1]) * factors[found[2].lower()]
+
+
+# ---------------------------------------------------------------- detectors and cameras
+
+
+Row = Mapping[str, Any]
+SETTABLE = {"detectors": "settings", "cameras": "numbers"}  # kinds of offers, and the name of what can be set of each
+
+
+def plug_ins(kind: str) -> PlugIns:
+    """Return the detectors or the cameras."""
+    if kind == "detectors":
+        from detectors import DETECTORS
+
+        return DETECTORS
+    from scenes.sensor.camera import CAMERAS
+
+    return CAMERAS
+
+
+def offered(kind: str) -> list[Row]:
+    """Return a row for each offer; what cannot be used has ``broken``, which says why, and ``fix``."""
+    rows: list[Row] = []
+    for offer in plug_ins(kind).offers():
+        try:
+            rows.append({**_origin(offer), **_facts(kind, offer.name)})
+            continue
+        except UserError as error:
+            mistake = error
+        except (Exception, SystemExit) as error:
+            if offer.built_in:
+                raise
+            mistake = plug_ins(kind).broken(offer, f"{type(error).__name__}: {error}")
+        rows.append({**_origin(offer), "broken": mistake.message, "fix": mistake.fix})
+    return rows
+
+
+def shown(kind: str, name: str) -> Row:
+    """Return an offer's row with all that can be set. Raises UserError where the name is unknown, taken twice or
+    broken."""
+    settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
+    return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
+
+
+def cells(kind: str, row: Row) -> tuple[str, ...]:
+    """Return a row as text."""
+    head = (row["name"], f"{row['package']} {row['package_version']}".strip())
+    if "broken" in row:
+        return (*head, f"broken: {row['broken']}")
+    if kind == "detectors":
+        mark = "(tests the harness, finds no damage) " if row["tests_the_harness"] else ""
+        return (*head, "" if row["version"] is None else f"version {row['version']}", f"{mark}{row['about']}")
+    near, far = row["nearest_m"], row["farthest_m"]
+    reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
+    return (*head, f"{row['columns']} x {row['rows']} px", reach, f"{row['wavelength_nm']:.4g} nm", row["title"])
+
+
+def _origin(offer: Offer) -> Row:
+    return {"name": offer.name, "package": offer.package, "package_version": offer.package_version}
+
+
+def _facts(kind: str, name: str) -> Row:
+    if kind == "detectors":
+        from detectors import detector_type, load_detector
+
+        loaded = detector_type(name)
+        try:
+            version = load_detector(name, {}).version
+        except UserError:  # not known without settings
+            version = None
+        about = (inspect.getdoc(loaded) or "").strip().partition("\n")[0]
+        tests = bool(getattr(loaded, "tests_the_harness", False))
+        return {"version": version, "about": about, "tests_the_harness": tests}
+    from scenes.sensor.camera import load_camera
+
+    camera = load_camera(name)
+    optics = camera.optics
+    return {
+        "title": camera.title,
+        "columns": optics.lens.width,
+        "rows": optics.lens.height,
+        "nearest_m": optics.nearest_m,
+        "farthest_m": optics.farthest_m if isfinite(optics.farthest_m) else None,
+        "wavelength_nm": optics.wavelength_nm,
+    }
+
+
+def _detector_settings(name: str) -> list[dict[str, Any]]:
+    """Every setting with its default and what is legal. Of a setting that is one of several kinds, those of the
+    default's kind."""
+    from pydantic import ValidationError
+
+    from detectors import detector_type
+    from harness.vocabulary.declaration.shape import Declared, kinds_of, legal_at
+
+    settings_type = detector_type(name).settings_type
+    try:
+        defaults = settings_type().to_data()
+    except ValidationError as error:
+        lacking = ", ".join(".".join(map(str, each["loc"])) for each in error.errors())
+        raise UserError(f"detector {name!r} has settings without a default: {lacking}") from error
+    declared = Declared(settings_type, defaults, {})
+
+    def legal(path: tuple[str, ...]) -> str:
+        around = kinds_of(declared.at(path[:-1]))
+        if around is not None and around[0] == path[-1]:
+            return "one of " + ", ".join(around[1])
+        return legal_at(declared.at(path)) or ""
+
+    return [{"path": ".".join(path), "value": value, "about": legal(path)} for path, value in leaves(defaults)]
+
+
+def _numbers(name: str) -> list[dict[str, Any]]:
+    """Every number of the camera's file with its tag and source."""
+    from harness.vocabulary.declaration.shape import get
+    from scenes.sensor.camera import load_camera, number_paths
+
+    data = load_camera(name).to_data()
+    numbers = {path: get(data, tuple(path.split("."))) for path in number_paths(data)}
+    return [{"path": path, "value": n["value"], "about": f"{n['tag']}: {n['source']}"} for path, n in numbers.items()]
+
+
+def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield (path, value) of everything in nested mappings that is no mapping, or an empty one."""
+    for key, value in data.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
+# ---------------------------------------------------------------- results
+
+
+EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
+POINT_NAME = re.compile(r"point-[0-9]{3,6}")  # name of a folder with the findings in a real capture
+SHOWN_SETTINGS = 6
+
+
+def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
+    """Describe every folder of results below ``out``, or of one experiment: `described`, ``limits`` of a study,
+    ``differs`` (settings that are not the same in all runs of the experiment) and ``is_latest``."""
+    found = []
+    for parent in folders_in(out, EXPERIMENT_NAME):
+        if experiment is not None and parent.name != experiment:
+            continue
+        runs = folders_in(parent, DIGEST_NAME)
+        settings = {run: _settings(run) for run in runs} if len(runs) > 1 else {}
+        known = [some for some in settings.values() if some]
+        paths = dict.fromkeys(path for some in known for path in some)
+        apart = [path for path in paths if len({canonical_json(some.get(path)) for some in known}) > 1]
+        newest = latest_run(parent)
+        for run in runs:
+            some = settings.get(run)
+            differs = {path: some.get(path) for path in apart} if some else {}
+            found.append(described(run) | {"limits": _limits(run), "differs": differs, "is_latest": run.name == newest})
+    return found
+
+
+def limit_text(limits: list[dict[str, Any]]) -> str:
+    """Return the detection limit with its set-up; the span of several; nothing of what is no study."""
+    found = [row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"]
+    if not found:
+        return "a90/95 not demonstrated" if limits else ""
+    found.sort(key=lambda row: row["a90_95_mm"])
+    ends = [found[0], *found[1:][-1:]]
+    missing = len(limits) - len(found)
+    beside = f"; not demonstrated by {missing} of {len(limits)} set-ups" if missing else ""
+    return "a90/95 " + " to ".join(f"{row['a90_95_mm']:.2f} mm ({row['set_up']})" for row in ends) + beside
+
+
+def differs_text(differs: dict[str, Any]) -> str:
+    """Return the settings that tell a run from others of its experiment, at most `SHOWN_SETTINGS`."""
+    names = names_of(differs)
+    said = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
+    more = len(said) - SHOWN_SETTINGS
+    return ", ".join(said[:SHOWN_SETTINGS]) + (f" and {more} more" if more > 0 else "")
+
+
+def _settings(run: Path) -> dict[str, Any]:
+    """Every setting of a run's resolved experiment by its dotted path; empty where it cannot be read."""
+    try:
+        found = {".".join(path): value for path, value in leaves(read_yaml(run / EXPERIMENT.name).data)}
+        canonical_json(found)
+    except (UserError, ValueError, OSError, TypeError, AttributeError):
+        return {}
+    return found
+
+
+def _limits(run: Path) -> list[dict[str, Any]]:
+    """The detection limits of a study; empty where there are none or they cannot be read."""
+    rows = []
+    try:
+        for row in csv.DictReader(io.StringIO(bounded_bytes(run / "limits.csv", TEXT_BYTES).decode())):
+            size, said = row["a90_95_mm"], {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]}
+            if not all(word.isprintable() for word in said.values()):
+                return []
+            rows.append({**said, "a90_95_mm": float(size) if size else None})
+    except (UserError, OSError, ValueError, KeyError, TypeError, csv.Error):
+        return []
+    return rows
+
+
+def described(run: Path) -> dict[str, Any]:
+    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken, with ``note``
+    in words; ``done``, ``failed``, ``planned``: trials as the provenance has them, None without one; ``records``: of
+    the journal; ``version``: of the results."""
+    from harness.engine.journal import Journal
+
+    try:
+        records = len(Journal(run / "journal"))
+    except UserError:  # of a newer tofpod, or reached through a link
+        records = 0
+    row: dict[str, Any] = {"path": str(run), "experiment": run.parent.name, "digest": run.name, "state": "broken"}
+    row |= {"note": "", "size_bytes": sum(map(_disk_bytes, files_below(run))), "records": records}
+    row |= {"has_report": (run / REPORT.name).is_file()}
+    row |= dict.fromkeys(("date", "commit", "dirty", "done", "failed", "planned", "version"))
+    try:
+        said = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
+        if not isinstance(said, dict):
+            raise ValueError("is no provenance")
+    except FileNotFoundError:  # a run that is not over, or real captures, which have no trials
+        judged = len(folders_in(run, POINT_NAME))
+        if judged and not records:  # their table is written last
+            state = "complete" if (run / CAPTURES.name).is_file() else "unfinished"
+            return row | {"state": state, "note": f"{state}: {many(judged, 'real capture')} judged"}
+        if not records and not (run / EXPERIMENT.name).is_file():
+            return row | {"note": "broken: it has neither an experiment nor records"}
+        state = "running" if in_use(run) else "unfinished"
+        return row | {"state": state, "note": f"{state}: {many(records, 'record')}"}
+    except (UserError, ValueError, OSError) as error:
+        return row | {"note": f"broken: provenance.json: {error}"}
+    trials = said.get("trials")
+    trials = trials if isinstance(trials, dict) else {}
+    done, resumed, failed = (_whole(trials.get(name)) for name in ("done", "resumed", "failed"))
+    state = "running" if in_use(run) else "unfinished" if failed else "complete"
+    note = state
+    if done is not None:
+        done, failed = done + (resumed or 0), failed or 0
+        row |= {"done": done, "failed": failed, "planned": done + failed}
+        of_all = f"{done} of {many(done + failed, 'trial')} done, {failed} failed"
+        note += ": " + (of_all if failed else many(done, "trial"))
+    version, dirty = _whole(said.get("results_version")), said.get("dirty")
+    if version is not None and version != RESULTS_VERSION:
+        age = "newer" if version > RESULTS_VERSION else "older"
+        note += f" ({age}: results version {version}, this tofpod writes {RESULTS_VERSION})"
+    facts = {"date": _line(said.get("started")), "commit": _line(said.get("commit")), "version": version}
+    return row | {"state": state, "note": note, "dirty": dirty if isinstance(dirty, bool) else None, **facts}
+
+
+def in_use(run: Path) -> bool:
+    """Return whether a sweep is at work in this folder; False where the system has no locks."""
+    from harness.engine.work import LOCK
+
+    try:
+        if not (run / LOCK).is_file():
+            return False
+        with opened_lock(run / LOCK) as file:
+            return lock(file, shared=False, wait=False) == "busy"
+    except (OSError, UserError):
+        return False
+
+
+def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
+    """Return folders with such names, links left out, sorted."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
+        found = [entry for entry in entries if names.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)]
+        return sorted(Path(entry.path) for entry in found)
+    return []
+
+
+def files_below(path: Path) -> Iterator[os.DirEntry[str]]:
+    """Yield everything below a folder that is no folder; links are not followed."""
+    with contextlib.suppress(OSError), os.scandir(path) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                yield from files_below(Path(entry.path))
+            else:
+                yield entry
+
+
+def _disk_bytes(entry: os.DirEntry[str]) -> int:
+    with contextlib.suppress(OSError):
+        file = entry.stat(follow_symlinks=False)
+        return int(getattr(file, "st_blocks", -(-file.st_size // 512)) * 512)
+    return 0
+
+
+def _line(value: Any) -> str | None:
+    """One short line of a file that anybody may have written, or None."""
+    return value[:40] if isinstance(value, str) and value.isprintable() else None
+
+
+def _whole(value: Any) -> int | None:
+    return value if type(value) is int and value >= 0 else None
+
+
+# ---------------------------------------------------------------- the newest run
+
+
+def latest_run(parent: Path) -> str | None:
+    """Return the name of the run that ``parent/latest`` points to, whether it is there or not; None where there is no
+    such link of tofpod's."""
+    path = Path(parent) / LATEST
+    said = os.readlink(path) if path.is_symlink() else ""
+    return said if DIGEST_NAME.fullmatch(said) else None
+
+
+def point_to(run: Path) -> None:
+    """Let the link ``latest`` beside a run point to it, unless it is not tofpod's; failures are told on stderr."""
+    path = Path(run).parent / LATEST
+    if os.path.lexists(path) and latest_run(path.parent) is None:
+        print(f"{path}: is not tofpod's and is left as it is; the newest run is {run}", file=sys.stderr)
+        return
+    part = path.with_name(f".{LATEST}.{secrets.token_hex(4)}.part")
+    try:
+        os.symlink(Path(run).name, part)
+        os.replace(part, path)
+    except (OSError, NotImplementedError) as error:
+        print(f"{path}: cannot be made ({error}); the newest run is {run}", file=sys.stderr)
+
+
+# ---------------------------------------------------------------- removal
+
+
+OURS = b"# tofpod experiment "  # first words of an experiment.yaml that a sweep wrote
+UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")
+"""A file that a killed process was writing (`harness.vocabulary.files.atomic_path`)."""
+UNFINISHED_LINK = re.compile(rf"\.{LATEST}\.[0-9a-f]{{8}}\.part")
+ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?|[0-9]{6}-[0-9a-f]{8}\.jsonl")
+"""Files of a journal: segments, and those of version 5 and before, of one trial each."""
+
+
+def refuse_links(*paths: Path) -> None:
+    """Raise UserError where a path is a link."""
+    for path in paths:
+        if path.is_symlink():
+            fix = "remove it there by hand"
+            raise UserError(f"{path}: is a link to another place, where nothing is removed", fix=fix)
+
+
+def cache_removal(
+    folder: Path, limit_bytes: int | None, older_s: float | None, *, damaged: bool, everything: bool
+) -> list[StoredFile]:
+    """Return the renders that any of the conditions names, and what killed processes left: with ``everything`` all of
+    it, else what is older than a day."""
+    renders = stored_renders(folder)
+    before_s = float("-inf") if older_s is None else time.time() - older_s
+    going = [one for one in renders if everything or one.used_s < before_s]
+    if damaged:
+        going += damaged_renders(one for one in renders if one not in going)
+    if limit_bytes is not None:
+        going += longest_unused((one for one in renders if one not in going), limit_bytes, ())
+    return going + (leftovers(folder, 0.0) if everything else leftovers(folder))
+
+
+def chosen_results(out: Path, name: str) -> list[Path]:
+    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError where there are none."""
+    experiment, slash, digest = name.partition("/")
+    if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
+        legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
+        raise UserError(f"{name!r} names no results", legal=legal)
+    parent = Path(out) / experiment
+    refuse_links(parent, *([parent / digest] if slash else []))
+    found = [path for path in folders_in(parent, DIGEST_NAME) if not slash or path.name == digest]
+    if not found:
+        raise UserError(f"{parent / digest if slash else parent}: holds no results", fix="python -m harness.ls results")
+    for folder in found:
+        # every sweep begins with its declaration, whose first line says whose it is
+        first = b""
+        with contextlib.suppress(OSError), (folder / EXPERIMENT.name).open("rb") as file:
+            first = file.read(len(OURS))
+        if first != OURS:
+            message = f"{folder}: has no experiment.yaml of tofpod's, so it is no folder of results"
+            raise UserError(message, fix="remove it by hand, if it is to go")
+    return found
+
+
+def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
+    """Return the files of a folder of results that tofpod wrote, locks last; with ``journal_only`` the records."""
+    found = []
+    for entry in files_below(folder):
+        with contextlib.suppress(OSError):
+            path, file = Path(entry.path), entry.stat(follow_symlinks=False)
+            *above, name = path.relative_to(folder).parts
+            unfinished = UNFINISHED_NAME.fullmatch(name)
+            name = name if unfinished is None else unfinished["stem"] + unfinished["suffix"]
+            if above[:1] == [JOURNAL]:
+                ours = len(above) <= 2 and ENTRY_NAME.fullmatch(name) is not None
+            elif not above:
+                ours = is_output(name, "results") or LOCK_NAME.fullmatch(name) is not None
+            else:
+                ours = len(above) == 1 and POINT_NAME.fullmatch(above[0]) is not None and is_output(name, "capture")
+            if ours and stat.S_ISREG(file.st_mode) and (above[:1] == [JOURNAL] or not journal_only):
+                found.append(StoredFile(path, file.st_size, file.st_mtime))
+    return sorted(found, key=lambda one: (LOCK_NAME.fullmatch(one.path.name) is not None, one.path))
+
+
+def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list[StoredFile]:
+    """Remove files, then folders that are empty, the experiment's own included; `latest` goes or moves on where the run
+    that it names is gone. Returns what is gone."""
+    gone = removed(files)
+    for folder in folders:
+        inner = folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}"))
+        deepest = [below for each in inner for below in folders_in(each, re.compile("[0-9a-f]{2}"))]
+        _remove_empty(*deepest, *inner, folder)
+    for parent in {folder.parent for folder in folders}:
+        for left in parent.glob(f".{LATEST}.*.part"):
+            if UNFINISHED_LINK.fullmatch(left.name) and left.is_symlink():
+                left.unlink(missing_ok=True)
+        runs = sorted(map(described, folders_in(parent, DIGEST_NAME)), key=lambda run: run["date"] or "")
+        reported = [Path(run["path"]) for run in runs if run["has_report"] or run["state"] == "complete"]
+        named = latest_run(parent)
+        if named is not None and named not in {run.name for run in reported}:
+            if reported:
+                point_to(reported[-1])
+            else:
+                (parent / LATEST).unlink(missing_ok=True)
+        _remove_empty(parent)
+    return gone
+
+
+def _remove_empty(*folders: Path) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()

@@ -1,0 +1,214 @@
+"""Sections that several pages of a sweep share, and the final tables of a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from markupsafe import Markup
+
+from harness.evaluation.maps import compare_maps, label_of
+from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.summary import MAIN, found_rule, summarise_holes
+from harness.report.blocks import heading, note, paragraph
+from harness.tables.schema import Column, Table
+from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
+from harness.tables.trials import CLAIMS, MARKS, SET_UPS, ResultTables
+from harness.thesis.claims import Verdict
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = Mapping[str, Any]
+RULES_NOTE = (
+    "Each criterion is written in the program and is the same for every run. Where the data leave room for both "
+    "answers, the claim is undecided."
+)
+CALLS_NOTE = (
+    "Detections that belong to no hole, with exact 95 % Poisson intervals. A calibrated threshold is the highest of "
+    "the quiet thresholds of R hole-free runs; one more such run would exceed it with probability 1/(R + 1)."
+)
+
+
+class Varied(NamedTuple):
+    """A variation with one number of frames: its row of `SET_UPS`, and that of the set-up that it changes."""
+
+    variant: Row
+    row: Row | None
+    other: Row | None
+
+    @property
+    def differs(self) -> bool:
+        """True where other holes are found."""
+        pair = self.row, self.other
+        return len({(*row["found"], "", *row["undecided"]) for row in pair if row is not None}) > 1
+
+
+def _side(label: str, side: str) -> Column:
+    """Return the column of `SET_UPS` called ``label``, of one side of a variation."""
+    (column,) = (one for one in SET_UPS.columns if one.label == label)
+
+    def cell(varied: Varied) -> Cell:
+        row = getattr(varied, side)
+        return Cell("–") if row is None else Cell(column.cell(row).text)
+
+    return Column("", f"{label}{', without' if side == 'other' else ''}", cell)
+
+
+VARIED = Table(
+    "variations",
+    "one row per variation and number of frames, beside the set-up that it changes",
+    (
+        Column("", "variation", lambda one: one.variant["variant"]),
+        Column("", "why", lambda one: "\n".join(filter(None, (one.variant["reason"], one.variant["settings"])))),
+        Column("", "changes", lambda one: one.variant["reference"] or "–"),
+        Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
+        Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
+        *(
+            _side(label, side)
+            for label in ("found", "threshold (mm)", "surface noise (mm)")
+            for side in ("row", "other")
+        ),
+    ),
+    formats=(),
+    left=4,
+)
+
+
+def varied_section(
+    tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = ""
+) -> list[Markup]:
+    """The sensitivity study: each variation beside the set-up that it changes, else beside ``of``, with as many frames
+    or else the most. ``compared``: of `compare_set_ups`; ``frames``: those to show, none for all."""
+    there: dict[str, list[Row]] = {}
+    for row in records(compared):
+        if not frames or row["frames"] in frames:
+            there.setdefault(str(row["variant"]), []).append(row)
+    rows = []
+    for variant in records(tables.variants[tables.variants["is_variation"].astype(bool)]):
+        variant["reference"] = variant["reference"] or of
+        others = there.get(variant["reference"], [])
+        for one in there.get(str(variant["variant"]), [None]):
+            alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
+            rows.append(Varied(variant, one, next(iter([*alike, *others[-1:]]), None)))
+    if not rows:
+        return []
+    said = (
+        "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
+        " A variation with fewer repeats and hole-free runs has a lower threshold."
+    )
+    return [heading("If facts were otherwise"), paragraph(said), VARIED.grid(rows).html()]
+
+
+def claims_section(title: str, verdicts: Sequence[Verdict]) -> list[Markup]:
+    """A heading and the table of claims; nothing without verdicts. Pages of other targets hold none of it."""
+    rows = [vars(verdict) for verdict in verdicts]
+    return [heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows).html()] if rows else []
+
+
+def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
+    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
+    named = {answer: [one.claim for one in verdicts if one.verdict == answer] for answer in MARKS}
+    said = [
+        f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
+        for answer, names in named.items()
+        if names
+    ]
+    return f" Of {many(len(verdicts), 'claim')}, {', '.join(said)}." if said else ""
+
+
+def rule_note(repeats: int, *more: str) -> Markup:
+    """Say under the answer what counts as found, and what the intervals do not speak of."""
+    draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
+    said = (
+        f"{draws} of the noise before the same board in the same place with one unit of each camera: the intervals "
+        "speak of these set-ups, not of other boards, places or units."
+    )
+    return note(" ".join((found_rule(repeats), *more, said)))
+
+
+def left_out(runs: pd.DataFrame) -> str:
+    """Say how many frames averaging left out as disturbed, over all runs; empty where it left out none."""
+    out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
+    return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
+
+
+def shown_frames(compared: pd.DataFrame) -> tuple[int, ...]:
+    """Return the least and the greatest number of frames."""
+    frames = sorted(int(n) for n in compared["frames"].unique()) if len(compared) else []
+    return tuple(dict.fromkeys([*frames[:1], *frames[-1:]]))
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table as mappings."""
+    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+
+
+TONES: dict[Any, Tone] = {"found": "key", "missed": "bad", "undecided": "open"}
+SHOWN = ("set-up", "frames", "found", "from (mm)", "50 % size (mm)")
+
+
+def final_tables(tables: ResultTables) -> list[str | Grid]:
+    """Return what a terminal shows at the end, by the kind of experiment."""
+    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
+    if not tables.registrations.empty:
+        return [ways_grid(compare_maps(tables, summary))]
+    if len(set_ups_of(tables)) > 1:
+        compared = compare_set_ups(tables, summary, set_ups_of(tables), half_sizes=False)
+        return [set_ups_grid(compared, terminal=True)]
+    return [holes_grid(summary, terminal=True)]
+
+
+def holes_grid(summary: pd.DataFrame, variant: str = MAIN, *, terminal: bool = False) -> Grid:
+    """Return detections of trials for each hole and number of frames, with intervals on a page, sizes at a terminal."""
+    summary = summary[summary["variant"] == variant]
+    frames = sorted(int(n) for n in summary["frames"].unique())
+
+    def detected(row: Row) -> Cell:
+        if terminal:
+            return Cell(f"{row['detected']}/{row['n']}", TONES[row["status"]])
+        ends = f"{row['rate_low']:.2f}–{row['rate_high']:.2f}, {row['status']}"
+        return Cell(f"{row['detected']}/{row['n']}\n{ends}", share=row["rate"])
+
+    rows = []
+    for hole, part in summary.groupby("hole", sort=False):
+        there = {row["frames"]: row for row in records(part)}
+        last = there[max(there)]
+        true = float(last["true_diameter_mm"])
+        cells: list[str | Cell] = [str(hole), inches(true).replace(" in", '"') or "–", f"{true:.2f}"]
+        cells += [detected(there[n]) if n in there else "–" for n in frames]
+        for of in ("extent", "model") if terminal else ():
+            cells.append(plus_minus(*(last[f"{of}_diameter_{what}_mm"] for what in ("mean", "std"))))
+        rows.append(cells)
+    counted = [f"N={n}" if terminal else many(n, "frame") for n in frames]
+    heads = ("hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ()))
+    return Grid.of(heads, rows, 1, "holes detected of trials, by number of averaged frames (N)")
+
+
+def set_ups_grid(compared: pd.DataFrame, *, terminal: bool = False) -> Grid:
+    """Return what each set-up finds with the least and the greatest number of frames."""
+    rows = [row for row in records(compared) if row["frames"] in shown_frames(compared)]
+    return SET_UPS.grid(rows, terminal=terminal, only=SHOWN)
+
+
+def ways_grid(compared: pd.DataFrame) -> Grid:
+    """Return holes found for each way of registering and merging (down) and number of views (across)."""
+    rows = [row for row in records(compared) if not row["is_variation"]]
+    frames, views = shown_frames(compared), sorted({row["views"] for row in rows})
+    several = len({row["place"] for row in rows}) > 1
+    there: dict[str, dict[tuple[int, int], Row]] = {}
+    for row in rows:
+        way = label_of(row["registration"], row["merge"], row["place"] if several else "")
+        there.setdefault(way, {})[row["views"], row["frames"]] = row
+
+    def count(row: Row | None) -> str:
+        undecided = f"+{len(row['undecided'])}" if row and row["undecided"] else ""
+        return "–" if row is None else f"{len(row['found'])}{undecided}"
+
+    cells = [
+        [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)] for way, found in there.items()
+    ]
+    heads = ("registration, merge", *(many(n, "view") for n in views))
+    of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""
+    said = " / ".join(f"N={n}" for n in frames)
+    return Grid.of(heads, cells, title=f"holes found{of_holes} with {said} frames a view (+: undecided)")

@@ -1,0 +1,525 @@
+"""The contract of detectors as checks for a plug-in author's own tests.
+
+    from harness.testing import check_detector
+    from acme.detector import AcmeDetector
+
+
+    def test_my_detector_keeps_the_contract():
+        check_detector(AcmeDetector, settings={"window_px": 7})
+
+Every check is a function of its own in `harness.testing`, listed in `CHECKS`.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from detectors.interface import Detection, Detector, Evidence, Measurement
+from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Cloud, Lens, MapViews, Reason, Region, transform_points
+
+__all__ = ["CHECKS", "check_detector"]
+
+
+def check_detector(
+    make: Callable[[], Detector] | type,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    clouds: Sequence[Cloud] | None = None,
+) -> None:
+    """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken.
+
+    ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) are then validated by its
+    ``settings_type``; or a function without arguments that makes a detector anew at each call. ``clouds``: what it is
+    checked on, by default three small synthetic ones 0.7 m before the camera, within 90 mm of its axis, each with
+    damage of centimetres (`harness.testing`). Something must be found on one of them at least, at any
+    threshold, or nothing would have been checked.
+
+    Not checked: whether the detector is any good, which is what a study measures.
+    """
+    settings_type, build = getattr(make, "settings_type", None), cast("Callable[..., Detector]", make)
+    if settings_type is None and settings is not None:
+        raise TypeError("`settings` belong to a detector's class with a `settings_type`, not to a function")
+
+    def made() -> Detector:
+        return build() if settings_type is None else build(settings_type.from_data(dict(settings or {})))
+
+    tried = tuple(synthetic_clouds() if clouds is None else clouds)
+    for check in CHECKS:
+        for cloud in tried:
+            check(made, cloud)
+    detector = made()
+    loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
+    require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
+
+
+# ---------------------------------------------------------------- clouds
+
+
+SHAPE = (90, 120)  # rows and columns: 126 by 168 mm at 0.7 m
+DISTANCE_M, NOISE_M, FRAMES = 0.7, 3e-4, 20
+LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, 59.5, 44.5)
+DAMAGE = ((-0.04, -0.02, 0.010, 0.012), (0.03, 0.02, 0.007, 0.008), (0.05, -0.03, 0.008, -0.006))
+"""x, y and radius on the face, and depth behind it (before it, where negative), metres: two holes and a bump."""
+
+
+def synthetic_clouds() -> tuple[Cloud, ...]:
+    """A tilted plane, a cylinder's face, and a tilted plane some of whose pixels have no range; each with `DAMAGE`."""
+    return plane(seed=1), cylinder(seed=2), with_gaps(plane(seed=3), seed=4)
+
+
+def plane(seed: int, tilt: float = 0.1) -> Cloud:
+    """A plane whose z grows by ``tilt`` metres with each metre in x."""
+    return _seen(seed, lambda x, y: DISTANCE_M + tilt * x)
+
+
+def cylinder(seed: int, radius_m: float = 0.5) -> Cloud:
+    """The convex face of a cylinder about the y axis."""
+    return _seen(seed, lambda x, y: DISTANCE_M + radius_m - np.sqrt(radius_m**2 - x**2))
+
+
+def with_gaps(cloud: Cloud, seed: int, share: float = 0.05) -> Cloud:
+    """The cloud without a share of its pixels, without a block of them, and without its last column."""
+    gone = np.random.default_rng(seed).random(cloud.valid.shape) < share
+    gone[10:14, 20:26] = True
+    gone[:, -1] = True
+    return without(cloud, gone)
+
+
+def without(cloud: Cloud, gone: np.ndarray) -> Cloud:
+    """The cloud with no range at the pixels ``gone`` (h, w) bool."""
+    return replace(
+        cloud,
+        points_m=np.where(gone[..., None], np.nan, cloud.points_m),
+        reason=np.where(gone, Reason.NO_RETURN, cloud.reason).astype(np.uint8),
+        count=np.where(gone, 0, cloud.count),
+        variance_m2=np.where(gone, np.nan, cloud.variance_m2),
+    )
+
+
+def _seen(seed: int, face: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Cloud:
+    slopes = LENS.region_slopes(LENS.whole)
+    z = np.full(SHAPE, DISTANCE_M)
+    # the ray meets the face where z = face(z * slopes); the slopes are small, so that this converges by itself
+    for _ in range(60):
+        z = face(slopes[..., 0] * z, slopes[..., 1] * z)
+    x, y = slopes[..., 0] * z, slopes[..., 1] * z
+    for centre_x, centre_y, radius, depth in DAMAGE:
+        z = z + depth * (np.hypot(x - centre_x, y - centre_y) < radius)
+    z = z + NOISE_M * np.random.default_rng(seed).standard_normal(SHAPE)
+    points = np.concatenate([slopes, np.ones((*SHAPE, 1))], axis=-1) * z[..., None]
+    flat = np.zeros(SHAPE, dtype=np.uint8)
+    return Cloud(
+        points_m=points,
+        reason=flat,
+        count=flat.astype(np.int64) + FRAMES,
+        variance_m2=np.full(SHAPE, FRAMES * NOISE_M**2),
+        region=Region(0, SHAPE[0], 0, SHAPE[1]),
+        z_step_m=0.0,
+        n_frames=FRAMES,
+        lens=LENS,
+    )
+
+
+# ---------------------------------------------------------------- checks
+
+
+STRONGEST = 5  # findings of one cloud that are looked at one by one
+CENTRE_MARGIN_M = 0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
+SCORE_TOLERANCE = 0.01
+"""Share of the highest score: robust fits stop at a tolerance of their own; sums in another order round otherwise."""
+CROP_TOLERANCE = 0.01  # share of the pixels: a crop may come to another decision at the target's rim
+PLACE_TOLERANCE_M = 1e-4
+SHIFT_M = 0.037
+QUARTER_TURN = np.array([[0.0, 1.0, 0, 0], [-1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+"""T_turned_cloud: what `numpy.rot90` makes of a picture with x right and y down."""
+
+Make = Callable[[], Detector]
+T = TypeVar("T")
+
+
+def require(kept: bool | np.bool_, what: str) -> None:
+    """Raise AssertionError unless this part of the contract is kept; python -O does not switch it off."""
+    if not kept:
+        raise AssertionError(what)
+
+
+@contextmanager
+def no_crash(doing: str) -> Iterator[None]:
+    """Tell any exception but a breach as one: a detector that is given a cloud may refuse it, but not break."""
+    try:
+        yield
+    except AssertionError:
+        raise
+    except Exception as error:
+        raise AssertionError(f"{doing} ended in {type(error).__name__}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Look:
+    """One detector's evidence on one cloud."""
+
+    detector: Detector
+    cloud: Cloud
+    evidence: Evidence
+
+    @classmethod
+    def at(cls, detector: Detector, cloud: Cloud) -> Look:
+        """Analyse a cloud that can be judged."""
+        with no_crash("`analyse`"):
+            return cls(detector, cloud, detector.analyse(cloud))
+
+    @property
+    def quiet(self) -> float:
+        """The quiet threshold."""
+        with no_crash("`quiet_threshold`"):
+            return float(self.detector.quiet_threshold(self.cloud, self.evidence))
+
+    def find(self, threshold: float) -> tuple[Detection, ...]:
+        """Return the findings above a threshold."""
+        with no_crash(f"`find` at a threshold of {threshold:g}"):
+            return tuple(self.detector.find(self.cloud, self.evidence, threshold))
+
+    def thresholds(self) -> tuple[float, ...]:
+        """Return rising thresholds from 0 to the quiet threshold at scores of pixels, where findings change."""
+        scores, quiet = self.evidence.score[np.isfinite(self.evidence.score)], self.quiet
+        high = np.quantile(scores, [0.5, 0.9, 0.99, 0.999]).tolist() if len(scores) else []
+        steps = {0.0, *high, *(share * quiet for share in (0.25, 0.5, 0.75, 0.95))}
+        return tuple(sorted(step for step in steps if 0.0 <= step < quiet))
+
+    def measured(self, finding: Detection) -> Measurement:
+        """Measure a finding; the numbers must be sound."""
+        with no_crash("`measure`"):
+            found = self.detector.measure(self.cloud, self.evidence, finding)
+        diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
+        require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
+        require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is no (3,) finite numbers")
+        told = f"`measure` says score {found.score:g} of a finding of {finding.score:g}"
+        require(found.score == finding.score, told)
+        require(found.points >= 1, f"`measure` says {found.points} points")
+        return found
+
+    def everything(self) -> tuple[Any, ...]:
+        """Return all that a detector says of a cloud."""
+        quiet = self.quiet
+        found = self.find(quiet / 2)
+        return self.evidence, quiet, found, [self.measured(finding) for finding in found[:STRONGEST]]
+
+
+# ---- the checks ------------------------------------------------------------------------------------------------------
+
+
+def declares_itself(make: Make, cloud: Cloud) -> None:
+    """A name, a version from 1, and settings that are a Config whose defaults are legal and survive being stored."""
+    detector = make()
+    require(isinstance(detector.name, str) and detector.name != "", "`name` is no text")
+    version = detector.version
+    require(type(version) is int and version >= 1, f"`version` is {version!r}: a whole number from 1 is wanted")
+    settings_type: Any = getattr(type(detector), "settings_type", None)
+    is_config = isinstance(settings_type, type) and issubclass(settings_type, Config)
+    require(is_config, "the class has no `settings_type` that is a harness.vocabulary.config.Config")
+    with no_crash("`settings_type()`, the settings with all defaults,"):
+        settings = settings_type()
+    with no_crash("`settings_type.from_data` of the stored defaults"):
+        restored = settings_type.from_data(settings.to_data())
+    require(restored == settings, "settings that are stored and read again are not the same")
+
+
+def gives_sound_evidence(make: Make, cloud: Cloud) -> None:
+    """Images of the cloud's size, no score where there is no point, none infinite, some finite, a scale above 0."""
+    _sound(Look.at(make(), cloud))
+
+
+def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
+    """The same bits for the same cloud: again, after another cloud, and from a detector made anew."""
+    detector = make()
+    first = Look.at(detector, cloud).everything()
+    again = Look.at(detector, cloud).everything()
+    require(_same(first, again), "the second time the same cloud gave another result")
+    other = Look.at(detector, with_gaps(cloud, seed=9))
+    other.find(other.quiet / 2)
+    again = Look.at(detector, cloud).everything()
+    require(_same(first, again), "after another cloud the same one gave another result")
+    require(_same(first, Look.at(make(), cloud).everything()), "a detector made anew gave another result")
+
+
+def keeps_its_input(make: Make, cloud: Cloud) -> None:
+    """Neither the cloud nor the evidence is written to, not even for a moment."""
+    given = _with_arrays(cloud, np.ndarray.copy)
+    look = Look.at(make(), given)
+    require(_same(given, cloud), "`analyse` changed the cloud that it was given")
+    kept = _with_arrays(look.evidence, np.ndarray.copy)
+    look.everything()
+    require(_same(given, cloud), "`find`, `quiet_threshold` or `measure` changed the cloud")
+    require(_same(look.evidence, kept), "`find`, `quiet_threshold` or `measure` changed the evidence")
+    protected = Look.at(make(), _with_arrays(cloud, _read_only))
+    replace(protected, evidence=_with_arrays(protected.evidence, _read_only)).everything()
+
+
+def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
+    """Strongest first, each above the threshold; at its own score a finding is gone, just below it is there."""
+    look = Look.at(make(), cloud)
+    for threshold in look.thresholds():
+        found = look.find(threshold)
+        scores = np.array([finding.score for finding in found], dtype=float)
+        require(np.isfinite(scores).all(), f"at a threshold of {threshold:g} a finding's score is not finite")
+        low = float(scores.min(initial=np.inf))
+        require(low > threshold, f"a finding scores {low:g}, no more than the threshold of {threshold:g}")
+        require((np.diff(scores) <= 0).all(), f"at a threshold of {threshold:g} the strongest finding is not first")
+        for finding in found[:STRONGEST]:
+            gone, there = (look.find(at) for at in (finding.score, float(np.nextafter(finding.score, 0.0))))
+            require(
+                not np.isin(finding.pixels, _pixels_of(gone)).any()
+                and np.isin(finding.pixels, _pixels_of(there)).any(),
+                f"a finding scores {finding.score:g}, but that is not the threshold at which it vanishes",
+            )
+
+
+def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
+    """Nothing is found there, something just below it, and it is the strongest finding's score; 0 where nothing can be
+    found."""
+    look = Look.at(make(), cloud)
+    quiet = look.quiet
+    require(np.isfinite(quiet) and quiet >= 0, f"the quiet threshold is {quiet:g}: a number from 0 is wanted")
+    loud = len(look.find(quiet))
+    require(loud == 0, f"at the quiet threshold of {quiet:g} there are {loud} findings")
+    below = look.find(float(np.nextafter(quiet, 0.0))) if quiet > 0 else ()
+    require(quiet == 0 or len(below) > 0, f"just below the quiet threshold of {quiet:g} nothing is found")
+    for threshold in look.thresholds():
+        found = look.find(threshold)
+        strongest = found[0].score if found else float("nan")
+        told = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
+        require(strongest == quiet, told)
+
+
+def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
+    """Raising the threshold takes pixels away from the findings and adds none."""
+    look = Look.at(make(), cloud)
+    lower, thresholds = _pixels_of(look.find(0.0)), (*look.thresholds(), look.quiet)
+    for before, threshold in pairwise(thresholds):
+        pixels = _pixels_of(look.find(threshold))
+        added = int((~np.isin(pixels, lower)).sum())
+        require(added == 0, f"raising the threshold from {before:g} to {threshold:g} adds {added} pixels to findings")
+        lower = pixels
+
+
+def finds_valid_pixels(make: Make, cloud: Cloud) -> None:
+    """Pixels are ascending flat indices of valid points; centres are finite and lie within the cloud."""
+    look = Look.at(make(), cloud)
+    for threshold in look.thresholds():
+        for finding in look.find(threshold):
+            _sound_finding(cloud, finding)
+
+
+def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
+    """Evidence and findings stay sound where a twentieth of the pixels, a block and a column are gone."""
+    look = Look.at(make(), with_gaps(cloud, seed=5))
+    _sound(look)
+    for finding in look.find(look.quiet / 2):
+        _sound_finding(look.cloud, finding)
+        look.measured(finding)
+
+
+def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
+    """A cloud without any point is the user's mistake, told as a UserError; one with a single point is no crash."""
+    detector, gone = make(), np.ones_like(cloud.valid)
+    for points in (0, 1):
+        gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False
+        few = without(cloud, gone)
+        try:
+            look = Look(detector, few, detector.analyse(few))
+        except UserError:
+            continue
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}"
+            text = f"a cloud with {points} valid points is not refused by a UserError but ends in {what}"
+            raise AssertionError(text) from error
+        require(points > 0, "a cloud without any point was not refused")
+        look.everything()
+
+
+def measures_extents(make: Make, cloud: Cloud) -> None:
+    """Each finding has a finite extent and centre, its own score, and a number of points."""
+    Look.at(make(), cloud).everything()
+
+
+def survives_pickling(make: Make, cloud: Cloud) -> None:
+    """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
+
+    def sent(value: Any, what: str) -> Any:
+        with no_crash(f"pickling {what}"):
+            return pickle.loads(pickle.dumps(value))
+
+    unused = sent(make(), "the detector")
+    detector = make()
+    result = Look.at(detector, cloud).everything()
+    require(_same(sent(result, "a result"), result), "a result that was pickled is not the same")
+    for arrived in (unused, sent(detector, "the detector, once used,")):
+        there = Look.at(arrived, cloud).everything()
+        require(_same(there, result), "a detector that was pickled gave another result")
+
+
+def turns_with_the_cloud(make: Make, cloud: Cloud) -> None:
+    """The camera turned about its optical axis by 90 and by 180 degrees, grid and lens with it."""
+    look = Look.at(make(), cloud)
+    pixels = np.arange(cloud.valid.size).reshape(cloud.valid.shape)
+    turned, T_turned_cloud = cloud, np.eye(4)
+    for degrees in (90, 180):
+        turned, pixels, T_turned_cloud = turned_once(turned), _grid_turned(cloud, pixels), QUARTER_TURN @ T_turned_cloud
+        _compare(look, Look.at(make(), turned), pixels, T_turned_cloud, f"turned by {degrees} degrees")
+
+
+def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
+    """The cloud moved away by 37 mm along its axis, as a map (whose grid samples space in parallel) can be."""
+    base = replace(cloud, projection="parallel", lens=None, map_views=None)
+    step = cloud.z_step_m
+    shift = np.eye(4)
+    shift[2, 3] = round(SHIFT_M / step) * step if step > 0 else SHIFT_M
+    moved = replace(base, points_m=transform_points(shift, base.points_m))
+    pixels = np.arange(cloud.valid.size).reshape(cloud.valid.shape)
+    _compare(Look.at(make(), base), Look.at(make(), moved), pixels, shift, f"moved by {1e3 * shift[2, 3]:.0f} mm")
+
+
+CHECKS = (
+    declares_itself,
+    gives_sound_evidence,
+    gives_the_same_twice,
+    keeps_its_input,
+    orders_findings_by_score,
+    is_silent_at_the_quiet_threshold,
+    finds_no_more_at_higher_thresholds,
+    finds_valid_pixels,
+    survives_missing_pixels,
+    refuses_an_empty_cloud,
+    measures_extents,
+    survives_pickling,
+    turns_with_the_cloud,
+    moves_with_the_cloud,
+)
+
+
+# ---- what several checks ask -----------------------------------------------------------------------------------------
+
+
+def _sound(look: Look) -> None:
+    shape, evidence = look.cloud.valid.shape, look.evidence
+    for name in ("score", "residual_m", "surface_z_m"):
+        image = np.asarray(getattr(evidence, name))
+        require(image.shape == shape, f"`{name}` is an array of {image.shape}; the cloud's grid is {shape}")
+        require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which knows no NaN")
+    score, scale = evidence.score, float(evidence.scale_m)
+    told = int(np.isfinite(score[~look.cloud.valid]).sum())
+    require(told == 0, f"{told} pixels without a point have a score; NaN is wanted there")
+    require(not np.isinf(score).any(), "a score is infinite")
+    require(np.isfinite(score).any(), "no pixel has a score; where a cloud cannot be judged, a UserError is wanted")
+    require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: a length above 0 is wanted")
+
+
+def _sound_finding(cloud: Cloud, finding: Detection) -> None:
+    pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
+    require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are no (n,) whole numbers")
+    require(len(pixels) > 0, "a finding has no pixels")
+    require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
+    require(pixels[0] >= 0 and pixels[-1] < cloud.valid.size, "a finding's pixels reach beyond the cloud's grid")
+    invalid = int((~cloud.valid.reshape(-1)[pixels]).sum())
+    require(invalid == 0, f"{invalid} pixels of a finding have no point")
+    require(centre.shape == (3,) and np.isfinite(centre).all(), "a finding's `centre_m` is no (3,) finite numbers")
+    points = cloud.points_m[cloud.valid]
+    low, high = points.min(axis=0) - CENTRE_MARGIN_M, points.max(axis=0) + CENTRE_MARGIN_M
+    is_inside = bool(((low <= centre) & (centre <= high)).all())
+    require(is_inside, f"a finding's centre {np.round(centre, 4).tolist()} m lies outside the cloud")
+
+
+def _pixels_of(found: tuple[Detection, ...]) -> np.ndarray:
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *(np.asarray(finding.pixels) for finding in found)]))
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Return whether two values hold the same bits: arrays, numbers, text, and dataclasses or mappings of them."""
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        a, b = np.asarray(a), np.asarray(b)
+        return a.shape == b.shape and bool(np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f"))
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(_same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__)
+    if isinstance(a, list | tuple):
+        return isinstance(b, list | tuple) and len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+    return bool(a == b) or (a != a and b != b)
+
+
+def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
+    """A dataclass whose arrays are changed."""
+    held = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
+    changed = {name: change(array) for name, array in held.items() if isinstance(array, np.ndarray)}
+    return cast(T, replace(cast(Any, value), **changed))
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    seen = array.copy()
+    seen.setflags(write=False)
+    return seen
+
+
+def turned_once(cloud: Cloud) -> Cloud:
+    """The cloud that the same camera gives when it is turned by 90 degrees about its optical axis."""
+    names = ("reason", "count", "variance_m2", "rgb", "amplitude", "mean_variance_m2")
+    images = {name: getattr(cloud, name) for name in names}
+    turned: dict[str, Any] = {name: _grid_turned(cloud, image) for name, image in images.items() if image is not None}
+    turned["points_m"] = _grid_turned(cloud, transform_points(QUARTER_TURN, cloud.points_m))
+    lens, region, views = cloud.lens, cloud.region, cloud.map_views
+    if cloud.organised:
+        width = lens.width if lens is not None else region.col1
+        turned["region"] = Region(width - region.col1, width - region.col0, region.row0, region.row1)
+    if lens is not None:
+        k1, k2, p1, p2, *further = lens.distortion
+        distortion = (k1, k2, -p2, p1, *further)
+        lens = Lens(lens.height, lens.width, lens.fy, lens.fx, lens.cy, lens.width - 1 - lens.cx, distortion)
+    if views is not None:
+        views = MapViews(QUARTER_TURN @ views.T_cloud_cameras, views.shares, views.pixel_m[::-1])
+    return replace(cloud, lens=lens if cloud.organised else None, map_views=views, **turned)
+
+
+def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
+    """A cloud without a grid keeps the order of its points."""
+    return np.ascontiguousarray(np.rot90(image)) if cloud.organised else image
+
+
+def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, how: str) -> None:
+    """Compare scores and findings; ``pixels`` (h, w): of each pixel afterwards, its flat index before."""
+    was, now = before.evidence.score.reshape(-1)[pixels], after.evidence.score
+    changed = int((np.isfinite(was) != np.isfinite(now)).sum())
+    require(changed <= CROP_TOLERANCE * now.size, f"{how}, {changed} of {now.size} pixels gained or lost their score")
+    tolerance = SCORE_TOLERANCE * max(float(np.nanmax(was)), 1e-12)
+    difference = float(np.nanmax(np.abs(was - now)))
+    require(difference <= tolerance, f"{how}, a score changed by {difference:g} (allowed {tolerance:g})")
+    quiet = abs(before.quiet - after.quiet)
+    require(quiet <= tolerance, f"{how}, the quiet threshold changed by {quiet:g} (allowed {tolerance:g})")
+
+    # findings in the middle of the widest gap between scores from a fifth of the quiet threshold to it; where none is
+    # wider than the tolerance on both sides, a tolerable change of a score can change findings
+    scores = np.unique(before.evidence.score[np.isfinite(before.evidence.score)])
+    scores = scores[(scores >= 0.2 * before.quiet) & (scores <= before.quiet)]
+    gaps = np.diff(scores)
+    if not len(gaps) or gaps.max() <= 2 * tolerance:
+        return
+    threshold, flat = float(scores[gaps.argmax()] + gaps.max() / 2), pixels.reshape(-1)
+    of_before = {frozenset(finding.pixels.tolist()): finding for finding in before.find(threshold)}
+    of_after = {frozenset(flat[finding.pixels].tolist()): finding for finding in after.find(threshold)}
+    lost = f"{len(of_before.keys() - of_after.keys())} of {len(of_before)} findings have other pixels"
+    require(of_before.keys() == of_after.keys(), f"{how}, {lost}, and there are {len(of_after)}")
+    for key, finding in of_before.items():
+        moved_to = transform_points(T_after_before, finding.centre_m)
+        apart = float(np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m)))
+        require(apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre lies {1e3 * apart:.2f} mm off")
+        sizes = before.measured(finding).extent_diameter_m, after.measured(of_after[key]).extent_diameter_m
+        grown = abs(sizes[1] - sizes[0])
+        require(grown <= PLACE_TOLERANCE_M, f"{how}, a finding's extent changed by {1e3 * grown:.2f} mm")
