@@ -34,6 +34,8 @@ LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
     "BYTES before the first frame"
 )
+NAMES_BESIDE_OBJECTS = ("Location", "Color", "depth", "depthImage", "points", "xyz")
+"""Variables that are read from a .mat file that also holds a MATLAB object."""
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -70,8 +72,12 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
         fix = "save it with '-v7' in place of '-v7.3', for a cloud: " + EXPORT
         raise UserError(f"{path}: is a -v7.3 file (HDF5)", legal=LEGAL_MAT, fix=fix)
     with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, "save it again with '-v7'"):
-        # cells and structs hold no frames, and nested deeply enough they end the process without a word
-        flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
+        try:
+            # cells and structs hold no frames, and nested deeply enough they end the process without a word
+            flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
+        except TypeError:
+            # SciPy cannot list a file that holds an object; it calls the object itself "None"
+            flat = [*NAMES_BESIDE_OBJECTS, "None"]
         loaded = scipy.io.loadmat(path, variable_names=flat)
         loaded = {name: value for name, value in loaded.items() if isinstance(value, np.ndarray)}
     arrays = {}

@@ -70,15 +70,15 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
     return content
 
 
-_LOCK, _BEFORE = threading.Lock(), list[tuple[int, int]]()
-"""The limits before `limited_memory`, once for each place that is inside."""
+_LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
+"""The limits that each place inside `limited_memory` wants, and the process's own from before the first of them."""
 
 
 @contextmanager
 def limited_memory() -> Iterator[None]:
     """Limit the memory that the process may take inside to `READING_BYTES` more; beyond, MemoryError is raised. The
-    limit (RLIMIT_AS) holds for all threads, from the first that enters to the last that leaves. Systems without it or
-    without /proc (macOS, Windows) set none."""
+    limit (RLIMIT_AS) holds for all threads; where several are inside, or a generator waits inside, the least limit
+    counts. Systems without it or without /proc (macOS, Windows) set none."""
     try:
         import resource
 
@@ -86,20 +86,24 @@ def limited_memory() -> Iterator[None]:
     except (ImportError, OSError):
         yield
         return
+    wanted = pages * resource.getpagesize() + READING_BYTES
+
+    def set_least() -> None:
+        soft, hard = _BEFORE[0]
+        limits = [limit for limit in (*_WANTED, soft, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(limits, default=resource.RLIM_INFINITY), hard))
+
     with _LOCK:
-        before = _BEFORE[0] if _BEFORE else resource.getrlimit(resource.RLIMIT_AS)
-        if not _BEFORE:
-            wanted = pages * resource.getpagesize() + READING_BYTES
-            least = min(limit for limit in (wanted, *before) if limit != resource.RLIM_INFINITY)
-            resource.setrlimit(resource.RLIMIT_AS, (least, before[1]))
-        _BEFORE.append(before)
+        if not _WANTED:
+            _BEFORE[:] = [resource.getrlimit(resource.RLIMIT_AS)]
+        _WANTED.append(wanted)
+        set_least()
     try:
         yield
     finally:
         with _LOCK:
-            before = _BEFORE.pop()
-            if not _BEFORE:
-                resource.setrlimit(resource.RLIMIT_AS, before)
+            _WANTED.remove(wanted)
+            set_least()
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
