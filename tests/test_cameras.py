@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,73 @@ def test_impossible_frequencies_are_named(tmp_path):
     path.write_text(AZURE.replace("[198.0e+6", "[-198.0e+6", 1))
     with pytest.raises(UserError, match="frequencies_hz"):
         read_camera(path)
+
+
+OWN = "name: own\ntitle: my own\nlike: azure_kinect_nfov\n"
+
+
+def test_a_camera_like_another_states_only_what_differs(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        OWN + "photons: {signal_electrons: {value: 600.0, tag: M, source: guess}}\nengine: {edge_threshold: null}\n"
+    )
+    own, azure = load_camera(str(path)), load_camera("azure_kinect_nfov")
+    assert (own.name, own.title) == ("own", "my own")
+    assert own.photons.signal_electrons.value == 600.0 and own.photons.band_nm == azure.photons.band_nm
+    assert own.engine.edge_threshold is None and own.engine.window_px == azure.engine.window_px
+    assert own.lens == azure.lens and not own.modes
+    second = tmp_path / "second.yaml"
+    second.write_text("name: second\ntitle: of that\nlike: own.yaml\n")
+    assert load_camera(str(second)).photons.signal_electrons.value == 600.0
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("name: own\ntitle: t\nlike: azure_kinect_nfv\n", "azure_kinect_nfov"),
+        ("name: own\ntitle: t\nlike: own.yaml\n", "own.yaml:3:7: `like` leads on"),
+        ("name: own\ntitle: t\nlike: [a]\n", "own.yaml:3:7: `like` is not the name of a camera"),
+        (OWN + "photons: {signal_electrons: {value: -1.0, tag: M, source: guess}}\n", "own.yaml:4:"),
+        (OWN + "lens: {fx: {value: 1.0, tag: M, source: guess}}\n", "unknown key `fx` in `lens`"),
+    ],
+)
+def test_mistakes_in_a_camera_like_another_are_told_where_they_stand(tmp_path, text, wanted):
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_camera(path)
+    assert wanted in str(caught.value)
+
+
+def test_an_experiment_names_a_camera_by_its_file(tmp_path, capsys):
+    (tmp_path / "own.yaml").write_text(OWN)
+    (tmp_path / "a.yaml").write_text(Path(SMOKE).read_text())
+    named = load_experiment(tmp_path / "a.yaml", ["source.camera.name=azure_kinect_nfov"])
+    text = (tmp_path / "a.yaml").read_text()
+    assert "name: azure_kinect_nfov" in text
+    (tmp_path / "a.yaml").write_text(text.replace("name: azure_kinect_nfov", "name: ./own.yaml", 1))
+    own = load_experiment(tmp_path / "a.yaml")
+    assert camera_of(own.points[0].config.source.camera).name == "own"
+    assert own.points[0].digest != named.points[0].digest
+    axis = f"sweep={{source.camera.name: [azure_kinect_nfov, {tmp_path / 'own.yaml'}]}}"
+    swept = load_experiment(SMOKE, [axis, "sensitivity=null"])
+    assert [point.variant for point in swept.points] == ["camera=azure_kinect_nfov", "camera=own"]
+    assert main([SMOKE, "--dry-run", "--out", str(tmp_path / "out"), "--set", "source.camera.name=./no.yaml"]) == 2
+    assert "there is no such file" in capsys.readouterr().err
+
+
+def test_a_lens_may_fold_outside_its_field(tmp_path):
+    wide = "lens:\n  width_px: {value: 1024, tag: R, source: s}\n  height_px: {value: 1024, tag: R, source: s}\n"
+    wide += "  cx_px: {value: 513.738, tag: R, source: s}\n  cy_px: {value: 513.338, tag: R, source: s}\n"
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN + wide)
+    with pytest.raises(UserError, match="folds the image"):
+        read_camera(path)
+    path.write_text(OWN + wide + "  field_half_angle_deg: {value: 60.0, tag: R, source: s}\n")
+    camera = read_camera(path)
+    outside = camera.lens.outside_field(camera.nominal_lens.whole)
+    # the circle of 120 degrees just fits the sensor of 1024 x 1024 pixels
+    assert 511 < np.sqrt((~outside).sum() / np.pi) < 513 and outside[0, 0] and not outside[512, 512]
 
 
 def test_distortion_unfolds_up_to_where_its_slope_vanishes():

@@ -26,7 +26,7 @@ from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from scenes.perspectives import check_in_view, poses_of, view_count
-from scenes.sensor.camera import CameraConfig, camera_names, camera_of
+from scenes.sensor.camera import CameraConfig, camera_names, camera_of, is_camera_path, load_camera
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
@@ -41,7 +41,12 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
     for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
         name = shape.get(source.data, path)
-        if isinstance(name, str) and name not in legal:
+        if path == CAMERA_NAME and isinstance(name, str) and is_camera_path(name):
+            try:
+                load_camera(name)
+            except UserError as error:
+                problems.append(Problem(str(error), source.place_of(path)))
+        elif isinstance(name, str) and name not in legal:
             problems.append(wrong_choice(path, name, legal, source.place_of(path)))
     if config is not None and not problems:
         if config.capture.average.frames is not None:

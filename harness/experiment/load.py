@@ -11,10 +11,11 @@ from harness.experiment import checks
 from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of, recording_of
 from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.diagnose import dotted
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import CameraConfig, camera_names, load_camera
+from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera
 
 EXPERIMENT_VERSION = 1
 """Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
@@ -63,8 +64,18 @@ def resolved_yaml(experiment: Experiment) -> str:
 
 
 def _with_absolute_paths(source: Source, folder: Path) -> Source:
-    """Make paths of a real capture absolute: they count from the YAML's folder, in ``--set`` from the current one."""
+    """Make paths of a real capture, and of camera files, absolute: they count from the YAML's folder, in ``--set`` from
+    the current one."""
     data = source.data
+    swept: KeyPath = ("sweep", dotted(checks.CAMERA_NAME))
+    listed = shape.get(data, swept)
+    named: list[KeyPath] = [checks.CAMERA_NAME]
+    named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
+    for at in named:
+        name = shape.get(data, at)
+        if isinstance(name, str) and is_camera_path(name):
+            start = Path.cwd() if source.place_of(at).origin == OPTION else folder
+            data = set_path(data, at, str(start / Path(name).expanduser()))
     listed, lens = (shape.get(data, ("source", key)) for key in ("paths", "intrinsics"))
     places: list[KeyPath] = [("source", "paths", k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     if isinstance(lens, str) and lens not in camera_names():
@@ -105,7 +116,8 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
             legal="an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them",
         )
     for name in cameras:
-        nominal = load_camera(name).nominal_lens if name in camera_names() else lens
+        known = name in camera_names() or is_camera_path(name)
+        nominal = load_camera(name).nominal_lens if known else lens
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             raise UserError(
                 f"{recording}: the calibration is of {lens.width} x {lens.height} pixels",

@@ -275,7 +275,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         camera, work = camera_of(source.camera), source.render.to_data()
         render = {"target": target, "optics": camera.optics.content(), "render": work}
         frames = {"kind": source.kind, "target": target, "render": work}
-        frames["camera"] = {**source.camera.to_data(), "facts": camera_digest(camera)}
+        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
@@ -27,8 +28,8 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number."""
-    text = on_one_line(value)
+    """A value on one line, short, with its unit where it is a number; of a camera's file, its name."""
+    text = on_one_line(Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return f"{value:g} {unit_of(path)}" if number and unit_of(path) else text
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.declaration.diagnose import read_as
-from harness.vocabulary.declaration.yaml_source import DeclarationError, Problem, read_yaml
+from harness.vocabulary.declaration.diagnose import read_as, with_value_at
+from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 from harness.vocabulary.plug_ins import PlugIns
@@ -23,6 +23,8 @@ from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 
+DEEPEST = 5
+"""Cameras that are each ``like`` the next."""
 GROUP = "tofpod.cameras"  # its entry points name the path of a camera's file, called as the entry point is
 CAMERAS = PlugIns(
     GROUP,
@@ -63,7 +65,8 @@ class CameraConfig(Config):
 
     name: str = Field(
         "azure_kinect_nfov",
-        description="a file of scenes/cameras/ without its ending, or a camera of an installed package",
+        description="a file of scenes/cameras/ without its ending, a camera of an installed package, or the path of a "
+        "camera's own .yaml file, from the experiment's folder",
     )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()
@@ -98,7 +101,10 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the file of that camera. Raises UserError for a name that is unknown or taken twice, or has no file."""
+    """Return the file of that camera, which a name that ends in ``.yaml`` is the path of. Raises UserError for a name
+    that is unknown or taken twice, or has no file."""
+    if is_camera_path(name):
+        return Path(name)
     offer = CAMERAS.offer(name)
     if offer.built_in:
         return Path(offer.target)
@@ -111,6 +117,11 @@ def camera_file(name: str) -> Path:
     return path
 
 
+def is_camera_path(name: str) -> bool:
+    """Return whether a camera's name is the path of its file."""
+    return name.endswith(".yaml")
+
+
 def load_camera(name: str) -> AnyCamera:
     """Return the camera of that name. Raises UserError as `camera_file`, and for a file that describes no camera."""
     return _camera_at(camera_file(name))
@@ -120,7 +131,8 @@ def lens_names() -> dict[str, str]:
     """Return the names under which `lens_named` knows a lens, cameras and further depth modes, each with its camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
-        names |= dict.fromkeys((camera, *load_camera(camera).modes), camera)
+        # a mode that has a file of its own stays with the camera whose mode it is
+        names = dict.fromkeys((camera, *load_camera(camera).modes), camera) | names
     return names
 
 
@@ -181,11 +193,39 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 def read_camera(path: Path) -> AnyCamera:
     """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
     source = read_yaml(path)
-    camera = read_as(KINDS, "kind", source)
-    if camera.name != path.stem:
-        message = f"`name` is {camera.name}, but the file is {path.name}"
+    named = source.data.get("name")
+    if named != path.stem:
+        message = f"`name` is {named}, but the file is {path.name}"
         raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])
-    return camera
+    return read_as(KINDS, "kind", _completed(source))
+
+
+def _completed(source: Source, depth: int = 0) -> Source:
+    """Return a file's content, what it does not state taken from the camera that its key ``like`` names: whole facts
+    and lists, never parts of them. Other modes of the lens are not taken over."""
+    name = source.data.get("like")
+    if name is None:
+        return source
+    place = source.place_of(("like",))
+    if not isinstance(name, str) or depth == DEEPEST:
+        message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` leads on {DEEPEST} times"
+        raise DeclarationError(source.origin, [Problem(message, place, legal=f"one of {', '.join(camera_names())}")])
+    beside = Path(source.origin).parent / name
+    base = _completed(read_yaml(beside if is_camera_path(name) else camera_file(name)), depth + 1)
+    found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
+    found = replace(found, values={**base.values, (): source.place_of(())}, keys=base.keys)
+    for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
+        found = found.with_value(path, with_value_at(found.data, path, value), source, path)
+    return found
+
+
+def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
+    """Yield the path and value of each fact, and of all else that is no mapping of facts."""
+    for key, value in data.items():
+        if isinstance(value, dict) and "value" not in value:
+            yield from _stated(value, (*prefix, key))
+        else:
+            yield (*prefix, key), value
 
 
 _camera_at = lru_cache(read_camera)

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.geometry import Lens
+from harness.vocabulary.geometry import Lens, Region
 
 T = TypeVar("T")
 
@@ -51,7 +51,9 @@ Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambd
 
 
 class LensFacts(Config):
-    """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none."""
+    """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none.
+    ``field_half_angle_deg``: the lens's image is a circle that ends so far from the axis; None: it covers the sensor.
+    Pixels beyond it see nothing, and the distortion may fold there."""
 
     width_px: PositiveInt
     height_px: PositiveInt
@@ -60,6 +62,7 @@ class LensFacts(Config):
     cx_px: Fact[float]
     cy_px: Fact[float]
     distortion: Fact[tuple[float, ...]]
+    field_half_angle_deg: HalfAngle | None = None
 
     @model_validator(mode="after")
     def _sees_each_direction_once(self) -> LensFacts:
@@ -68,16 +71,33 @@ class LensFacts(Config):
         lens = self.lens()
         across, down = max(lens.cx, lens.width - 1 - lens.cx), max(lens.cy, lens.height - 1 - lens.cy)
         corner, limit = float(np.hypot(across / lens.fx, down / lens.fy)), unfolded_slope(lens.distortion)
-        if corner > limit:
+        if min(corner, self.image_radius) > limit:
+            end = "corner of the sensor lies" if corner < self.image_radius else "field ends"
             raise ValueError(
-                f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the corner "
-                f"of the sensor lies at {corner:.3g}"
+                f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the {end} "
+                f"at {min(corner, self.image_radius):.3g}"
             )
         u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)))
+        seen = np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) < self.image_radius
+        u, v = u[seen], v[seen]
         again = lens.project(np.concatenate([lens.slopes(u, v), np.ones((u.size, 1))], axis=-1))
         if not (np.abs(again - np.stack([u, v], axis=-1)) < WORST_PX).all():
             raise ValueError("distortion folds the image: somewhere on the sensor no direction leads to a pixel")
         return self
+
+    @cached_property
+    def image_radius(self) -> float:
+        """The radius of the lens's image, in focal lengths; infinite where it covers the sensor."""
+        if self.field_half_angle_deg is None:
+            return float("inf")
+        slope = np.tan(np.deg2rad(self.field_half_angle_deg.value))
+        return float(distorted_slope(np.float64(slope), self.lens().distortion))
+
+    def outside_field(self, region: Region) -> np.ndarray:
+        """Return (h, w) bool: pixels beyond the lens's image."""
+        lens = self.lens()
+        v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
+        return np.asarray(np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) > self.image_radius)
 
     def lens(self) -> Lens:
         """The lens in the program's own type."""
@@ -135,13 +155,18 @@ class CameraFacts(Config):
         return self.lens.lens()
 
 
-def unfolded_slope(distortion: tuple[float, ...]) -> float:
-    """Return the largest distorted slope up to which radial distortion (k1 k2 p1 p2 k3 k4 k5 k6, without the tangential
-    part) grows with the true one; infinite where it always does within `STEEPEST`."""
+def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Return the distorted slopes of true ones (n,) by radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6)."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
-    slope = np.linspace(0.0, STEEPEST, 6001)
     s = slope**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        distorted = slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
-    back = np.flatnonzero(~(np.diff(distorted) > 0))
+        return np.asarray(slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6))))
+
+
+def unfolded_slope(distortion: tuple[float, ...]) -> float:
+    """Return the largest distorted slope up to which radial distortion grows with the true one; infinite where it
+    always does within `STEEPEST`."""
+    distorted = distorted_slope(np.linspace(0.0, STEEPEST, 6001), distortion)
+    with np.errstate(invalid="ignore"):
+        back = np.flatnonzero(~(np.diff(distorted) > 0))
     return float(distorted[back[0]]) if back.size else float("inf")

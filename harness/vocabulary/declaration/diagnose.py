@@ -45,7 +45,7 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
     for path, spliced in splices.items():
         try:
             filled = spliced.from_data(shape.get(data, path) or {})
-            data = _with(data, path, filled.to_data())
+            data = with_value_at(data, path, filled.to_data())
         except ValidationError as error:
             problems += problems_of(error, declared, source, path)
     try:
@@ -55,11 +55,11 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
     return (None if problems else config), problems
 
 
-def _with(data: Any, path: KeyPath, value: Any) -> Any:
+def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
     """Return data with a value at a path; unchanged where something other than a mapping or list is in the way."""
     if not path:
         return value
-    inner = _with(shape.child(data, path[0]), path[1:], value)
+    inner = with_value_at(shape.child(data, path[0]), path[1:], value)
     if isinstance(data, list):
         return [inner if index == path[0] else each for index, each in enumerate(data)]
     return {**(data or {}), path[0]: inner} if data is None or isinstance(data, dict) else data

@@ -128,9 +128,9 @@ class AmcwImager:
 
     @cached_property
     def outside_mask(self) -> np.ndarray:
-        """(h, w) bool: pixels that look beyond the illuminated polygon, if the camera has one."""
+        """(h, w) bool: pixels that look beyond the lens's image or the illuminated polygon, if the camera has one."""
         x, y = self.slopes[..., 0], self.slopes[..., 1]
-        outside = np.zeros(x.shape, bool)
+        outside = self.camera.lens.outside_field(self.region)
         if self.camera.emitter.mask_slopes is not None:
             corners = np.array(self.camera.emitter.mask_slopes.value)
             for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
