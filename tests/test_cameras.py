@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,15 @@ from harness.sweep import main
 from harness.vocabulary.errors import UserError
 from scenes.perspectives import check_in_view
 from scenes.sensor.calibration import _main as calibration_program
-from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, camera_of, load_camera, read_camera
+from scenes.sensor.camera import (
+    CAMERA_FOLDER,
+    CameraConfig,
+    camera_names,
+    camera_of,
+    lens_named,
+    load_camera,
+    read_camera,
+)
 from scenes.sensor.facts import unfolded_slope
 from scenes.target.mesh import build_target
 from scenes.target.thesis import target_from_data
@@ -124,6 +133,31 @@ def test_an_experiment_names_a_camera_by_its_file(tmp_path, capsys):
     assert [point.variant for point in swept.points] == ["camera=azure_kinect_nfov", "camera=own"]
     assert main([SMOKE, "--dry-run", "--out", str(tmp_path / "out"), "--set", "source.camera.name=./no.yaml"]) == 2
     assert "there is no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", load_camera("azure_kinect_nfov").modes)
+def test_a_mode_with_a_file_of_its_own_has_the_lens_of_the_mode(mode):
+    azure, own = load_camera("azure_kinect_nfov"), load_camera(mode)
+    found, wanted = (
+        dataclasses.asdict(lens) for lens in (own.nominal_lens, azure.modes[mode].lens(azure.nominal_lens))
+    )
+    assert found.pop("distortion") == wanted.pop("distortion")
+    assert found == pytest.approx(wanted, abs=1e-5)
+    assert lens_named(mode).mode == mode and len(lens_named(mode).others) == 4
+
+
+def test_a_guess_of_the_precision_states_its_range(tmp_path):
+    path = tmp_path / "own.yaml"
+    for range_, legal in (("range: [300.0, 1200.0]", True), ("range: [700.0, 1200.0]", False), ("", False)):
+        path.write_text(
+            OWN
+            + f"photons: {{signal_electrons: {{value: 600.0, tag: G, {range_}, source: guess}}}}\n".replace(", ,", ",")
+        )
+        if legal:
+            assert read_camera(path).photons.signal_electrons.range == (300.0, 1200.0)
+        else:
+            with pytest.raises(UserError, match="states the `range`"):
+                read_camera(path)
 
 
 def test_a_lens_may_fold_outside_its_field(tmp_path):
@@ -242,7 +276,8 @@ def test_calibrating_an_unknown_camera_is_one_message(capsys):
 
 def test_one_value_on_an_axis_tells_no_set_ups_apart():
     several = load_experiment("experiments/cameras.yaml", ["sweep.source.target.distance_m=[0.75]", "sensitivity=null"])
-    assert {point.variant for point in several.points} == {f"camera={name}" for name in camera_names()}
+    names = ("azure_kinect_nfov", "kinect_v2", "realsense_l515")
+    assert {point.variant for point in several.points} == {f"camera={name}" for name in names}
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path, capsys):

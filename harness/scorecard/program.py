@@ -39,7 +39,7 @@ from harness.tables.text import show
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import RESULTS_VERSION, record
-from scenes.sensor.camera import camera_digest, camera_names, load_camera
+from scenes.sensor.camera import camera_digest, load_camera
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -198,7 +198,8 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     # a quick look is judged by a baseline that is named only
     baseline_file = options.baseline or (None if options.quick else BASELINE_FILE)
     every = read_figures(options.figures or FIGURES_FILE)
-    titles = {name: load_camera(name).title for name in (dict.fromkeys(options.camera) or camera_names())}
+    published = dict.fromkeys(figure.entry.camera for figure in every)
+    titles = {name: load_camera(name).title for name in (dict.fromkeys(options.camera) or published)}
     figures = tuple(figure for figure in every if figure.entry.camera in titles)
     baseline = read_baseline(baseline_file) if baseline_file else {}
     points = tuple(curve_points(QUICK_GRIDS if options.quick else FULL_GRIDS))

@@ -21,12 +21,20 @@ STEEPEST = 6.0  # slope from the axis up to which distortion is examined: 80 deg
 
 class Fact(Config, Generic[T]):
     """One number of a camera with where it comes from. ``tag``: R read in the named public source, D derived from such,
-    S one secondary source, W measured on public captures, C calibrated, M a guess, U set by the user of an
-    experiment."""
+    S one secondary source, W measured on public captures, C calibrated, M a guess, G a guess of the precision with the
+    ``range`` that it may lie in, U set by the user of an experiment."""
 
     value: T
-    tag: Literal["R", "D", "S", "W", "C", "M", "U"]
+    tag: Literal["R", "D", "S", "W", "C", "M", "G", "U"]
     source: str
+    range: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _guess_has_a_range(self) -> Fact[T]:
+        low, high = self.range or (np.nan, np.nan)
+        if (self.tag == "G") != (self.range is not None) or (self.range and not low <= self.value <= high):  # type: ignore[operator]
+            raise ValueError("a number with the tag G, and no other, states the `range` that it may lie in")
+        return self
 
 
 def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
