@@ -285,3 +285,15 @@ def test_a_calibration_that_is_none_is_refused(tmp_path, capsys):
     path.write_bytes(b"no recording")
     assert main([SMOKE, "--dry-run", "--out", str(tmp_path / "out"), "--calibration", str(path)]) == 2
     assert "not.mkv" in capsys.readouterr().err
+
+
+def test_the_camera_of_the_documentation_is_legal(tmp_path):
+    text = Path("docs/add_a_camera.md").read_text()
+    block = text.split("    # blaze101.yaml\n", 1)[1].split("\n\nEvery number", 1)[0]
+    path = tmp_path / "blaze101.yaml"
+    path.write_text("\n".join(line[4:] for line in block.splitlines()))
+    camera = load_camera(str(path))
+    assert camera.photons.signal_electrons.range == (6400.0, 102000.0)
+    albedos = "[{wavelength_nm: 940.0, board: 0.6, backing: 0.6, floor: 0.3, back_wall: 0.6}]"
+    changes = [f"source.camera.name={path}", f"source.target.other_wavelengths={albedos}"]
+    assert load_experiment("experiments/detection_limit.yaml", changes).points[0].variant == "main"
