@@ -34,9 +34,15 @@ def _parser() -> argparse.ArgumentParser:
         epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
     )
     add, switch = parser.add_argument, argparse.BooleanOptionalAction
-    add("file", type=Path, metavar="FILE.csv", help="a header row, then one row an inspection; comma, semicolon or tab")
+    add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row an inspection")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
-    add("--hit", metavar="COL", help="column of 1 (found) and 0 (missed)")
+    add(
+        "--hit",
+        metavar="COL",
+        action="append",
+        help="column of 1 (found) and 0 (missed), or yes and no, hit and miss; "
+        "may be repeated, once for each inspector",
+    )
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
     add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
     add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
@@ -75,6 +81,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _stated(options: argparse.Namespace) -> PodStatement:
+    from harness.evaluation.pod import inspections as table
     from harness.evaluation.pod import statement as pod
 
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
@@ -89,16 +96,17 @@ def _stated(options: argparse.Namespace) -> PodStatement:
         legal = "a signal, in the column's unit"
         fix = "add --decision Y; a value for a wanted rate of false calls comes from hole-free runs"
         raise UserError("--ahat needs --decision: the POD is that of a signal above it", legal=legal, fix=fix)
-    read = pod.read_inspections(options.file, options.size, options.hit if of_hits else options.ahat, options.target)
+    responses = options.hit if of_hits else [options.ahat]
+    read = table.read_inspections(options.file, options.size, responses, options.target, hits=of_hits)
     if of_hits:
-        pod.require_hits(read)
+        table.require_hits(read)
     if options.log:
-        pod.require_positive(read, response=False, why="--log")
+        table.require_positive(read, response=False, why="--log")
     if of_hits:
         told: dict[str, Any] = {"link": options.link, "log_size": options.log, "bounded": options.bounded or "none"}
         return pod.state_hits(read, **told, method=(options.bound or BOUNDS[0]).replace("-", " "), unit=options.unit)
     if options.log_signal and options.left is None:
-        pod.require_positive(read, response=True, why="--log-signal")
+        table.require_positive(read, response=True, why="--log-signal")
     names = ("decision", "left", "right", "log_signal", "unit")
     return pod.state_signals(read, log_size=options.log, **{name: getattr(options, name) for name in names})
 

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.evaluation.pod.statement import drawn_sizes, read_inspections, state_hits, state_signals
+from harness.evaluation.pod.inspections import read_inspections
+from harness.evaluation.pod.statement import drawn_sizes, state_hits, state_signals
 from harness.pod import FILES, main
 from harness.vocabulary.provenance import RESULTS_VERSION
 
@@ -81,7 +82,7 @@ def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
 
 def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every target inspected five times, alike each time: the limit is that of the targets, and both are shown."""
-    single = read_inspections(table(tmp_path / "one.csv", size=SIZES, hit=hits()), "size", "hit")
+    single = read_inspections(table(tmp_path / "one.csv", size=SIZES, hit=hits()), "size", ["hit"])
     once = state_hits(single, link="logit", log_size=False)
     repeated = {"size": np.repeat(SIZES, 5), "hit": np.repeat(hits(), 5), "hole": np.repeat(np.arange(60), 5)}
     file = str(table(tmp_path / "many.csv", **repeated))
@@ -111,7 +112,7 @@ def test_what_is_not_demonstrated_is_said(tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.parametrize("method", ["likelihood-ratio", "profile", "wald"])
 def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, method: str) -> None:
-    read = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", "hit")
+    read = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", ["hit"])
     said = state_hits(read, link="logit", log_size=False, method=method.replace("-", " "))
     rising = np.maximum.accumulate(said.lower)
     assert float(np.interp(0.9, rising, said.sizes)) == pytest.approx(said.bound.value, rel=2e-3)
@@ -146,7 +147,9 @@ def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixtu
     """The same signal four times over is one signal: same curve, same limit; and the wrong one beside it."""
     sizes = np.linspace(1, 10, 50)
     once = state_signals(
-        read_inspections(table(tmp_path / "one.csv", size=sizes, signal=signals(sizes)), "size", "signal"),
+        read_inspections(
+            table(tmp_path / "one.csv", size=sizes, signal=signals(sizes)), "size", ["signal"], hits=False
+        ),
         decision=400,
         log_size=False,
         log_signal=False,
@@ -161,6 +164,23 @@ def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert said["a90"] == pytest.approx(4 + 0.8 * 1.2816, rel=0.05)
     assert "WRONG here" in capsys.readouterr().out
     assert float(np.interp(0.9, once.lower, once.sizes)) == pytest.approx(once.bound.value, rel=2e-3)
+
+
+def test_unflawed_sites_give_the_probability_of_a_false_positive(tmp_path: Path) -> None:
+    """2,000 sites with noise of 150 +- 100 and a decision at 400, censored at 50: PFP = 1 - F(2.5) = 0.62 %."""
+    noise = np.random.default_rng(3).normal(150, 100, 2000)
+    sizes = np.concatenate([np.linspace(1, 10, 50), np.zeros(2000)])
+    both = np.concatenate([signals(np.linspace(1, 10, 50)), noise])
+    file = table(tmp_path / "a.csv", size=sizes, signal=both, hit=(both > 400).astype(int))
+    asked = ["--ahat", "signal", "--decision", "400", "--left", "50", "--no-log", "--no-log-signal"]
+    assert main([str(file), "--size", "size", *asked, "--out", str(tmp_path)]) == 0
+    numbers, calls = stated(tmp_path)["numbers"], int((noise > 400).sum())
+    assert (numbers["unflawed sites"], numbers["false positives"]) == (2000, calls)
+    assert numbers["PFP by the noise's normal law"] == pytest.approx(0.0062, rel=0.2)
+    assert numbers["PFP"] == calls / 2000 < numbers["PFP's 95 % upper bound"] < 0.012
+    assert main([str(file), "--size", "size", "--hit", "hit", "--out", str(tmp_path)]) == 0
+    assert stated(tmp_path)["numbers"]["false positives"] == calls
+    assert stated(tmp_path)["inspections"] == 50
 
 
 def test_mistakes_with_signals_are_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,12 +198,13 @@ def test_mistakes_with_signals_are_explained(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_small_studies_and_separation_are_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = table(tmp_path / "a.csv", size=np.arange(12), hit=(np.arange(12) > 5).astype(int))
+    file = table(tmp_path / "a.csv", size=np.arange(-1, 11), hit=(np.arange(12) > 5).astype(int))
     assert main([str(file), "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert "12 independent targets; MIL-HDBK-1823A asks for at least 60" in printed
+    assert "11 independent targets; MIL-HDBK-1823A asks for at least 60" in printed
     assert "Firth" in printed
-    assert len(stated(tmp_path)["models"]) == 4  # a size of 0 has no logarithm
+    assert len(stated(tmp_path)["models"]) == 4  # a size of -1 has no logarithm
+    assert "1 of 12 inspections are of unflawed sites" in " ".join(printed.split())
 
 
 # ---- what it writes --------------------------------------------------------------------------------------------------
@@ -231,7 +252,7 @@ def test_drawn_sizes_hold_data_and_near_marks() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    sizes=st.lists(st.floats(-1e6, 1e6, allow_subnormal=False), min_size=10, max_size=14),
+    sizes=st.lists(st.floats(-1e6, 1e6, allow_subnormal=False).filter(bool), min_size=10, max_size=14),
     separator=st.sampled_from([",", ";", "\t"]),
     mark=st.booleans(),
     end=st.sampled_from(["\n", "\r\n"]),
@@ -244,9 +265,83 @@ def test_any_separator_mark_and_line_end(
     texts = [repr(one) if separator == "," else repr(one).replace(".", ",") for one in sizes]
     rows = [separator.join(("a", "h", "t")), *(separator.join((text, "1", "x y")) for text in texts), ""]
     path.write_bytes(end.join(rows).encode("utf-8-sig" if mark else "utf-8"))
-    read = read_inspections(path, "a", "h")
+    read = read_inspections(path, "a", ["h"])
     assert read.size.tolist() == sizes
     assert read.line.tolist() == list(range(2, len(sizes) + 2))
+
+
+TRUE = [0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 1234.5]
+
+
+def written(head: str, sizes: str, misses_and_hits: str, between: str = ",") -> str:
+    """A table whose sizes are written by the format ``sizes``; misses and hits in turn, as these two words."""
+    words = misses_and_hits.split()
+    rows = (sizes.format(size) + between + words[k % 2] for k, size in enumerate(TRUE))
+    return f"{head}größe{between}hit\n" + "\n".join(rows)
+
+
+GERMAN = {ord("."): ",", ord(","): "."}
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (written("", "{}", "0 1"), "utf-16"),
+        (written("", "{}", "0 1"), "latin-1"),
+        (written("", "{}", "No yes", ";").translate(GERMAN), "utf-8"),
+        (written("", "{:,}", "0 1", ";").translate(GERMAN), "cp1252"),
+        (written("", '"{:,}"', "MISS hit"), "utf-8-sig"),
+        (written("sep=|\n", "{}", "False True", "|"), "utf-8"),
+        (written("", "{:,}", "0.0 1.0", "\t").replace(",", "'"), "utf-8"),
+    ],
+)
+def test_tables_as_people_have_them(tmp_path: Path, text: str, encoding: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(text.encode(encoding))
+    read = read_inspections(path, "größe", ["hit"])
+    assert read.size.tolist() == TRUE
+    assert read.response.tolist() == [0.0, 1.0] * 5
+    assert read.notes == ()
+
+
+def test_a_mark_that_may_part_thousands_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("a;h\n" + "".join(f"{k},{250 + k};{k % 2}\n" for k in range(1, 12)))
+    read = read_inspections(path, "a", ["h"])
+    assert read.size[0] == 1.251
+    assert read.notes == ("a: '1,251' was read as 1.251; write thousands without a mark if it is more",)
+
+
+def test_inspectors_in_columns_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The handbook's layout: a row for each flaw, a column for each inspector; a flaw is one target."""
+    first, second = hits(seed=4), hits(seed=5).astype(object)
+    second[[3, 10]] = ["NA", ""]
+    wide = table(tmp_path / "wide.csv", size=SIZES, A=first, B=second)
+    read = read_inspections(wide, "size", ["A", "B"])
+    assert (len(read.size), read.targets) == (118, 60)
+    assert read.notes == ("2 of 120 inspections state no result: left out",)
+    assert read.response[:60].tolist() == first.tolist()
+    assert main([str(wide), "--size", "size", "--hit", "A", "--hit", "B", "--out", str(tmp_path)]) == 0
+    assert "2 of 120 inspections state no result" in capsys.readouterr().out
+    assert (stated(tmp_path)["inspections"], stated(tmp_path)["targets"]) == (118, 60)
+
+
+def test_a_sheet_of_excel_reads_as_its_csv(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in [("size", "hit"), *zip(SIZES.tolist(), hits().tolist(), strict=True), (None, 1)]:
+        book.active.append([None, *row])
+    book.create_sheet("empty")
+    book.save(tmp_path / "a.xlsx")
+    found = read_inspections(tmp_path / "a.xlsx", "size", ["hit"])
+    same = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", ["hit"])
+    assert found.size == pytest.approx(same.size, rel=1e-14)
+    assert found.response.tolist() == same.response.tolist()
+    assert found.unflawed.tolist() == [1.0]
+    book["empty"].append(["size"])
+    book.save(tmp_path / "a.xlsx")
+    assert main([str(tmp_path / "a.xlsx"), *HIT, "--out", str(tmp_path / "out")]) == 2
+    assert "has 2 sheets with data: Sheet, empty" in capsys.readouterr().err
 
 
 GOOD = "a,hit,t\n" + "".join(f"{0.5 * row},{int(row > 6)},t{row}\n" for row in range(1, 13))
@@ -265,12 +360,22 @@ HIT = ["--size", "a", "--hit", "hit"]
         (GOOD, [*HIT, "--no-log-signal"], ["--log-signal belongs to --ahat"]),
         (GOOD, ["--size", "a", "--ahat", "t", "--decision", "1", "--link", "logit"], ["--link belongs to --hit"]),
         (GOOD, ["--size", "a", "--hit", "a"], ["column 'a' is chosen twice"]),
-        (GOOD.replace("3.0,0", "3.0,2"), HIT, ["line 7: hit is 2", "1 for a hit, 0 for a miss", "--ahat"]),
-        (GOOD.replace("3.0,0", "3.0,"), HIT, ["line 7: hit is empty, not a number"]),
+        (GOOD.replace("3.0,0", "3.0,2"), HIT, ["line 7: hit is '2', which is neither", "1, yes, true", "--ahat"]),
+        (GOOD.replace("3.0,0", "3.0,perhaps"), HIT, ["line 7: hit is 'perhaps', which is neither hit nor miss"]),
+        (
+            GOOD.replace("3.0,0", "3.0,").replace("2.5,0", "2.5,NA").replace("2.0,0", "2.0,-"),
+            HIT,
+            ["9 rows are too few"],
+        ),
+        (GOOD.replace("3.0", '"3,0"'), HIT, ["a has numbers with the decimal marks , and ."]),
         (GOOD.replace("3.0,0", "3 mm,0"), HIT, ["line 7: a is '3 mm', not a number"]),
-        (GOOD.replace("3.0,0", "nan,0"), HIT, ["line 7: a is 'nan', not a number"]),
+        (GOOD.replace("3.0,0", "inf,0"), HIT, ["line 7: a is 'inf', not a number"]),
         (GOOD.replace("3.0,0", "3,0,0"), HIT, ["line 7: 4 fields, and the header has 3"]),
-        (GOOD.replace("3.0,0", "0,0"), [*HIT, "--log"], ["line 7: a is 0, which has no logarithm", "leave out --log"]),
+        (
+            GOOD.replace("3.0,0", "-1,0"),
+            [*HIT, "--log"],
+            ["line 7: a is -1, which has no log", "leave out --log"],
+        ),
         (GOOD.replace(",0,", ",1,"), HIT, ["all 12 rows of hit are hits", "both hits and misses"]),
         (GOOD.replace(",1,", ",0,"), HIT, ["all 12 rows of hit are misses"]),
         ("\n".join(GOOD.split("\n")[:10]), HIT, ["9 rows are too few", "at least 10"]),
@@ -293,9 +398,16 @@ def test_mistakes_are_explained(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_a_missing_file_and_another_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "utf16.csv").write_bytes(GOOD.encode("utf-16"))
-    for name, said in (("none.csv", "no such file"), (".", "is a directory"), ("utf16.csv", "not UTF-8")):
+def test_a_folder_a_missing_file_and_no_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "zeros.csv").write_bytes(bytes(100))
+    (tmp_path / "broken.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
+    excel = "Excel file"
+    for name, said in (
+        ("none.csv", "no such file"),
+        (".", "is a directory"),
+        ("zeros.csv", "no text"),
+        ("broken.xlsx", excel),
+    ):
         assert main([str(tmp_path / name), *HIT, "--out", str(tmp_path / "out")]) == 2
         assert said in capsys.readouterr().err
 

@@ -14,7 +14,7 @@ import pytest
 from hostile_files import BOMB, capture_refusal, little_memory, refusal
 
 from detectors.recordings.intrinsics import read_lens
-from harness.evaluation.pod.statement import read_inspections
+from harness.evaluation.pod.inspections import read_inspections
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import assign, read_poses
@@ -193,7 +193,7 @@ def sparse(path: Path) -> Path:
 @pytest.mark.parametrize(
     ("read", "told"),
     [
-        (lambda path: read_inspections(path, "size", "hit"), "more than 256 MiB"),
+        (lambda path: read_inspections(path, "size", ["hit"]), "more than 256 MiB"),
         (lambda path: read_poses(path, 1), "more than 16 MiB"),
         (read_baseline, "more than 16 MiB"),
         (read_mask, "no image that can be read (has more than 512 MiB)"),

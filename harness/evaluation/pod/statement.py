@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,129 +20,8 @@ from harness.evaluation.pod.hit_miss import (
     fit_hit_miss,
     floor_ceiling_test,
 )
+from harness.evaluation.pod.inspections import Inspections
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import TABLE_BYTES, bounded_bytes
-
-FEWEST_ROWS = 10
-"""Too few below this for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
-SEPARATORS = (",", ";", "\t")
-
-
-@dataclass(frozen=True)
-class Inspections:
-    """One inspection a row: ``size`` (n,) in the file's unit, ``response`` (n,) hits as 0/1 or signals, ``target`` (n,)
-    the name of what was inspected, None where every row is a target of its own; ``line`` (n,) of the file, from 1."""
-
-    path: Path
-    size_column: str
-    response_column: str
-    size: np.ndarray
-    response: np.ndarray
-    target: np.ndarray | None
-    line: np.ndarray
-
-    @property
-    def targets(self) -> int:
-        """Number of different targets."""
-        return len(self.size) if self.target is None else len(set(self.target.tolist()))
-
-
-def read_inspections(path: Path, size: str, response: str, target: str | None = None) -> Inspections:
-    """Read the named columns of a UTF-8 file with a header row; comma, semicolon or tab between columns (with the
-    latter two a comma within a number is its decimal mark). UserError with the line for what cannot be read."""
-    (_, header), *rows = _lines(path)
-    header = [name.strip() for name in header]
-    chosen = [name for name in (size, response, target) if name is not None]
-    for name in chosen:
-        if chosen.count(name) > 1:
-            raise UserError(f"column {name!r} is chosen twice", fix="name a different column for each option")
-        if header.count(name) > 1:
-            raise UserError(f"{path}: {header.count(name)} columns are called {name!r}", fix="rename all but one")
-        if name not in header:
-            from harness.vocabulary.declaration.diagnose import nearest
-
-            near, legal = nearest(name, header), ", ".join(map(repr, header))
-            fix = f"did you mean {near!r}?" if near else "name one of these columns"
-            raise UserError(f"{path}: no column {name!r}", legal=legal, fix=fix)
-    for line, row in rows:
-        if len(row) != len(header):
-            fix = "put text that holds a separator in double quotes"
-            raise UserError(f"{path}, line {line}: {len(row)} fields, and the header has {len(header)}", fix=fix)
-    if len(rows) < FEWEST_ROWS:
-        legal = f"at least {FEWEST_ROWS}; 60 targets (hit/miss) or 40 (signal) are what the standard asks for"
-        raise UserError(f"{path}: {len(rows)} rows are too few for a POD curve", legal=legal)
-    lines = np.array([line for line, _ in rows])
-    texts = [[row[header.index(name)].strip() for _, row in rows] for name in chosen]
-    numbers = []
-    for name, column in zip(chosen[:2], texts[:2], strict=True):
-        numbers.append(np.array([_number(text) for text in column]))
-        if (wrong := ~np.isfinite(numbers[-1])).any():
-            text = column[int(np.argmax(wrong))]
-            said = f"{path}, line {lines[wrong][0]}: {name} is {repr(text) if text else 'empty'}, not a number"
-            raise UserError(said, legal="a finite number in every row", fix="mend the row, or take it out")
-    seen: dict[str, int] = {}
-    for k, name in enumerate(texts[2] if target else ()):
-        if not name:
-            raise UserError(f"{path}, line {lines[k]}: {target} is empty", fix="name the target, or take the row out")
-        before, now = numbers[0][first := seen.setdefault(name, k)], numbers[0][k]
-        if before != now:
-            said = f"{path}: target {name!r} has size {before:g} in line {lines[first]} and {now:g} in line {lines[k]}"
-            raise UserError(said, fix="give every target one size (the true one), or different targets different names")
-    return Inspections(path, size, response, numbers[0], numbers[1], np.array(texts[2]) if target else None, lines)
-
-
-def require_hits(read: Inspections) -> None:
-    """Refuse responses that are neither 0 nor 1, or that are all the same."""
-    wrong = ~np.isin(read.response, (0.0, 1.0))
-    if wrong.any():
-        where, value = f"{read.path}, line {read.line[wrong][0]}", read.response[wrong][0]
-        fix = "a column of signals is analysed with --ahat and --decision"
-        said = f"{where}: {read.response_column} is {value:g}, which is neither hit nor miss"
-        raise UserError(said, legal="1 for a hit, 0 for a miss", fix=fix)
-    if np.ptp(read.response) == 0:
-        kind = "hits" if read.response[0] else "misses"
-        said = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
-        raise UserError(f"{said}, and a curve needs both hits and misses", fix="add targets of other sizes")
-
-
-def require_positive(read: Inspections, response: bool, why: str) -> None:
-    """Refuse a size (or a response) that has no logarithm; ``why`` names the option that asks for it."""
-    values, column = (read.response, read.response_column) if response else (read.size, read.size_column)
-    wrong = values <= 0
-    if wrong.any():
-        said = f"{read.path}, line {read.line[wrong][0]}: {column} is {values[wrong][0]:g}, which has no logarithm"
-        raise UserError(said, legal=f"values above 0 with {why}", fix=f"leave out {why}, or take out the rows")
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """(line, fields) of every row that is not blank; the separator is the one that parts the header most."""
-    try:
-        text = bounded_bytes(path, TABLE_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        reason = (error.strerror or "no reason given").lower()
-        raise UserError(f"{path}: cannot be read ({reason})", fix="name a CSV file") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is not UTF-8 text", fix="save it as CSV in UTF-8") from error
-    first = next((line for line in text.splitlines() if line.strip()), "")
-    if not first:
-        raise UserError(f"{path}: is empty", legal="a header row with column names, then one row an inspection")
-    separator = max(SEPARATORS, key=lambda one: len(next(csv.reader([first], delimiter=one))))
-    reader = csv.reader(text.splitlines(keepends=True), delimiter=separator)
-    try:
-        rows = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
-    except csv.Error as error:
-        raise UserError(f"{path}, line {reader.line_num}: {error}", fix="save the file as CSV") from error
-    if separator != ",":  # a comma is then the decimal mark
-        return [rows[0], *((line, [field.replace(",", ".") for field in row]) for line, row in rows[1:])]
-    return rows
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
-
 
 POD, CONFIDENCE = 0.9, 0.95
 """The field's customary statement, a90/95."""
@@ -151,6 +29,8 @@ DRAWN = 241
 """Sizes at which curve and band are drawn."""
 LEAST_TARGETS = 60
 """MIL-HDBK-1823A: independent targets that a hit/miss study should have at least."""
+FEWEST_SITES = 5
+"""Unflawed sites below which no law is fitted to their signals."""
 TESTED: dict[Between, str] = {
     "floor": "a floor: hits by chance at any size",
     "ceiling": "a ceiling: misses at any size",
@@ -256,7 +136,7 @@ def state_hits(
         size, hit = read.size, read.response
         tried = choose_model(size, hit, inspections=read.target, bounded=bounded)
         fit = next(one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size))
-        curve, notes, tests, independent = fit.curve, list(fit.notes), [], None
+        curve, notes, tests, independent = fit.curve, [*read.notes, *fit.notes], [], None
         if fit.targets < fit.n:
             # A fit of its own, because where hits and misses separate the penalty counts targets.
             rows = fit_hit_miss(size, hit, link=curve.link, log_size=curve.log_size, bounded=fit.bounded)
@@ -289,6 +169,7 @@ def state_hits(
     numbers |= {"deviance": fit.deviance, "deviance of a constant": fit.null_deviance}
     numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
+    numbers |= false_positives(read)
     bounds = (limit, further, independent)
     return _statement(read, "hit/miss", unit, fit, models, bounds, (sizes, lower, upper), numbers, notes, said)
 
@@ -319,12 +200,13 @@ def state_signals(
     numbers |= {"variance of mu": of_mu, "covariance of mu, sigma": common, "variance of sigma": of_sigma}
     numbers |= {"signals at or below --left": float(fit.below.sum())}
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
+    numbers |= false_positives(read, fit)
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
     drawn = (sizes, *ahat_band(fit, sizes, CONFIDENCE))
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
     kind, bounds = "signal against size", (limit, (), rows)
-    return _statement(read, kind, unit, fit, models, bounds, drawn, numbers, list(fit.notes), said)
+    return _statement(read, kind, unit, fit, models, bounds, drawn, numbers, [*read.notes, *fit.notes], said)
 
 
 def _statement(
@@ -358,6 +240,31 @@ def _statement(
     return PodStatement(
         read.path, kind, unit, *columns, *what, *bounds, *drawn, numbers, tuple(notes), signal, tuple(tests)
     )
+
+
+def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:
+    """Return the probability of a false positive at unflawed sites by names, nothing where there are none: the share of
+    calls with its upper bound (Clopper and Pearson), and of signals also by the normal law that fits the noise best, on
+    the fit's axis, signals at or below its left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
+    from scipy import stats
+
+    sites = read.unflawed
+    if not sites.size:
+        return {}
+    calls = int((sites > (0.5 if fit is None else fit.decision)).sum())
+    upper = stats.beta.ppf(CONFIDENCE, calls + 1, len(sites) - calls) if calls < len(sites) else 1.0
+    found = {"unflawed sites": float(len(sites)), "false positives": float(calls)}
+    found |= {"PFP": calls / len(sites), f"PFP's {100 * CONFIDENCE:g} % upper bound": float(upper)}
+    if fit is None or (fit.log_signal and not (sites > 0).all()) or len(sites) < FEWEST_SITES:
+        return found
+    limit = -np.inf if fit.left is None else fit.left
+    below = sites <= limit
+    if len(np.unique(sites[~below])) < FEWEST_SITES:
+        return found
+    put: np.ufunc = np.log if fit.log_signal else np.positive
+    noise = stats.CensoredData(put(sites[~below]), left=put(np.full(int(below.sum()), limit)))
+    law = stats.norm(*stats.norm.fit(noise))
+    return found | {"PFP by the noise's normal law": float(law.sf(put(fit.decision)))}
 
 
 def finite(value: float) -> float | None:

@@ -28,7 +28,8 @@ from harness.evaluation.pod.curve import (
     slopes_of_link,
 )
 from harness.evaluation.pod.hit_miss import HitMissFit, band, bound, fit_hit_miss
-from harness.evaluation.pod.statement import CONFIDENCE, POD, Inspections, PodStatement, state_hits, state_signals
+from harness.evaluation.pod.inspections import Inspections
+from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
 from harness.evaluation.study.record import Inspected, SetUpRecord
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
