@@ -98,8 +98,8 @@ class LensFacts(Config):
         """The radius of the lens's image, in focal lengths; infinite where it covers the sensor."""
         if self.field_half_angle_deg is None:
             return float("inf")
-        slope = np.tan(np.deg2rad(self.field_half_angle_deg.value))
-        return float(distorted_slope(np.float64(slope), self.lens().distortion))
+        slope = np.tan(np.deg2rad([self.field_half_angle_deg.value]))
+        return float(distorted_slope(slope, self.lens().distortion)[0])
 
     def outside_field(self, region: Region) -> np.ndarray:
         """Return (h, w) bool: pixels beyond the lens's image."""

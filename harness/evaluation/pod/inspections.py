@@ -63,7 +63,8 @@ def read_inspections(
 ) -> Inspections:
     """Read the named columns; ``responses``: one, or one for each inspector. ``hits``: responses are words or 0/1, else
     signals. Raises UserError, with the line, for what cannot be read."""
-    (_, header), *rows, notes = *_rows(path), []
+    (_, header), *rows = _rows(path)
+    notes: list[str] = []
     header = [name.strip() for name in header]
     columns = [_column(path, header, name, (size, *responses, target)) for name in (size, *responses, target) if name]
     for line, row in rows:
