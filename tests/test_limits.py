@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_tables import World, joined, tables
 
-from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, ladder_of
+from harness.evaluation.set_ups import Ladder, effect_costs, effects_table, found_limit_mm, half_size, ladder_of
 from harness.evaluation.summary import summarise_holes
 
 
@@ -111,6 +111,10 @@ def test_costs_are_differences_of_the_half_sizes():
     assert many.together.mm == pytest.approx(3 * step)
     assert noise.alone.certain
     assert noise.alone.interval.low == pytest.approx(noise.alone.interval.high)  # the same chance on both sides
+    rows = effects_table(together)
+    assert rows["effect"].tolist() == ["noise", "fixed pattern", "noise", "fixed pattern", "all"] * 2
+    assert rows["against"].tolist() == ["nothing", "nothing", "all others", "all others", "nothing"] * 2
+    assert rows["loss_mm"].tolist()[5:] == pytest.approx([2 * step, step, 2 * step, step, 3 * step])
 
 
 def test_a_size_off_the_ladder_gives_a_bound():

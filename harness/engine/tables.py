@@ -14,13 +14,14 @@ import pandas as pd
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.profile import shadowed_shares
-from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.set_ups import compare_set_ups, effects_table, set_ups_of
 from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point, SimulatedSource
 from harness.experiment.unfold import FRAMES
 from harness.tables.schema import Table, write_table
 from harness.tables.trials import (
     CLAIMS,
+    EFFECTS,
     FALSE_CALLS,
     NOISE,
     NOISE_BY_FRAMES,
@@ -233,6 +234,8 @@ def summaries(tables: ResultTables, examples: Sequence[Any] = ()) -> dict[Table,
         verdict = claim_c11(summary[summary["variant"].isin(variants)], paths)
         found[SET_UPS] = compare_set_ups(tables, summary, variants)
         found[CLAIMS] = claims_table([verdict] if verdict else [])
+        if not (effects := effects_table(tables)).empty:
+            found[EFFECTS] = effects
     else:
         found[CLAIMS] = claims_table(score_claims(tables, MAIN, examples, summary))
     for frame in found.values():

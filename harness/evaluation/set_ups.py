@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
-from harness.tables.trials import ResultTables
+from harness.tables.trials import EFFECTS, ResultTables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -227,6 +227,19 @@ def effect_costs(tables: ResultTables) -> list[EffectCosts]:
             if together is not None:
                 found.append(EffectCosts(place, int(str(frames)), tuple(effects), together))
     return found
+
+
+def effects_table(tables: ResultTables) -> pd.DataFrame:
+    """Return `effect_costs` as rows of the table of effects."""
+    rows: list[dict[str, Any]] = []
+    for at in effect_costs(tables):
+        costs = [(one.effect, "nothing", one.alone) for one in at.effects]
+        costs += [(one.effect, "all others", one.last) for one in at.effects]
+        for effect, against, cost in (*costs, ("all", "nothing", at.together)):
+            ends = {"loss_low_mm": cost.interval.low, "loss_high_mm": cost.interval.high, "on_ladder": cost.certain}
+            named = {"place": at.place, "frames": at.frames, "effect": effect, "against": against}
+            rows.append({**named, "loss_mm": cost.mm, **ends})
+    return EFFECTS.frame(rows)
 
 
 def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> SwitchCost | None:

@@ -453,9 +453,22 @@ CLAIMS = Table(
     left=5,
     kind="claims",
 )
+EFFECTS = Table(
+    "effects",
+    "one row per effect, condition and number of frames, of an experiment with `switches`: what the effect costs",
+    (
+        Column("place", "place", note="values of the other axes"),
+        Column("frames", "frames", note="frames averaged"),
+        Column("effect", "effect", note="switch that goes on; `all` together at last"),
+        Column("against", "against", note="what else is on: nothing, or all other effects"),
+        Column("loss_mm", "loss (mm)", note="change of the 50 % size when it goes on"),
+        *_columns(loss_low_mm="lower end of its 95 % bootstrap interval", loss_high_mm="upper end"),
+        Column("on_ladder", note="whether both sizes lie on the ladder of sizes; the loss is a bound otherwise"),
+    ),
+)
 STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, WALLS, SITES, FINDINGS, OPERATING, PIXELS)
 STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
-SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS)
+SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS, EFFECTS)
 
 
 def _empty() -> pd.DataFrame:
