@@ -1,0 +1,207 @@
+"""``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
+
+The files are for other simulators (Isaac Sim, Gazebo, MuJoCo, BlenderProc), which render ideal depth: ``NAME.npz``
+with the table, ``depth_noise.py`` (NumPy) and ``depth_noise_torch.py``, copies of `scenes.sensor.tabled` and
+`scenes.sensor.tabled_torch`, which say what is not modelled. The table is measured on the full model before tilted
+planes of many brightnesses: deviation of single pixels, chance of a return, correlation of neighbours, fixed pattern.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.vocabulary.errors import exit_code_of
+
+if TYPE_CHECKING:
+    from scenes.sensor.camera import AnyCamera
+
+ALBEDO = 0.6
+"""Of the planes; farther and nearer than the camera ranges, darker and brighter planes stand for distance."""
+DARKEST = 0.02
+MEASURED, PER_OCTAVE = 2, 16
+"""Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
+FRAMES, FRAMES_OF_CORRELATION = 40, 100
+"""Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
+LONGEST_LAG = 12
+"""Pixels to which the correlation of neighbours is followed."""
+SPECTRUM, LEAST_POWER, FAINT = 256, 3e-3, 0.05
+"""Frequencies of a filter's spectrum, the least power there relative to the largest, and the share of the largest tap
+below which further taps are left out: correlations are met to 0.03."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.export_noise " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.export_noise",
+        description="Write a simulated camera's depth noise as a small table (NAME.npz) and as code for NumPy and "
+        "torch that turns ideal depth and intensity into noisy depth, for use in other simulators.",
+        epilog="example: python -m harness.export_noise azure_kinect_nfov --out noise",
+    )
+    parser.add_argument("camera", help="a camera's name (see python -m harness.ls), or the path of its .yaml file")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the three files")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.vocabulary.files import write_bytes, write_text
+    from scenes.sensor import tabled, tabled_torch
+    from scenes.sensor.camera import load_camera
+
+    camera = load_camera(options.camera)
+    print(f"measuring the noise of {camera.title} ..", flush=True)
+    table = noise_table(camera)
+    file = io.BytesIO()
+    np.savez_compressed(file, **table, command=np.array(command))  # type: ignore[arg-type]
+    write_bytes(options.out / f"{camera.name}.npz", file.getvalue())
+    for module, name in ((tabled, "depth_noise.py"), (tabled_torch, "depth_noise_torch.py")):
+        write_text(options.out / name, Path(str(module.__file__)).read_text(encoding="utf-8"))
+    seen = table["seen"] > 0.5
+    low, high = (1e3 * float(table["sigma_m"][seen][k]) for k in (-1, 0))
+    print(f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern of a unit "
+          f"{1e3 * float(table['pattern_m']):.3g} mm")  # fmt: skip
+    print(f"wrote {options.out / camera.name}.npz, depth_noise.py, depth_noise_torch.py")
+    return 0
+
+
+def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
+    """Return the arrays that `scenes.sensor.tabled.DepthNoise` takes.
+
+    ``sigma_m``, ``seen`` (n,): deviation and chance of a return at log2 of intensity / range^2, from ``first`` on,
+    ``per_octave`` entries each; filters ``rows``, ``columns`` of the noise, ``pattern_rows``, ``pattern_columns`` of
+    the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w): each pixel's light relative
+    to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    optics, fine = camera.optics, _without_rounding(camera)
+    nearest_m, farthest_m = max(1.05 * optics.nearest_m, 0.1), 0.95 * min(optics.farthest_m, 15.0)
+    levels = np.arange(np.log2(DARKEST / farthest_m**2), np.log2(1.0 / nearest_m**2), 1.0 / MEASURED)
+    measured = [_before_plane(fine, level, nearest_m, farthest_m) for level in levels]
+    sigma_m, seen = np.array([row[:2] for row in measured]).T
+    known = np.isfinite(sigma_m)
+    places = np.arange(levels[0], levels[-1], 1.0 / PER_OCTAVE)
+    sigma_m = np.exp(np.interp(places, levels[known], np.log(sigma_m[known])))
+    at = int(np.argmin(np.abs(levels - np.log2(ALBEDO / np.sqrt(nearest_m * min(farthest_m, 4.0)) ** 2))))
+    residuals = _residuals(fine, levels[at], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
+    pattern = _pattern_m(fine)
+    slopes, falloff = _pixels(camera)
+    return {
+        "first": np.float32(levels[0]),
+        "per_octave": np.float32(PER_OCTAVE),
+        "sigma_m": sigma_m.astype(np.float32),
+        "seen": np.interp(places, levels, seen).astype(np.float32),
+        **dict(zip(("rows", "columns"), (_filter(residuals, axis) for axis in (1, 2)), strict=True)),
+        "pattern_m": np.float32(np.sqrt(np.nanmean(pattern**2))),
+        **dict(zip(("pattern_rows", "pattern_columns"), (_filter(pattern, axis) for axis in (1, 2)), strict=True)),
+        "slopes": slopes,
+        "falloff": falloff,
+        "step_m": np.float32(camera.z_step_m),
+        "nearest_m": np.float32(optics.nearest_m),
+        "farthest_m": np.float32(min(optics.farthest_m, 1e3)),
+    }
+
+
+def _without_rounding(camera: AnyCamera) -> AnyCamera:
+    """Return the camera with an output in micrometres: rounding is the simulator's own last step."""
+    from scenes.sensor.calibration import with_number
+
+    return with_number(camera, "engine", "output_step_mm", 1e-3)
+
+
+def _stack_m(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int) -> np.ndarray:
+    """Return ranges (frames, h, w), NaN without a return, before a plane whose light has this level."""
+    from scenes.sensor.calibration import unit_before_plane
+
+    distance_m = float(np.clip(np.sqrt(ALBEDO / 2.0**level), nearest_m, farthest_m))
+    unit = unit_before_plane(camera, distance_m, float(min(distance_m**2 * 2.0**level, 1.0)))
+    z_m = np.stack([frame.z_m for frame in unit.capture(frames, 1, "noise table").frames()]).astype(float)
+    return np.asarray(z_m * np.sqrt(1.0 + (unit.view.slopes[unit.cut] ** 2).sum(axis=-1)))
+
+
+def _before_plane(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float) -> tuple[float, float]:
+    """Return the deviation of a pixel's range, NaN where hardly anything returns, and the share of returns."""
+    range_m = _stack_m(camera, level, nearest_m, farthest_m, FRAMES)
+    there = np.isfinite(range_m)
+    often = there.sum(axis=0) > FRAMES // 4
+    if not often.any():
+        return float("nan"), float(there.mean())
+    # the robust deviation: a wrong period, far away and rare, is no noise of the table
+    middle = np.nanmedian(range_m[:, often], axis=0)
+    apart = np.abs(range_m[:, often] - middle)
+    kept = apart < 8.0 * np.nanmedian(apart) / 0.6745
+    return float(np.sqrt(np.mean(apart[kept] ** 2) * FRAMES / (FRAMES - 1))), float(there.mean())
+
+
+def _residuals(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int) -> np.ndarray:
+    range_m = _stack_m(camera, level, nearest_m, farthest_m, frames)
+    return np.asarray(range_m - np.nanmean(range_m, axis=0))
+
+
+def _pattern_m(camera: AnyCamera) -> np.ndarray:
+    """Return the range (units, h, w) that the fixed pattern of some units adds before a plane."""
+    from harness.vocabulary.geometry import Region
+    from scenes.closed_form import plane_view
+    from scenes.sensor.camera import NO_EFFECTS, CameraConfig
+    from scenes.sensor.source import SimulatedUnit
+
+    lens = camera.nominal_lens
+    row, column = int(lens.cy), int(lens.cx)
+    half_h, half_w = min(80, row - 8, lens.height - row - 8), min(100, column - 8, lens.width - column - 8)
+    view = plane_view(camera, Region(row - half_h, row + half_h, column - half_w, column + half_w), 1.0, ALBEDO)
+    found = []
+    for seed in (1, 2, 3):
+        ranges = []
+        for on in (True, False):
+            effects = NO_EFFECTS.model_copy(update={"fixed_pattern": on})
+            unit = SimulatedUnit(camera, CameraConfig(name=camera.name, unit_seed=seed, effects=effects), view)
+            ranges.append(next(iter(unit.capture(1, 1).frames())).z_m.astype(float))
+        found.append(ranges[0] - ranges[1])
+    return np.asarray(found)
+
+
+def _filter(images: np.ndarray, axis: int) -> np.ndarray:
+    """Return causal taps (k,) with a sum of squares of 1 that give white noise the images' (n, h, w) mean correlation
+    along an axis: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim and Schafer), as it is short."""
+    images = np.moveaxis(np.nan_to_num(images), axis, -1)
+    products = [np.mean(images[..., lag:] * images[..., : images.shape[-1] - lag]) for lag in range(LONGEST_LAG + 1)]
+    correlation = np.zeros(SPECTRUM)
+    correlation[: LONGEST_LAG + 1] = np.asarray(products) / max(products[0], 1e-30)
+    correlation[-LONGEST_LAG:] = correlation[LONGEST_LAG:0:-1]
+    spectrum = np.fft.fft(correlation).real
+    cepstrum = np.fft.ifft(0.5 * np.log(np.maximum(spectrum, LEAST_POWER * spectrum.max()))).real
+    cepstrum[1 : SPECTRUM // 2] *= 2.0
+    cepstrum[SPECTRUM // 2 + 1 :] = 0.0
+    taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
+    taps = taps[: 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())]
+    return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
+
+
+def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slopes (h, w, 2) of every pixel and its light relative to the axis (h, w); 0 where none comes."""
+    from scenes.sensor.amcw.facts import AmcwCamera
+    from scenes.sensor.amcw.imager import AmcwImager
+    from scenes.sensor.camera import CameraConfig
+
+    lens = camera.nominal_lens
+    slopes = lens.region_slopes(lens.whole)
+    if not isinstance(camera, AmcwCamera):
+        return slopes.astype(np.float32), np.ones(slopes.shape[:2], np.float32)
+    model = AmcwImager(camera, CameraConfig(name=camera.name), lens.whole, slopes)
+    angle_deg = np.degrees(np.arctan(np.hypot(slopes[..., 0], slopes[..., 1])))
+    full, cutoff = camera.emitter.full_half_angle_deg.value, camera.emitter.cutoff_half_angle_deg.value
+    lit = np.clip((cutoff - angle_deg) / (cutoff - full), 0.0, 1.0)
+    return slopes.astype(np.float32), np.where(model.outside_mask, 0.0, model.gathered * lit).astype(np.float32)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
