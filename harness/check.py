@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
 from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.files import shipped
 
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
 
-BASELINES = Path(__file__).resolve().parents[1] / "results" / "baselines"
+BASELINES = shipped("baselines")
 """Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
 
 

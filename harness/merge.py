@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
+    options = _parser().parse_args(arguments)
+    return exit_code_of(lambda: _run(options.folders, options.into))
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m harness.merge",
         description="Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
@@ -26,8 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder with a journal")
     parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
-    options = parser.parse_args(arguments)
-    return exit_code_of(lambda: _run(options.folders, options.into))
+    return parser
 
 
 def _run(folders: list[Path], into: Path) -> int:

@@ -15,13 +15,21 @@ from harness.vocabulary.errors import exit_code_of
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    if arguments is None:
+        # what batch systems and containers send first is to end as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    return exit_code_of(lambda: _run(options, given))
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m harness.sweep",
         description="Run an experiment: render its targets, simulate the camera, detect, measure, report.",
         epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
     )
     add = parser.add_argument
-    add("experiment", type=Path, help="a YAML file, such as experiments/averaging.yaml")
+    add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, such as averaging")
     help = "change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
     help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
@@ -29,11 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
     add("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
     add_engine_options(parser)
-    options = parser.parse_args(given)
-    if arguments is None:
-        # what batch systems and containers send first is to end as Ctrl-C does
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_code_of(lambda: _run(options, given))
+    return parser
 
 
 def _run(options: argparse.Namespace, given: list[str]) -> int:

@@ -14,6 +14,7 @@ from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera
 
@@ -29,14 +30,15 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
     ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`)."""
     recording_of.cache_clear()
-    written = read_yaml(Path(path))
+    path = _experiment_file(Path(path))
+    written = read_yaml(path)
     # a file that a result folder holds states its version; a file that is written by hand states none
     found = stamp_of(written.text, STAMP_KIND)
     if found is not None:
         again = "take the experiment that it was made from, or remove the first line and mend what is refused then"
-        check_version(found, EXPERIMENT_VERSION, Path(path), "an experiment", again=again)
+        check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
     source, problems = overridden(written, overrides, declared_of)
-    source = _with_absolute_paths(source, Path(path).resolve().parent)
+    source = _with_absolute_paths(source, path.resolve().parent)
     if calibration is not None:
         source = _with_calibration(source, calibration)
     name = source.data.get("name")
@@ -56,6 +58,15 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
         # a detector may fill some settings from others (a preset): written out they would count beside a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
+
+
+def _experiment_file(path: Path) -> Path:
+    """Return the file that a path or name means: ``averaging`` is the one that comes with tofpod where there is no file
+    of that name."""
+    if path.exists() or path.name != str(path):
+        return path
+    own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
+    return own if own.is_file() else path
 
 
 def resolved_yaml(experiment: Experiment) -> str:

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import stat
+import sysconfig
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -68,6 +69,14 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
     if len(content) > at_most:
         raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
     return content
+
+
+def shipped(kind: str) -> Path:
+    """Return the folder of ``experiments`` or ``baselines`` that come with tofpod: of its checkout, else of the
+    environment that it is installed in."""
+    checkout = Path(__file__).resolve().parents[2]
+    folder = checkout / ("results/baselines" if kind == "baselines" else kind)
+    return folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
 
 
 _LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()

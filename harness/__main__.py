@@ -1,0 +1,102 @@
+"""``tofpod PROGRAM ...``: every program under one command; ``tofpod`` alone shows the commonest tasks."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import shlex
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+NO_PROGRAMS = ("__init__", "__main__", "exchange", "listing", "testing", "prepare")
+TASKS = (
+    ("run an experiment and read its report", "tofpod sweep averaging"),
+    ("state the smallest hole that a camera finds", "tofpod sweep detection_limit"),
+    ("find the damage in your own capture", "tofpod detect captures/board --out findings"),
+    ("state the limit of your own inspections", "tofpod pod inspections.csv --size length --hit found"),
+    ("list cameras and detectors with all their settings", "tofpod ls"),
+)
+COMPLETION = """\
+_tofpod() {{
+  local word="${{COMP_WORDS[COMP_CWORD]}}"
+  if [ "$COMP_CWORD" -eq 1 ]; then
+    COMPREPLY=($(compgen -W "{programs}" -- "$word"))
+    return
+  fi
+  case "${{COMP_WORDS[1]}}" in
+{options}
+  esac
+  [ ${{#COMPREPLY[@]}} -gt 0 ] || COMPREPLY=($(compgen -f -- "$word"))
+}}
+complete -o filenames -F _tofpod tofpod
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command. Returns what the program returns; 2 for a program that there is not."""
+    given = sys.argv[1:] if arguments is None else arguments
+    name, *rest = given or [""]
+    if name in programs():
+        program = importlib.import_module(f"harness.{name}")
+        if arguments is not None:
+            return int(program.main(rest))
+        sys.argv[1:] = rest
+        return int(program.main())
+    return exit_code_of(lambda: _told(name, rest))
+
+
+@lru_cache
+def programs() -> dict[str, str]:
+    """Return the programs by name, each with the first sentence of its description."""
+    found = {}
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        if path.stem not in NO_PROGRAMS:
+            # read, not imported: the list is there at once
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            found[path.stem] = text.splitlines()[0].split(": ", 1)[-1].rstrip(".")
+    return found
+
+
+def _told(name: str, rest: list[str]) -> int:
+    if name in ("", "-h", "--help"):
+        wide = max(map(len, programs()))
+        print("How small a damage can a time-of-flight depth camera detect?\n")
+        for task, command in TASKS:
+            print(f"  {command:56}{task}")
+        print("\nprograms (tofpod PROGRAM --help):\n")
+        for program, text in programs().items():
+            print(f"  {program:{wide}}  {text}")
+        print('\nshell completion: eval "$(tofpod completion bash)"')
+        return 0
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"tofpod {version('tofpod')}")
+        return 0
+    if name == "completion":
+        if rest not in (["bash"], ["zsh"]):
+            raise UserError(f"completion {shlex.join(rest)}: no such shell", legal="tofpod completion bash, or zsh")
+        print(("autoload -U bashcompinit && bashcompinit\n" if rest == ["zsh"] else "") + _completion(), end="")
+        return 0
+    from harness.vocabulary.declaration.diagnose import nearest
+
+    near = nearest(name, programs())
+    fix = f"did you mean {near}?" if near else "tofpod --help says what each does"
+    raise UserError(f"there is no program {name!r}", legal=", ".join(programs()), fix=fix)
+
+
+def _completion() -> str:
+    """Return a script that completes programs and their options; everything else is a file's name."""
+    cases = []
+    for program in programs():
+        parser = importlib.import_module(f"harness.{program}")._parser()
+        options = " ".join(option for action in parser._actions for option in action.option_strings)
+        cases.append(f'    {program}) COMPREPLY=($(compgen -W "{options}" -- "$word"));;')
+    return COMPLETION.format(programs=" ".join(programs()), options="\n".join(cases))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
