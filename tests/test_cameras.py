@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from declared_targets import target_from_data
 
 from harness.experiment.load import lens_numbers, load_experiment
 from harness.sweep import main
@@ -13,7 +14,6 @@ from scenes.sensor.calibration import _main as calibration_program
 from scenes.sensor.camera import CAMERA_FOLDER, CameraConfig, camera_names, camera_of, load_camera, read_camera
 from scenes.sensor.facts import unfolded_slope
 from scenes.target.mesh import build_target
-from scenes.target.thesis import target_from_data
 
 AZURE = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
 SMOKE = "experiments/smoke.yaml"
