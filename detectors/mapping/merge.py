@@ -165,9 +165,9 @@ class Mapped:
     merged: Merged
 
     def view_of_points(self) -> np.ndarray:
-        """Return (n,) for each point of the merged cloud the index of the view it comes from, `SEVERAL` for several or
-        unknown: of a map as it knows, else by the nearest point, several where another view has one within twice
-        that."""
+        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, `SEVERAL` for
+        several or unknown: of a map as it knows, else by the nearest point, several where another view has one within
+        twice that."""
         from scipy.spatial import cKDTree
 
         merged = self.merged

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from detectors.mapping.merge import Mapped
+from detectors.mapping.merge import SEVERAL, Mapped
 from detectors.mapping.settings import MappingConfig
 from harness.engine.judge import detector_for, judge
 from harness.engine.plan import Batch, Group, SweepPlan
@@ -159,14 +159,16 @@ def _map_example(maps: MapMaker, point: Point, threshold: float) -> MappedExampl
     merged = maps.merged(mapping, frames)
     mapped = Mapped(maps.prepared(mapping, frames), maps.registrations(mapping, frames), merged)
     count, way = maps.count(mapping), (mapping.registration.method, mapping.merge.kind)
+    names = tuple(view.view.name for view in mapped.views)
+    number_of = np.array([*map(names.index, merged.views_used), SEVERAL])  # a view that failed keeps its number
     scene = Scene3d(
         points_mm=points_m / MM,
         frame="board",
         rgb=np.full((len(shown), 3), GREY, np.uint8) if cloud.rgb is None else cloud.rgb.reshape(-1, 3)[shown],
         residual_mm=judged.evidence.residual_m.ravel()[shown] / MM,
         detected=_detected(cloud, judged.detections).ravel()[shown],
-        view_of=mapped.view_of_points()[shown],
-        view_names=merged.views_used,
+        view_of=number_of[mapped.view_of_points()[shown]],
+        view_names=names,
         circles=tuple(circles),
         facts=(
             ("views", f"{count} ({', '.join(way)})"),
