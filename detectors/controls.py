@@ -21,19 +21,15 @@ from harness.vocabulary.seeds import random_stream
 UNIT_M = 1.0 * MM  # length of one unit of score: neither score is a length, and tables ask for one
 
 
-class OracleConfig(Config):
-    """The oracle has nothing to set."""
-
-
 class Oracle:
-    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else."""
+    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else; has no settings."""
 
-    settings_type: ClassVar[type[OracleConfig]] = OracleConfig
+    settings_type: ClassVar[type[Config]] = Config
     name = "oracle"
     version = 1
     tests_the_harness = True
 
-    def __init__(self, settings: OracleConfig, truth: tuple[TrueDamage, ...] | None = None) -> None:
+    def __init__(self, settings: Config, truth: tuple[TrueDamage, ...] | None = None) -> None:
         self.settings = settings
         self._truth = truth
 

@@ -122,7 +122,6 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
     for name in ("rgb", "depth"):
         (folder / name).mkdir()
         (folder / f"{name}_sync").symlink_to(name, target_is_directory=True)
-    rows, columns, inside = nearest_pixels(lens)
     lines: dict[str, list[str]] = {
         "rgb.txt": ["# color images", "# timestamp filename"],
         "depth.txt": ["# depth maps, 5000 to the metre, 0: none", "# timestamp filename"],
@@ -133,11 +132,9 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
         place = " ".join(f"{value:.9g}" for value in pose)
         for exposure in view.exposures():
-            depth = np.where(inside, depth_units(exposure.z_m)[rows, columns], 0).astype(np.uint16)
-            colour = np.where(inside[..., None], exposure.rgb[rows, columns], 0).astype(np.uint8)
             time = seconds_text(exposure.stamp_ns)
-            for name, picture in (("rgb", colour[..., ::-1]), ("depth", depth)):
-                coded, content = cv2.imencode(".png", np.ascontiguousarray(picture))
+            for name, picture in (("rgb", exposure.rgb[..., ::-1]), ("depth", depth_units(exposure.z_m))):
+                coded, content = cv2.imencode(".png", undistorted(lens, np.ascontiguousarray(picture)))
                 assert coded
                 (folder / name / f"{time}.png").write_bytes(content.tobytes())
                 lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
@@ -155,14 +152,12 @@ def depth_units(z_m: np.ndarray) -> np.ndarray:
     return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
 
 
-def nearest_pixels(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nearest row and column of the lens' own image for each pixel of the pinhole image (both (h, w) int),
-    and whether that pixel exists (bool)."""
+def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
+    """Return a picture (h, w[, 3]) as the pinhole sees it: each pixel the nearest one of the lens' own image, else
+    0."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
-    columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
-    inside = (columns >= 0) & (columns < lens.width) & (rows >= 0) & (rows < lens.height)
-    return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
+    return cv2.remap(picture, np.rint(u), np.rint(v), cv2.INTER_NEAREST)
 
 
 def seconds_text(stamp_ns: int) -> str:

@@ -26,7 +26,7 @@ def _prepare() -> int:
     from detectors.mapping.settings import FusedMerge, GridMerge
     from detectors.marks.mark import MarkSet
     from detectors.registration.register import register
-    from detectors.registration.settings import CpdRegistration, NominalRegistration
+    from detectors.registration.settings import CpdRegistration, PlainRegistration
     from detectors.views import PreparedView, View
     from harness.engine.trial import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
@@ -60,7 +60,7 @@ def _prepare() -> int:
     nothing = MarkSet((), np.zeros(0, np.int64))
     views = [PreparedView(View(name, cloud, np.eye(4)), cloud.valid, nothing) for name in ("first", "second")]
     register(views, CpdRegistration(points="target", max_iterations=2))
-    registrations = register(views, NominalRegistration())
+    registrations = register(views, PlainRegistration(method="nominal"))
     merge(views, registrations, GridMerge())
     merged = merge(views, registrations, FusedMerge()).cloud
     evidence = detector.analyse(merged)

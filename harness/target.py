@@ -39,8 +39,7 @@ def _parser() -> argparse.ArgumentParser:
 def _run(arguments: argparse.Namespace) -> int:
     config = _declared(arguments.target, arguments.board)
 
-    from scenes.target.export import write_mesh, write_truth
-    from scenes.target.mesh import build_target
+    from scenes.target.mesh import build_target, write_mesh, write_truth
 
     target = build_target(config.hole_free() if arguments.hole_free else config)
     for path, write in ((arguments.out, write_mesh), (arguments.truth, write_truth)):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Lens, Region
-from scenes.optics import BeamFootprint, Beams, NoiseFreeView, Optics, Quadrilaterals
+from harness.vocabulary.geometry import Lens, Region
+from scenes.optics import Beams, NoiseFreeView, Optics, Quadrilaterals, wave_numbers
 from scenes.sensor.camera import AnyCamera
 
 COARSE, FINE = 4, 12
@@ -50,7 +50,7 @@ def plane_view(
     Amplitude: albedo cos(incidence) / d^2 with d from the emitter. The footprint's extent and the cone are left out."""
     plane, slopes = Plane(distance_m, slope_x, slope_y), camera.nominal_lens.region_slopes(region)
     points, amplitude, path_m = _lit(slopes, plane, albedo, camera.optics)
-    phasor = amplitude * np.exp(1j * _wave_numbers(camera.optics)[:, None, None] * path_m)
+    phasor = amplitude * np.exp(1j * wave_numbers(camera.optics.frequencies_hz)[:, None, None] * path_m)
     seen, coverage = np.zeros(amplitude.shape, int), np.ones(amplitude.shape)
     return _view(camera.optics, region, slopes, phasor, amplitude, points, seen, ("plane",), coverage)
 
@@ -62,7 +62,7 @@ def layered_view(
     says where the front is. Each pixel sums phasors over its footprint; a point of the back is dark where the way to
     the emitter passes the front. Surfaces: "front", "back". Left out: the front's thickness and its edge's own face,
     light between the planes, the emitter's cone."""
-    lens, optics, waves = camera.nominal_lens, camera.optics, _wave_numbers(camera.optics)
+    lens, optics, waves = camera.nominal_lens, camera.optics, wave_numbers(camera.optics.frequencies_hz)
 
     def meet(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return for rays (..., 2): whether they meet the front, where they end (..., 3), the light there, its path in
@@ -107,9 +107,9 @@ def sub_rays(
     """Return a grid of side x side rays over the footprints of the chosen ``pixels`` (h, w) bool: slopes
     (n, side^2, 2), and the share of the footprint's light (side^2,) that each stands for."""
     rows, cols = np.nonzero(pixels)
-    if not isinstance(optics.footprint, BeamFootprint):
+    if optics.beam_fwhm_rad is None:
         return Quadrilaterals(lens, region).strata(rows, cols, side), np.full(side**2, 1 / side**2)
-    place, fwhm_rad = ((np.arange(side) + 0.5) / side * 2 - 1) * BEAM_REACH_FWHM, optics.footprint.fwhm_rad
+    place, fwhm_rad = ((np.arange(side) + 0.5) / side * 2 - 1) * BEAM_REACH_FWHM, optics.beam_fwhm_rad
     down, across = (each.ravel() for each in np.meshgrid(place, place, indexing="ij"))
     weight = np.exp(-4 * np.log(2) * (down**2 + across**2))
     rays = Beams(lens, region, fwhm_rad).turned(rows, cols, fwhm_rad * np.column_stack([across, down]))
@@ -124,10 +124,6 @@ def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tup
     leg_out = np.linalg.norm(to_emitter, axis=-1)
     amplitude = albedo * np.clip(to_emitter @ plane.normal, 0, None) / leg_out**3
     return points, np.nan_to_num(amplitude), np.nan_to_num(leg_out + np.linalg.norm(points, axis=-1))
-
-
-def _wave_numbers(optics: Optics) -> np.ndarray:
-    return 2 * np.pi * np.array(optics.frequencies_hz) / SPEED_OF_LIGHT_AIR
 
 
 def _view(

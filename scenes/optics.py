@@ -12,22 +12,10 @@ from pydantic import Field
 from scipy.special import ndtri
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.geometry import Lens, Region
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Lens, Region
 
 FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
 """Full width at half maximum of a Gaussian by its standard deviation."""
-
-
-@dataclass(frozen=True)
-class PixelFootprint:
-    """An imager's pixel: the quadrilateral between the pixel's corners, evenly weighted."""
-
-
-@dataclass(frozen=True)
-class BeamFootprint:
-    """A scanner's beam: a round Gaussian in angle about the pixel's central ray; full width at half maximum, rad."""
-
-    fwhm_rad: float
 
 
 @dataclass(frozen=True)
@@ -36,7 +24,9 @@ class Optics:
     at ``emitter_m`` (3,), of uniform intensity within a cone about the axis with a linear roll-off between two half
     angles. A scanner sends its beam from the origin and receives at ``emitter_m``: on Lambertian surfaces the light of
     a path is the same in both directions (Helmholtz' reciprocity), so it is described as an imager whose pixels are
-    beams and whose emitter is the receiver. ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond
+    beams and whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a round Gaussian
+    in angle about the pixel's central ray; None for an imager, whose pixel is evenly weighted between its corners.
+    ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond
     a region whose light reaches it through the camera's own filter. ``wavelength_nm``: at which surfaces need an
     albedo. The camera gives no range below ``nearest_m`` or beyond ``farthest_m``, counted along its rays or its axis,
     whatever the light; they change no render."""
@@ -47,7 +37,7 @@ class Optics:
     full_half_angle_deg: float
     cutoff_half_angle_deg: float
     frequencies_hz: tuple[float, ...]
-    footprint: PixelFootprint | BeamFootprint
+    beam_fwhm_rad: float | None
     wavelength_nm: float
     margin_px: int
     nearest_m: float = 0.0
@@ -61,10 +51,15 @@ class Optics:
             "emitter_m": self.emitter_m.tolist(),
             "half_angles_deg": [self.full_half_angle_deg, self.cutoff_half_angle_deg],
             "frequencies_hz": list(self.frequencies_hz),
-            "footprint": [type(self.footprint).__name__, *self.footprint.__dict__.values()],
+            "beam_fwhm_rad": self.beam_fwhm_rad,
             "wavelength_nm": self.wavelength_nm,
             "margin_px": self.margin_px,
         }
+
+
+def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return (f,) 2 pi f / c in rad per metre of full path, for the speed of light in air."""
+    return 2 * np.pi * np.array(frequencies_hz, float) / SPEED_OF_LIGHT_AIR
 
 
 COARSE = 4
@@ -76,11 +71,9 @@ BEAM_REACH = 3.0
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def footprint_of(lens: Lens, region: Region, kind: PixelFootprint | BeamFootprint) -> Quadrilaterals | Beams:
-    """Return the footprint of a region's pixels."""
-    if isinstance(kind, BeamFootprint):
-        return Beams(lens, region, kind.fwhm_rad / FWHM_PER_DEVIATION)
-    return Quadrilaterals(lens, region)
+def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals | Beams:
+    """Return the footprint of a region's pixels, beams where they have a width."""
+    return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
 
 
 class Quadrilaterals:

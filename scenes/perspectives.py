@@ -15,11 +15,9 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Region, invert, transform_points
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import Optics
+from scenes.target.checks import NEAREST_M
 from scenes.target.custom import PoseConfig, TargetConfig
 from scenes.target.truth import OUTLINE_STEPS, face_grid_m, outline_board_m
-
-NEAREST_M = 0.05
-"""Least distance of the face from the lens' plane, whatever the camera."""
 
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:

@@ -10,7 +10,8 @@ import pandas as pd
 from synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.clouds import FindingSeen, HoleSeen, MappedExample
+from harness.report.clouds import MappedExample
+from harness.report.view3d import Circle3d, Scene3d
 
 MAP_AXES = pd.DataFrame(
     [
@@ -196,34 +197,39 @@ def walls(counts: Sequence[int]) -> pd.DataFrame:
     )
 
 
+def circle(x_mm: float, y_mm: float, diameter_mm: float, label: str, kind) -> Circle3d:
+    return Circle3d(np.array([x_mm, y_mm, 0.0]), np.array([0.0, 0.0, 1.0]), diameter_mm, label, kind)
+
+
 def map_example(views: int = 2, merge: str = "grid", points: int = 6000, registration: str = "cpd") -> MappedExample:
     """A board with four marks as each view places it."""
     rng = np.random.default_rng(views)
     x, y = rng.uniform(-300, 300, points), rng.uniform(-55, 55, points)
     holes = [
-        HoleSeen(str(number), 254.0 - offset, 0.0, diameter, number >= 4)
+        circle(254.0 - offset, 0.0, diameter, str(number), "found" if number >= 4 else "missed")
         for number, (diameter, offset) in enumerate(zip(DIAMETERS_MM, OFFSETS_MM, strict=True), start=1)
     ]
     z, detected = rng.normal(0, 0.3, points), np.zeros(points, bool)
     for hole in holes:
-        inside = np.hypot(x - hole.x_mm, y - hole.y_mm) < hole.diameter_mm / 2
+        inside = np.hypot(x - hole.centre_mm[0], y - hole.centre_mm[1]) < hole.diameter_mm / 2
         z[inside] -= 10
-        detected |= inside & hole.found
+        detected |= inside & (hole.kind == "found")
     rgb = np.where((np.abs(np.abs(x) - 200) < 20)[:, None], [200, 40, 30], [205, 170, 120]).astype(np.uint8)
-    findings = [FindingSeen(h.x_mm + 0.4, 0.3, h.diameter_mm + 0.5, 9.0, h.hole) for h in holes if h.found]
-    findings.append(FindingSeen(100.0, 40.0, 4.0, 5.1, ""))
-    return MappedExample(
-        variant=name_of(views, registration, merge),
-        frames=50,
-        views=views,
-        registration=registration,
-        merge=merge,
+    findings = [
+        circle(h.centre_mm[0] + 0.4, 0.3, h.diameter_mm + 0.5, f"{h.diameter_mm + 0.5:.1f}", "finding")
+        for h in holes
+        if h.kind == "found"
+    ]
+    findings.append(circle(100.0, 40.0, 4.0, "4.0", "false call"))
+    scene = Scene3d(
+        frame="board",
         points_mm=np.column_stack([x, y, z]),
         rgb=rgb,
         residual_mm=-z,
         detected=detected,
         view_of=rng.integers(0, views, points) if merge == "grid" else np.full(points, -1),
-        holes=tuple(holes),
-        findings=tuple(findings),
+        circles=(*holes, *findings),
         view_names=tuple(f"view {number}" for number in range(views)),
+        facts=(("views", f"{views} ({registration}, {merge})"), ("frames a view", "50"), ("holes found", "8 of 11")),
     )
+    return MappedExample(name_of(views, registration, merge), 50, views, registration, merge, scene)

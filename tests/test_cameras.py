@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from declared_targets import target_from_data
 
 from harness.experiment.load import lens_numbers, load_experiment
 from harness.sweep import main
@@ -24,7 +25,6 @@ from scenes.sensor.camera import (
 )
 from scenes.sensor.facts import unfolded_slope
 from scenes.target.mesh import build_target
-from scenes.target.thesis import target_from_data
 
 AZURE = (CAMERA_FOLDER / "azure_kinect_nfov.yaml").read_text()
 SMOKE = "experiments/smoke.yaml"

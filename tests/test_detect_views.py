@@ -21,7 +21,6 @@ from detectors.registration.registered import reference_registration
 from detectors.views import PreparedView, View
 from harness import detect
 from harness.inspection.arguments import read_poses
-from harness.inspection.told import view_of_points
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region, invert, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -196,12 +195,12 @@ def test_the_picture_tells_which_view_a_point_is_of() -> None:
         for name, points in (("a", first), ("b", second))
     )
     placed = tuple(reference_registration(name, "nominal") for name in "ab")
-    told = view_of_points(Mapped(prepared, placed, merged))
+    told = Mapped(prepared, placed, merged).view_of_points()
     expected = [*([0] * 10 * 4), *([1] * 10 * 4), -1]
     np.testing.assert_array_equal(told, expected)
     halfway = Merged(_cloud((first + np.array([0.0, 0.005, 0.0]))[:, 5:]), np.eye(4), ("a", "b"), 0.0)
     # between a point of each: of several
-    assert (view_of_points(Mapped(prepared, placed, halfway)) == -1).all()
+    assert (Mapped(prepared, placed, halfway).view_of_points() == -1).all()
 
 
 def _cloud(points: np.ndarray) -> Cloud:

@@ -14,7 +14,8 @@ from synthetic_tables import World, example, tables
 from harness.evaluation.profile import HoleInView, bowl, hole_shape, hole_shapes
 from harness.evaluation.summary import hole_list
 from harness.report.clouds import ExampleCloud
-from harness.thesis.claims import RULES, Verdict, claims_table, decide, falling_rank, scatter_ratio, score_claims
+from harness.tables.trials import CLAIMS
+from harness.thesis.claims import RULES, Verdict, decide, falling_rank, scatter_ratio, score_claims
 
 
 def verdict(claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)) -> Verdict:
@@ -120,10 +121,10 @@ def test_evidence_carries_the_numbers() -> None:
 
 
 def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:
-    table = claims_table(score_claims(tables(frames=(1, 50))))
+    table = CLAIMS.frame(map(vars, score_claims(tables(frames=(1, 50)))))
     assert list(table["claim"]) == list(RULES)
     assert list(table.columns) == ["claim", "text", "verdict", "evidence", "rule"]
-    assert len(claims_table([])) == 0
+    assert list(CLAIMS.frame([]).columns) == list(table.columns)
 
 
 def test_rank_test_is_the_exact_permutation_test() -> None:

@@ -273,7 +273,8 @@ def test_a_sequence_read_back_lies_on_the_planes(experiment: Path, tmp_path: Pat
     "lens", (Lens(90, 70, 80.0, 81.0, 44.0, 35.0), Lens(90, 70, 80.0, 81.0, 44.0, 35.0, (0.1,) * 8))
 )
 def test_the_nearest_pixel_is_within_half_a_pixel_of_the_ray(lens: Lens) -> None:
-    rows, columns, inside = tum.nearest_pixels(lens)
+    numbered = tum.undistorted(lens, np.arange(1, 70 * 90 + 1, dtype=np.uint16).reshape(70, 90)).astype(int)
+    inside, (rows, columns) = numbered > 0, np.divmod(numbered - 1, 90)
     pinhole = Lens(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
     rays = np.concatenate([pinhole.region_slopes(pinhole.whole), np.ones((70, 90, 1))], axis=-1)
     off = np.abs(lens.project(rays) - np.stack([columns, rows], axis=-1))[inside]

@@ -9,10 +9,11 @@ import pytest
 from scipy import stats
 
 from detectors import load_detector
-from detectors.controls import BlindDetector, Oracle, OracleConfig, judged_area_m2
+from detectors.controls import BlindDetector, Oracle, judged_area_m2
 from detectors.interface import ToldTheTruth, TrueDamage
 from harness import testing as checks
 from harness.testing import CHECKS, DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
+from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud
 
@@ -92,7 +93,7 @@ def test_the_oracle_keeps_the_contract_of_its_own_cloud() -> None:
 
 def test_the_oracle_that_was_told_nothing_says_so() -> None:
     with pytest.raises(UserError, match="was not told the truth"):
-        Oracle(OracleConfig()).analyse(plane(seed=1))
+        Oracle(Config()).analyse(plane(seed=1))
 
 
 # ---------------------------------------------------------------- the blind one

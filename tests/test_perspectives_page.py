@@ -15,7 +15,7 @@ from harness.evaluation.maps import compare_maps
 from harness.evaluation.summary import summarise_holes
 from harness.report.page import write_report
 from harness.report.perspectives import map_files, perspectives_html
-from harness.report.sections import ways_grid
+from harness.report.sections import About, ways_grid
 
 YAML = "name: perspectives # <few> & many\n"
 METHODS = ("icp", "cpd", "marks")
@@ -46,7 +46,7 @@ def examples():
 
 @pytest.fixture(scope="module")
 def page(found):
-    return perspectives_html(found, examples(), provenance(), YAML, "Several perspectives", True)
+    return perspectives_html(found, examples(), About(provenance(), YAML, "Several perspectives", True))
 
 
 def headings(page: str) -> list[str]:
@@ -86,12 +86,12 @@ def test_the_answer_counts_holes_and_says_every_verdict(page):
 
 
 def test_the_same_input_gives_the_same_bytes(small):
-    first, second = (perspectives_html(small, [map_example(2)], provenance(), YAML, "T") for _ in range(2))
+    first, second = (perspectives_html(small, [map_example(2)], About(provenance(), YAML, "T")) for _ in range(2))
     assert first == second
 
 
 def test_a_page_of_another_target_does_not_mention_the_thesis(small):
-    page = perspectives_html(small, [], provenance(), YAML, "Several perspectives")
+    page = perspectives_html(small, [], About(provenance(), YAML, "Several perspectives"))
     assert "thesis" not in page.lower()
     answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
     assert answer == "With 50 frames a view one view finds 8 of 11 holes, 2 views (CPD, grid) 8."
@@ -110,7 +110,7 @@ def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
 
 
 def test_without_pictures_and_walls_the_page_says_so(small):
-    bare = perspectives_html(replace(small, walls=pd.DataFrame()), [], provenance(), YAML, "T")
+    bare = perspectives_html(replace(small, walls=pd.DataFrame()), [], About(provenance(), YAML, "T"))
     assert text_of(bare).count("No data for this figure were kept") == 1
     for name in ("merged",):
         assert f'<figure id="{name}">' not in bare
@@ -118,7 +118,7 @@ def test_without_pictures_and_walls_the_page_says_so(small):
 
 def test_nothing_finished_is_said(found):
     empty = replace(found, **{name: getattr(found, name).iloc[:0] for name in ("holes", "runs", "probes")})
-    page = perspectives_html(empty, [], provenance(), YAML, "T", True)
+    page = perspectives_html(empty, [], About(provenance(), YAML, "T", True))
     assert "No trial of any set-up finished" in page
     assert page.count("? undecided</td>") == 4
 
@@ -127,7 +127,7 @@ def test_a_missing_set_up_leaves_a_dash(small):
     gone = name_of(2, "cpd", "fusion")
     names = ("holes", "runs", "probes")
     part = replace(small, **{name: getattr(small, name)[getattr(small, name)["variant"] != gone] for name in names})
-    page = perspectives_html(part, [], provenance(), YAML, "T")
+    page = perspectives_html(part, [], About(provenance(), YAML, "T"))
     assert "–</td>" in page
     assert ">nan" not in page
 

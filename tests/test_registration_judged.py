@@ -21,10 +21,7 @@ from detectors.registration.settings import (
     AnyRegistration,
     CpdRegistration,
     IcpRegistration,
-    JointRegistration,
-    MarksRegistration,
-    NominalRegistration,
-    OdometryRegistration,
+    PlainRegistration,
 )
 from detectors.views import PreparedView, View
 from harness.vocabulary.errors import UserError
@@ -33,7 +30,11 @@ from harness.vocabulary.geometry import Lens
 POSES = [pose(3, 4), pose(-6, 15, 2, (0.01, 0.0, 0.01)), pose(8, -12, -1, (-0.01, 0.01, 0.0))]
 NOISE_M = 3e-4
 PITCH_M = 0.5 / 300
-BY_MARKS: list[AnyRegistration] = [MarksRegistration(), CpdRegistration(), JointRegistration()]
+BY_MARKS: list[AnyRegistration] = [
+    PlainRegistration(method="marks"),
+    CpdRegistration(),
+    PlainRegistration(method="joint"),
+]
 
 
 def prepared(made) -> list[PreparedView]:
@@ -65,7 +66,7 @@ def test_one_view_is_its_own_reference():
 
 def test_no_views_are_refused():
     with pytest.raises(UserError, match="no views"):
-        register([], MarksRegistration())
+        register([], PlainRegistration(method="marks"))
 
 
 # ------------------------------------------------------------ failures, in words
@@ -81,7 +82,7 @@ def test_views_that_do_not_overlap():
     made = views(POSES[:2])
     moved = View("view 1", made[1].prepared.view.cloud, away @ made[1].prepared.view.T_reference_view_guess)
     side = PreparedView(moved, made[1].prepared.inside, made[1].prepared.marks)
-    failure = register([made[0].prepared, side], NominalRegistration())[1].failure
+    failure = register([made[0].prepared, side], PlainRegistration(method="nominal"))[1].failure
     assert "the views do not overlap" in failure and "%" in failure
 
 
@@ -94,7 +95,7 @@ def test_other_marks_on_the_other_target():
         [reference, other], IcpRegistration()
     )
     assert "do not coincide" in only_failure([reference, other], CpdRegistration())
-    assert only_failure([reference, other], MarksRegistration())
+    assert only_failure([reference, other], PlainRegistration(method="marks"))
 
 
 def test_a_target_of_another_shape_lies_apart():
@@ -137,7 +138,7 @@ def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(con
 
 
 def test_views_whose_errors_would_blur_the_map_are_refused():
-    found = register(prepared(fine_pair(9.0)), MarksRegistration())[1]
+    found = register(prepared(fine_pair(9.0)), PlainRegistration(method="marks"))[1]
     assert "which would blur the map (up to" in found.failure
 
 
@@ -148,7 +149,7 @@ def test_the_widened_covariance_holds_the_true_errors():
     ratios = []
     for seed in range(12):
         pair = fine_pair(1.2 * random.standard_normal(), seed)
-        found = register(prepared(pair), MarksRegistration())[1]
+        found = register(prepared(pair), PlainRegistration(method="marks"))[1]
         assert found.failure == ""
         _, predicted = predicted_error_m(found, pair[0].prepared.points_m, pair[0].T_camera_board[:3, 2])
         ratios.append(target_error_m(found, *pair)[1] / predicted)
@@ -175,7 +176,7 @@ def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:
 
 def test_points_on_a_line_leave_a_turn_open():
     made = views(POSES[:2], noise_m=NOISE_M)
-    found = register(prepared(made), MarksRegistration())[1]
+    found = register(prepared(made), PlainRegistration(method="marks"))[1]
     open_turn = np.diag([0.2**2, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
     judged = judge(replace(found, covariance=open_turn), made[0].prepared, made[1].prepared)
     assert "lie on a line" in judged.failure and "which would blur" in judged.failure
@@ -187,7 +188,7 @@ def test_points_on_a_line_leave_a_turn_open():
 @pytest.mark.parametrize("broken", [np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)])
 def test_a_mirror_image_or_nothing_is_no_registration(broken):
     made = views(POSES[:2])
-    found = register(prepared(made), MarksRegistration())[1]
+    found = register(prepared(made), PlainRegistration(method="marks"))[1]
     judged = judge(replace(found, T_reference_view=broken), made[0].prepared, made[1].prepared)
     assert judged.failure in ("mirrored: the transform is a reflection, not a rotation", "no transform was found")
 
@@ -207,7 +208,7 @@ def test_one_bad_view_does_not_spoil_the_others():
 
 def test_what_nominal_leaves_is_noted_and_not_refused():
     made = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
-    found = register(prepared(made), NominalRegistration())[1]
+    found = register(prepared(made), PlainRegistration(method="nominal"))[1]
     assert found.failure == "" and "apart" in found.notes[-1]
     np.testing.assert_array_equal(found.T_reference_view, made[1].prepared.view.T_reference_view_guess)
 
@@ -215,7 +216,7 @@ def test_what_nominal_leaves_is_noted_and_not_refused():
 # ------------------------------------------------------------ users' mistakes
 
 
-@pytest.mark.parametrize("config", [*BY_MARKS, IcpRegistration(), OdometryRegistration()])
+@pytest.mark.parametrize("config", [*BY_MARKS, IcpRegistration(), PlainRegistration(method="odometry")])
 def test_a_capture_without_colour_is_refused_where_colour_is_needed(config):
     made = prepared(views(POSES[:2]))
     with pytest.raises(UserError, match=r"view 1: registration by \w+ needs colour"):
@@ -225,9 +226,9 @@ def test_a_capture_without_colour_is_refused_where_colour_is_needed(config):
 def test_odometry_needs_a_lens_and_nominal_a_guess():
     made = prepared(views(POSES[:2]))
     with pytest.raises(UserError, match="needs a pixel grid and the lens"):
-        register([made[0], changed(made[1], lens=None)], OdometryRegistration())
+        register([made[0], changed(made[1], lens=None)], PlainRegistration(method="odometry"))
     with pytest.raises(UserError, match="needs the nominal pose of every view"):
-        register([made[0], replace_guess(made[1], None)], NominalRegistration())
+        register([made[0], replace_guess(made[1], None)], PlainRegistration(method="nominal"))
 
 
 # ------------------------------------------------------------ loops
@@ -235,24 +236,24 @@ def test_odometry_needs_a_lens_and_nominal_a_guess():
 
 def test_loops_close_to_what_a_registration_is_wrong_by():
     made = prepared(views([*POSES, pose(-2, -5, 4)], guess_error=usual_error(), noise_m=NOISE_M))
-    loops = loop_errors(made, MarksRegistration())
+    loops = loop_errors(made, PlainRegistration(method="marks"))
     assert [loop.views for loop in loops[:2]] == [("view 0", "view 1", "view 2"), ("view 0", "view 1", "view 3")]
     assert len(loops) == 4 and not any(loop.failure for loop in loops)
     assert max(loop.translation_m for loop in loops) < PITCH_M
-    assert len(loop_errors(made, MarksRegistration(), most=2)) == 2
-    assert loop_errors(made[:2], MarksRegistration()) == ()
+    assert len(loop_errors(made, PlainRegistration(method="marks"), most=2)) == 2
+    assert loop_errors(made[:2], PlainRegistration(method="marks")) == ()
 
 
 def test_a_loop_says_which_step_failed():
     made = prepared(views(POSES, noise_m=NOISE_M))
     hidden = board_view(POSES[1], None, tapes_m=TAPES_M[:1]).prepared
-    (loop,) = loop_errors([made[0], hidden, made[2]], MarksRegistration())
+    (loop,) = loop_errors([made[0], hidden, made[2]], PlainRegistration(method="marks"))
     assert loop.failure.startswith("view to view 0: ") and np.isnan(loop.translation_m)
 
 
 def test_loops_of_a_method_without_pairs_are_refused():
     with pytest.raises(UserError, match="loops cannot be closed with joint"):
-        loop_errors(prepared(views(POSES)), JointRegistration())
+        loop_errors(prepared(views(POSES)), PlainRegistration(method="joint"))
 
 
 # ------------------------------------------------------------ the yardstick

@@ -9,7 +9,7 @@ from board_views import LENS, pose, target_error_m, views
 
 from detectors.registration.by_points import register_by_odometry
 from detectors.registration.register import register
-from detectors.registration.settings import OdometryRegistration
+from detectors.registration.settings import PlainRegistration
 from harness.vocabulary.geometry import Lens
 
 PITCH_M = 0.5 / 300
@@ -18,7 +18,7 @@ WALK = [pose(2 * np.sin(t), 3 * t, 1.5 * t, (0.004 * t, 0.003 * np.sin(2 * t), 0
 
 def test_it_follows_a_walk_and_drifts():
     made = views(WALK, noise_m=2e-4, textured=True)
-    found = register([each.prepared for each in made], OdometryRegistration())
+    found = register([each.prepared for each in made], PlainRegistration(method="odometry"))
     errors = [np.hypot(*target_error_m(each, made[0], view)) for each, view in zip(found, made, strict=True)]
     assert not any(each.failure for each in found) and errors[0] == 0.0
     # steps of 3 degrees and 5 mm; without following them the last view would be 24 mm off

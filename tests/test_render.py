@@ -50,7 +50,7 @@ def frontal(z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo
     return quad([[x0, -2, z], [x1, -2, z], [x1, 2, z], [x0, 2, z]], name, albedo)
 
 
-def light_on(lit, lens, region, footprint=CAMERA.optics.footprint, frequencies_hz=CAMERA.frequencies_hz):
+def light_on(lit, lens, region, footprint=CAMERA.optics.beam_fwhm_rad, frequencies_hz=CAMERA.frequencies_hz):
     return direct_light(lit, lens.region_slopes(region), footprint_of(lens, region, footprint), frequencies_hz)
 
 
@@ -171,13 +171,13 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
     kernel = 0.6 * sent * (-gap[..., 2] / d) * (gap[..., 1] / d) / (np.pi * d**2) * (2 / 1600) * (0.8 / 1600)
     for f, wave in enumerate(WAVE):
         expected = (kernel * np.exp(1j * wave * (leg + d))).sum()
-        assert abs(light.mean[f, 0] - expected) < 0.004 * abs(expected)
+        assert abs(light.mean(axis=0)[f, 0] - expected) < 0.004 * abs(expected)
     slope = point[:2] / point[2]
     rays = OffFace(np.zeros(1, int), np.ones(1, int), np.ones(1), slope[None].astype(np.float32))
     pixel = gather_in_pixels(lit, rays, PathWork(CAMERA.frequencies_hz, 4, seed=3), 8192)
     hit = cast(lit, slope[None])
     direct = hit.amplitude * np.exp(1j * WAVE * hit.path_m)
-    assert (np.angle((direct + pixel.mean[:3, 0]) / direct) > 0).all()
+    assert (np.angle((direct + pixel.mean(axis=0)[:3, 0]) / direct) > 0).all()
 
 
 SMALL = ThesisTargetConfig.from_data({"name": "thesis"}).declare()
@@ -227,7 +227,7 @@ def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
     where noise is white from pixel to pixel."""
     target, optics, slopes = build_target(SMALL), CAMERA.optics, thesis_view.slopes
     lit = lit_scene(load_mitsuba(), target.parts, optics, face_triangles(target))
-    footprint = footprint_of(optics.lens, thesis_view.region, optics.footprint)
+    footprint = footprint_of(optics.lens, thesis_view.region, optics.beam_fwhm_rad)
     direct = direct_light(lit, slopes, footprint, optics.frequencies_hz)
     inside = np.ones(thesis_view.range_m.shape, bool)
     config = QUICK.model_copy(update={"face_samples": 64})
@@ -256,7 +256,7 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
     direct = thesis_view.phasor_direct[:, rows, cols]
     indirect = thesis_view.phasor[:, rows, cols] - direct
     f = np.array(CAMERA.frequencies_hz)[:, None]
-    difference = np.imag((traced.mean[:3] - indirect) / direct)
+    difference = np.imag((traced.mean(axis=0, dtype=complex)[:3] - indirect) / direct)
     error_m = (SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * difference).sum(axis=0)
     assert abs(error_m.mean()) < max(4 * error_m.std() / np.sqrt(error_m.size), 0.02e-3)
 

@@ -18,7 +18,7 @@ from synthetic_tables import Tables, World, example, joined, provenance, tables
 from harness.evaluation.summary import summarise_holes
 from harness.report.clouds import residual_figure
 from harness.report.page import answer_sentence, report_html, write_report
-from harness.report.sections import holes_grid
+from harness.report.sections import About, holes_grid
 from harness.tables.text import inches
 from harness.thesis.claims import score_claims
 from harness.vocabulary.errors import UserError
@@ -67,7 +67,7 @@ def results() -> Tables:
 
 @pytest.fixture(scope="module")
 def page(results: Tables) -> str:
-    return report_html(results, [example(50), example(1, noise_mm=0.9)], provenance(), YAML, "Averaging", True)
+    return report_html(results, [example(50), example(1, noise_mm=0.9)], About(provenance(), YAML, "Averaging", True))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_every_figure_is_well_formed_and_has_words_for_those_who_cannot_see(page
 
 
 def test_the_same_input_gives_the_same_bytes(page: str, results: Tables) -> None:
-    again = report_html(results, [example(50), example(1, noise_mm=0.9)], provenance(), YAML, "Averaging", True)
+    again = report_html(results, [example(50), example(1, noise_mm=0.9)], About(provenance(), YAML, "Averaging", True))
     assert again == page
 
 
@@ -132,7 +132,7 @@ def test_answer_counts_and_verdicts_are_told(page: str) -> None:
 
 
 def test_a_page_of_another_target_does_not_mention_the_thesis(results: Tables, page: str) -> None:
-    other = report_html(results, [example(50), example(1, noise_mm=0.9)], provenance(), YAML, "Dents")
+    other = report_html(results, [example(50), example(1, noise_mm=0.9)], About(provenance(), YAML, "Dents"))
     assert "thesis" in page
     assert "thesis" not in other.lower()
     assert not re.search(r"\bC[1-9]\b", re.sub(r"<svg.*?</svg>", "", other, flags=re.DOTALL))
@@ -145,7 +145,7 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
     told = provenance() | {
         "failures": ["repeat 7 ended: <out of memory>", {"what": "repeat 3", "why": "boom"}, {"a": 1}]
     }
-    page = report_html(tables(world, frames=(1, 50)), [example(50, "cylinder")], told, YAML, "Averaging", True)
+    page = report_html(tables(world, frames=(1, 50)), [example(50, "cylinder")], About(told, YAML, "Averaging", True))
     assert page.count("✗ not borne out") >= 4
     assert "More than the thesis: 2–3" in page
     assert "3 parts of the experiment failed" in page
@@ -156,13 +156,15 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
 
 def test_little_data_still_make_a_page() -> None:
     few = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
-    page = report_html(few, [], {}, "", "Averaging", True)
+    page = report_html(few, [], About({}, "", "Averaging", True))
     assert "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of 7 claims, 7 are undecided" in page
     assert "The one repeat is" in page
     assert "No data for this figure were kept." in page
     assert "not recorded" in page
     nothing = dataclasses.replace(few, holes=pd.DataFrame(), runs=few.runs[:0], probes=few.probes[:0])
-    assert "No trial of the main experiment finished" in report_html(nothing, [], provenance(), YAML, "Averaging")
+    assert "No trial of the main experiment finished" in report_html(
+        nothing, [], About(provenance(), YAML, "Averaging")
+    )
 
 
 def test_an_all_invalid_cloud_is_drawn() -> None:
@@ -172,7 +174,7 @@ def test_an_all_invalid_cloud_is_drawn() -> None:
         residual_mm=np.full_like(cloud.residual_mm, np.nan),
         detected=np.zeros_like(cloud.detected),
     )
-    page = report_html(tables(frames=(50,)), [blank], provenance(), YAML, "Averaging")
+    page = report_html(tables(frames=(50,)), [blank], About(provenance(), YAML, "Averaging"))
     assert "0 of 11 holes marked" in page
     ET.fromstring(residual_figure([blank]))
 

@@ -16,7 +16,7 @@ from harness.engine.trial import pair_noise
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.report.page import Layout, set_ups_html, write_report
-from harness.report.sections import set_ups_grid
+from harness.report.sections import About, set_ups_grid
 
 AXES = ["source.camera.name", "source.target.distance_m"]
 SMALLEST = {"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)}
@@ -42,7 +42,7 @@ def varied():
 
 @pytest.fixture(scope="module")
 def page(varied):
-    return set_ups_html(varied, clouds(), provenance(), YAML, "Three cameras", True)
+    return set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", True))
 
 
 def headings(page: str) -> list[str]:
@@ -73,11 +73,11 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
 
 
 def test_the_same_input_gives_the_same_bytes(varied, page):
-    assert set_ups_html(varied, clouds(), provenance(), YAML, "Three cameras", True) == page
+    assert set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", True)) == page
 
 
 def test_a_page_of_another_target_does_not_mention_the_thesis():
-    other = set_ups_html(cameras(SMALLEST), [], provenance(), YAML, "Three cameras")
+    other = set_ups_html(cameras(SMALLEST), [], About(provenance(), YAML, "Three cameras"))
     assert "thesis" not in other.lower() and "C11" not in other
 
 
@@ -115,7 +115,7 @@ def test_failures_and_missing_set_ups_are_told():
     found = replace(found, **{name: getattr(found, name)[getattr(found, name)["variant"] != gone] for name in parts})
     said = provenance() | {"failures": [{"what": "damaged-00001", "why": "ValueError: empty crop"}]}
     kept = [cloud for cloud in clouds() if cloud.variant != gone]
-    page = set_ups_html(found, kept, said, YAML, "Three cameras")
+    page = set_ups_html(found, kept, About(said, YAML, "Three cameras"))
     assert "damaged-00001: ValueError: empty crop" in page
     assert gone not in page
     assert '<figure id="sights">' in page
@@ -126,7 +126,7 @@ def test_effects_have_a_figure_and_a_table():
     names = ("noise", "fixed_pattern")
     found = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
     cloud = [replace(example(50), variant="noise+fixed_pattern")]
-    page = set_ups_html(found, cloud, provenance(), YAML, "Anatomy")
+    page = set_ups_html(found, cloud, About(provenance(), YAML, "Anatomy"))
     assert "What each effect costs" in headings(page)
     assert '<figure id="effects">' in page
     # noise alone, with 1 and 50 frames, in the answer and in the table: 2/16 in, which is 3.175 mm

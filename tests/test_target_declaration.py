@@ -6,10 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from declared_targets import target_from_data
 from pydantic import TypeAdapter, ValidationError
 
 from scenes.target.custom import BoardConfig, DentConfig, FlatConfig, HoleConfig, TargetConfig
-from scenes.target.thesis import AnyTargetConfig, ThesisTargetConfig, target_from_data
+from scenes.target.thesis import AnyTargetConfig, ThesisTargetConfig
 
 BOARD = {"width_mm": 300, "height_mm": 100, "thickness_mm": 12}
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declared_targets import target_from_data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -23,7 +24,6 @@ from scenes.sensor.camera import load_camera
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
-from scenes.target.thesis import target_from_data
 from scenes.target.truth import backing_corners_board_m, outline_board_m
 
 ALPHA = 1e-3

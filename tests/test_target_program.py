@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from declared_targets import target_from_data
 
 from harness.target import main
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import RESULTS_VERSION
-from scenes.target.export import _srgb_bytes, write_mesh, write_truth
-from scenes.target.mesh import Target, build_target
-from scenes.target.thesis import ThesisTargetConfig, target_from_data
+from scenes.target.mesh import Target, _srgb_bytes, build_target, write_mesh, write_truth
+from scenes.target.thesis import ThesisTargetConfig
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from declared_targets import target_from_data
 
 from harness.vocabulary.errors import UserError
 from scenes.target.checks import check_target
 from scenes.target.mesh import build_target
-from scenes.target.thesis import target_from_data
 
 BOARD: dict[str, Any] = {"width_mm": 300, "height_mm": 100, "thickness_mm": 12}
 

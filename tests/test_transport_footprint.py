@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Lens, Region
-from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Beams, Optics, RenderConfig, footprint_of
+from scenes.optics import FWHM_PER_DEVIATION, Beams, Optics, RenderConfig, footprint_of
 from scenes.render.direct import comb_step, direct_light, phasor_sums
 from scenes.render.scene import lit_scene, load_mitsuba
 from scenes.render.view import render_view
@@ -21,7 +21,7 @@ from scenes.target.mesh import TargetPart, build_target
 
 LENS = Lens(width=400, height=300, fx=800.0, fy=800.0, cx=199.5, cy=149.5)
 DEVIATION_RAD = 1.2e-3
-BEAM = BeamFootprint(DEVIATION_RAD * FWHM_PER_DEVIATION)
+BEAM = DEVIATION_RAD * FWHM_PER_DEVIATION
 COMB = tuple(20e6 * k for k in range(1, 33))
 OPTICS = Optics(
     title="a scanner",
@@ -30,7 +30,7 @@ OPTICS = Optics(
     full_half_angle_deg=80.0,
     cutoff_half_angle_deg=85.0,
     frequencies_hz=COMB,
-    footprint=BEAM,
+    beam_fwhm_rad=BEAM,
     wavelength_nm=850.0,
     margin_px=0,
 )

@@ -70,10 +70,10 @@ def test_a_corner(histogram):
     theirs = its_phasors(lit, optics, 128, histogram)
     region = optics.lens.whole
     slopes = optics.lens.region_slopes(region)
-    direct = direct_light(lit, slopes, footprint_of(optics.lens, region, optics.footprint), FREQUENCIES)
+    direct = direct_light(lit, slopes, footprint_of(optics.lens, region, optics.beam_fwhm_rad), FREQUENCIES)
     light = gather_in_pixels(lit, direct.off_face, PathWork(FREQUENCIES, BOUNCES, seed=1), 512)
     ours = direct.phasor.reshape(3, -1).copy()
-    ours[:, direct.off_face.pixel] += direct.off_face.share * light.mean[:-1]
+    ours[:, direct.off_face.pixel] += direct.off_face.share * light.mean(axis=0, dtype=complex)[:-1]
     ours = ours.reshape(3, *region.shape)
     share = np.abs(ours - direct.phasor).mean() / np.abs(ours).mean()
     assert share > 0.1

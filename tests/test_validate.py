@@ -302,9 +302,9 @@ def test_the_room_bends_the_board_only_with_multipath(tmp_path):
 def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
     """Two figures, quick: files written, exit 0; a baseline that the simulation falls behind: exit 1, naming it."""
     grids = {key: values[:1] if key in ("lag_px", "step_mm") else () for key, values in QUICK_GRIDS.items()}
-    monkeypatch.setattr(program, "QUICK_GRIDS", grids)
-    monkeypatch.setattr(program, "measured", lru_cache(lambda wanted, *more: measured(wanted, *more)))
-    monkeypatch.setattr(program, "requests_of", lambda *of: tuple(requests_of(*of)))
+    monkeypatch.setattr(program.scoring, "QUICK_GRIDS", grids)
+    monkeypatch.setattr(program.scoring, "measured", lru_cache(lambda wanted, *more: measured(wanted, *more)))
+    monkeypatch.setattr(program.scoring, "requests_of", lambda *of: tuple(requests_of(*of)))
     figures, baseline, out = written(tmp_path), tmp_path / "baseline.json", tmp_path / "out"
     options = ["--quick", "--jobs", "1", "--camera", "azure_kinect_nfov"]
     options += ["--figures", str(figures), "--out", str(out)]

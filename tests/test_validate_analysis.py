@@ -26,7 +26,7 @@ from harness.scorecard.bench import (
 from harness.scorecard.quantities import QUANTITIES, PlateauConditions, SurvivalConditions
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import BEAM_REACH_FWHM, Plane, layered_view, plane_view, sub_rays
-from scenes.optics import BeamFootprint, Optics
+from scenes.optics import Optics
 from scenes.sensor.camera import CameraConfig, camera_of
 
 AZURE = "azure_kinect_nfov"
@@ -232,7 +232,7 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
 def test_a_beam_is_a_round_gaussian_of_its_width():
     """Second moment fwhm / 2.355 within 2 % of the truncated grid; weights sum to 1; the centre is the pixel's ray."""
     fwhm = 2e-3
-    optics = Optics("beam", PINHOLE.nominal_lens, np.zeros(3), 38, 42, (1e8,), BeamFootprint(fwhm), 860.0, 0)
+    optics = Optics("beam", PINHOLE.nominal_lens, np.zeros(3), 38, 42, (1e8,), fwhm, 860.0, 0)
     rays, weights = sub_rays(optics, PINHOLE.nominal_lens, REGION, np.ones(REGION.shape, bool), 24)
     off = rays.reshape(*REGION.shape, -1, 2) - PINHOLE.nominal_lens.region_slopes(REGION)[..., None, :]
     assert weights.sum() == pytest.approx(1)

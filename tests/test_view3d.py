@@ -17,7 +17,6 @@ from harness.report.view3d import (
     Circle3d,
     Scene3d,
     packed,
-    scene_of,
     view3d_html,
     write_view3d,
 )
@@ -32,8 +31,8 @@ def places(data) -> np.ndarray:
 
 
 def test_points_come_back_within_a_step_and_colours_as_they_were():
-    example = map_example(3)
-    data = packed(scene_of(example))
+    example = map_example(3).scene
+    data = packed(example)
     assert data["count"] == data["total"] == len(example.points_mm)
     span = np.ptp(example.points_mm, axis=0)
     assert np.abs(places(data) - example.points_mm).max(axis=0) == pytest.approx(span / 65535 / 2, rel=0.01)
@@ -125,7 +124,7 @@ def browsed(path, *options: str) -> str:
 
 
 def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
-    page = view3d_html(scene_of(map_example(2, points=2000)), "T").replace("</body>", DRAG)
+    page = view3d_html(map_example(2, points=2000).scene, "T").replace("</body>", DRAG)
     path = tmp_path / "turn.html"
     path.write_text(page)
     shown = browsed(path, "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -142,6 +141,6 @@ def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
 
 
 def test_a_browser_without_webgl_says_so(tmp_path):
-    path = write_view3d(tmp_path / "flat.html", map_example(2, points=500), "T")
+    path = write_view3d(tmp_path / "flat.html", map_example(2, points=500).scene, "T")
     shown = browsed(path, "--disable-gpu", "--disable-3d-apis")
     assert re.search(r'<p id="missing" role="alert" style="display: block;">', shown)

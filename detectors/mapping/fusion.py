@@ -23,15 +23,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from detectors.mapping.placing import (
-    ChosenView,
-    PlacedView,
-    T_reference_map_of,
-    common_surface,
-    grid_over,
-    place,
-    raster_between,
-)
+from detectors.mapping import placing
 from detectors.noise import rounding_left_m2
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points
@@ -200,15 +192,17 @@ LEAST_M2 = 1e-14
 """Least variance: no point is known better than to 0.1 um, and no weight is infinite."""
 
 
-def fuse(views: Sequence[ChosenView], cell_m: float | None) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
+def fuse(
+    views: Sequence[placing.ChosenView], cell_m: float | None
+) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
     """Return the map as an organised cloud, its frame in the first view's (4, 4), what else is known, and notes. The
     cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` all of it, which
     one view does not know of itself (then None). Rounding is in it, so there is no rounding step left. Raises UserError
     where the points do not determine a surface or the map would have too many cells."""
-    T_reference_map = T_reference_map_of(views[0])
-    surface = common_surface(views, T_reference_map)
-    placed = [place(view, T_reference_map, surface) for view in views]
-    grid = grid_over(placed, cell_m)
+    T_reference_map = placing.T_reference_map_of(views[0])
+    surface = placing.common_surface(views, T_reference_map)
+    placed = [placing.place(view, T_reference_map, surface) for view in views]
+    grid = placing.grid_over(placed, cell_m)
     x, y = grid.places()
     z = surface.evaluate(x, y)
     # the product of the gradient with a small displacement is the change of height along z
@@ -219,7 +213,7 @@ def fuse(views: Sequence[ChosenView], cell_m: float | None) -> tuple[Cloud, np.n
     observed, repeated = [], True
     for view in placed:
         cloud, inside = view.chosen.cloud, view.chosen.inside
-        raster = raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
+        raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
         variance, by_frames = depth_noise(cloud, inside, _roughness(view))
         repeated &= by_frames
         slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
@@ -273,7 +267,7 @@ def fuse(views: Sequence[ChosenView], cell_m: float | None) -> tuple[Cloud, np.n
     return merged, T_reference_map, found, _notes(views, found)
 
 
-def _roughness(view: PlacedView) -> np.ndarray:
+def _roughness(view: placing.PlacedView) -> np.ndarray:
     """(h, w) z less the view's own smooth surface; only needed, and only worked out, where frames do not repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
@@ -285,7 +279,7 @@ def _roughness(view: PlacedView) -> np.ndarray:
     return rough
 
 
-def _neighbour_correlation(view: PlacedView) -> float:
+def _neighbour_correlation(view: placing.PlacedView) -> float:
     """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a pixel grid."""
     if not view.chosen.cloud.organised:
         return 1.0
@@ -304,7 +298,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def _registration_variance(
-    view: ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
+    view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
 ) -> np.ndarray:
     """(h, w) variance, by the registration, of the displacements w x (p - centre) + t of points (h, w, 3) along vectors
     (h, w, 3): that of w . ((p - centre) x along) + t . along. 0 where the method has no covariance."""
@@ -317,7 +311,7 @@ def _registration_variance(
     return np.asarray(np.maximum(spread, 0.0))
 
 
-def _notes(views: Sequence[ChosenView], found: SurfaceMap) -> tuple[str, ...]:
+def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
     between = found.between
     notes = ["one view: errors fixed for a view (pattern, wiggling) cannot be told, its variance has none"]
     if len(views) > 1:

@@ -136,6 +136,8 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
     return along >= np.cos(np.deg2rad(WALL_DEG)) * np.linalg.norm(turned, axis=1)
 
 
+SEVERAL = -1
+"""Stands for several views, or an unknown one."""
 MAX_BOXES = 1 << 21
 """Boxes of the grid along one axis: three axes in a 63-bit key."""
 
@@ -161,6 +163,31 @@ class Mapped:
     views: tuple[PreparedView, ...]
     registrations: tuple[Registration, ...]
     merged: Merged
+
+    def view_of_points(self) -> np.ndarray:
+        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, `SEVERAL` for
+        several or unknown: of a map as it knows, else by the nearest point, several where another view has one within
+        twice that."""
+        from scipy.spatial import cKDTree
+
+        merged = self.merged
+        count = merged.cloud.valid.size
+        if merged.surface_map is not None:
+            seen = merged.surface_map.seen_by.reshape(-1, count)
+            return np.where(seen.sum(axis=0) == 1, seen.argmax(axis=0), SEVERAL)
+        points = merged.cloud.points_m.reshape(-1, 3)
+        known = np.isfinite(points).all(axis=1)
+        distances = np.stack(
+            [
+                cKDTree(transform_points(each.T_reference_view, view.points_m)).query(points[known])[0]
+                for view, each in zip(self.views, self.registrations, strict=True)
+                if each.view in merged.views_used
+            ]
+        )
+        least, second = np.sort(np.vstack([distances, np.full(known.sum(), np.inf)]), axis=0)[:2]
+        indices = np.full(count, SEVERAL)
+        indices[known] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
+        return indices
 
 
 def prepare(view: View, config: MappingConfig) -> PreparedView:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from detectors.crop import AutoCrop, CropConfig
 from detectors.marks.mark import ColourMarks, MarksConfig
-from detectors.registration.settings import MarksRegistration, RegistrationConfig
+from detectors.registration.settings import PlainRegistration, RegistrationConfig
 from harness.vocabulary.config import Config
 
 
@@ -44,5 +44,5 @@ class MappingConfig(Config):
     views: int | None = Field(default=None, ge=1, le=1000)
     crop: CropConfig = Field(default_factory=AutoCrop)
     marks: MarksConfig = Field(default_factory=ColourMarks)
-    registration: RegistrationConfig = Field(default_factory=MarksRegistration)
+    registration: RegistrationConfig = Field(default_factory=lambda: PlainRegistration(method="marks"))
     merge: MergeConfig = Field(default_factory=FusedMerge)

@@ -24,17 +24,7 @@ import numpy as np
 
 from detectors.marks.mark import Mark, off_line_problem
 from detectors.marks.pairing import SHARED_M, Placement, pair_marks, place
-from detectors.registration.registered import (
-    MEDIAN_TO_SIGMA,
-    Registration,
-    displacement_jacobian,
-    failed,
-    guess_of,
-    independent,
-    moved_by,
-    sampling_of,
-    thinned,
-)
+from detectors.registration import registered
 from detectors.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, invert, transform_points
@@ -45,21 +35,21 @@ REFUSE_BELOW = 1e-4
 """The same with `SHARED_M` for each mark and axis allowed for, below which the views do not fit."""
 
 
-def register_by_marks(reference: PreparedView, view: PreparedView) -> Registration:
+def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
     """Return the pose of a view relative to the reference, from their trusted marks. ``overlap`` stays NaN. Never
     raises for the content of the views: too few marks, marks on a line, marks that fit nowhere, in several ways, or
     badly, are its ``failure``; the transform is then the best known, or else the guess, or else the identity."""
     from scipy.special import gammaincc
 
-    guess = guess_of(reference, view)
+    guess = registered.guess_of(reference, view)
     ours, theirs, problem, notes = _matched(reference, view)
     if len(ours) < 3:
-        return failed(view, "marks", guess, problem, *notes)
+        return registered.failed(view, "marks", guess, problem, *notes)
     problem = problem or off_line_problem(ours) or off_line_problem(theirs)
     try:
         placement = _placed(ours, theirs, 0.0)
     except np.linalg.LinAlgError:
-        return failed(view, "marks", guess, problem or "the matched marks do not determine the rotation")
+        return registered.failed(view, "marks", guess, problem or "the matched marks do not determine the rotation")
     freedom = 3 * len(ours) - 6
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
     if not problem and gammaincc(freedom / 2, _placed(ours, theirs, SHARED_M).chi2 / 2) < REFUSE_BELOW:
@@ -72,7 +62,7 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> Registrati
         ratio = float(np.sqrt(placement.chi2 / freedom))
         covariance = covariance * ratio**2
         notes += (f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",)
-    return Registration(
+    return registered.Registration(
         view=view.view.name,
         method="marks",
         T_reference_view=placement.T_to_from,
@@ -111,7 +101,7 @@ def _matched(
     if problem:
         return (), (), problem, ()
     ours, theirs = reference.marks.trusted, view.marks.trusted
-    pairing = pair_marks(ours, theirs, guess_of(reference, view))
+    pairing = pair_marks(ours, theirs, registered.guess_of(reference, view))
     i, j = pairing.pairs.T
     return tuple(ours[k] for k in i), tuple(theirs[k] for k in j), pairing.problem, pairing.notes
 
@@ -171,7 +161,9 @@ class JointState:
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
         poses, surface, marks, own = self.split(motion)
-        T = np.stack([self.T[0], *(moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))])
+        T = np.stack(
+            [self.T[0], *(registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))]
+        )
         return JointState(T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m)
 
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -190,8 +182,8 @@ class JointState:
         by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
         by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
         normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
-        by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
-        scale = max(data.noise_m, float(np.median(np.abs(residual))) * MEDIAN_TO_SIGMA)
+        by_pose = np.einsum("ni,nij->nj", normals, registered.displacement_jacobian(points, np.zeros(3)))
+        scale = max(data.noise_m, float(np.median(np.abs(residual))) * registered.MEDIAN_TO_SIGMA)
         tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
         return residual, basis, by_pose, tukey / data.sigma_m**2
 
@@ -215,7 +207,7 @@ class JointState:
             turn = self.T[v][:2, :3]
             for mark, label in each.marks:
                 place = transform_points(self.T[v], mark.centre_m)
-                within = displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
+                within = registered.displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
                 rows = np.concatenate([-np.eye(2), within], axis=1)
                 weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
                 add(np.concatenate([marks[label], pose]), rows, place[:2] - self.marks_m[label], weight)
@@ -223,7 +215,7 @@ class JointState:
         return matrix, right
 
 
-def register_jointly(views: Sequence[PreparedView]) -> list[Registration]:
+def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registration]:
     """Register views but the first to the first, from all views together. ``covariance`` is each view's marginal,
     smooth errors of the views included; ``residual_m`` the root mean square across the surface of the points that
     count. A view whose marks fail keeps that failure and takes no part."""
@@ -236,7 +228,9 @@ def register_jointly(views: Sequence[PreparedView]) -> list[Registration]:
     return [replace(each, method="joint") for each in found]
 
 
-def _adjust(views: Sequence[PreparedView], by_marks: Sequence[Registration]) -> list[Registration]:
+def _adjust(
+    views: Sequence[PreparedView], by_marks: Sequence[registered.Registration]
+) -> list[registered.Registration]:
     """Registrations of views 1.. adjusted from those by their marks, none of which failed."""
     T_reference = [np.eye(4), *(found.T_reference_view for found in by_marks)]
     data = [_view_data(view, views[0], T) for view, T in zip(views, T_reference, strict=True)]
@@ -291,7 +285,7 @@ def _adjust(views: Sequence[PreparedView], by_marks: Sequence[Registration]) -> 
 
 def _surface_frame(reference: PreparedView) -> np.ndarray:
     """(4, 4) from the reference to the frame of the surface z(x, y): z along its mean normal, towards the camera."""
-    sampling = sampling_of(reference)
+    sampling = registered.sampling_of(reference)
     z = sampling.normal
     x = np.array([1.0, 0.0, 0.0]) - z[0] * z
     x /= np.linalg.norm(x)
@@ -303,9 +297,9 @@ def _surface_frame(reference: PreparedView) -> np.ndarray:
 
 def _view_data(view: PreparedView, reference: PreparedView, T_reference_view: np.ndarray) -> ViewData:
     """The data of a view; its marks are those of the reference that ``T_reference_view`` brings them to, once each."""
-    points = thinned(view.points_m)
-    noise = max(sampling_of(view).noise_m, 1e-9)
-    inflation = max(len(points) / independent(int(view.inside.sum())), 1.0)
+    points = registered.thinned(view.points_m)
+    noise = max(registered.sampling_of(view).noise_m, 1e-9)
+    inflation = max(len(points) / registered.independent(int(view.inside.sum())), 1.0)
     turn = T_reference_view[:3, :3]
     fits = []
     for i, mark in enumerate(view.marks.trusted):

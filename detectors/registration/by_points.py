@@ -27,20 +27,7 @@ import numpy as np
 from detectors.average import CORRELATED_PIXELS
 from detectors.marks.pairing import kabsch
 from detectors.open3d_library import open3d_on_one_thread
-from detectors.registration.registered import (
-    MIN_OVERLAP,
-    SLIDES,
-    Registration,
-    clouds_of,
-    clustered_sandwich,
-    displacement_jacobian,
-    failed,
-    local_normals,
-    moved_by,
-    moved_m,
-    sampling_of,
-    still_moving,
-)
+from detectors.registration import registered
 from detectors.registration.settings import CpdRegistration, IcpRegistration
 from detectors.surface import SurfaceConfig, fit_surface
 from detectors.views import PreparedView
@@ -57,15 +44,15 @@ CONVERGED_PITCHES = 0.05
 SLOPE_STEP_M = 1 * MM
 
 
-def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> Registration:
+def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by ICP of their fiducial clouds or targets. ``covariance``:
     see `_covariance`."""
     from scipy.spatial import cKDTree
 
-    fixed, moving, start, notes, few = clouds_of(reference, view, config.points)
+    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
-        return failed(view, "icp", start, few, *notes)
-    sampling = sampling_of(view)
+        return registered.failed(view, "icp", start, few, *notes)
+    sampling = registered.sampling_of(view)
     tree = cKDTree(fixed)
     local, real = _normals(reference, fixed) if config.estimation == "point_to_plane" else (None, None)
     T, moved, iterations, step_m = np.eye(4) if start is None else start, moving, 0, np.inf
@@ -76,9 +63,9 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
             apart, paired, _ = _pairs(tree, local, moved, limit_m)
             if paired.sum() < 3:
                 failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
-                return failed(view, "icp", start, failure, *notes)
+                return registered.failed(view, "icp", start, failure, *notes)
             change = _step(moved[paired], apart[paired], to_plane=local is not None)
-            T, step_m = change @ T, moved_m(change, moved)
+            T, step_m = change @ T, registered.moved_m(change, moved)
             iterations += 1
             now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
             if np.abs(now - last).max() < LEAST_CHANGE:
@@ -89,7 +76,7 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
     moved = transform_points(T, moving)
     apart, paired, _ = _pairs(tree, local, moved, limit_m)
     covariance = _covariance(tree, real, moved, limit_m, sampling.pitch_m)
-    return Registration(
+    return registered.Registration(
         view=view.view.name,
         method="icp",
         T_reference_view=T,
@@ -99,7 +86,8 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
         pairs=int(paired.sum()),
         iterations=iterations,
         converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
-        failure=still_moving(step_m, sampling.pitch_m) or ("" if np.isfinite(covariance).all() else SLIDES),
+        failure=registered.still_moving(step_m, sampling.pitch_m)
+        or ("" if np.isfinite(covariance).all() else registered.SLIDES),
         notes=notes,
     )
 
@@ -135,8 +123,8 @@ def _step(moved_m: np.ndarray, apart_m: np.ndarray, to_plane: bool) -> np.ndarra
     some = size > 0
     centre = moved_m.mean(axis=0)
     normals = apart_m[some] / size[some, None]
-    rows = np.einsum("ni,nij->nj", normals, displacement_jacobian(moved_m[some], centre))
-    return moved_by(np.linalg.lstsq(rows, -size[some], rcond=1e-6)[0], centre)
+    rows = np.einsum("ni,nij->nj", normals, registered.displacement_jacobian(moved_m[some], centre))
+    return registered.moved_by(np.linalg.lstsq(rows, -size[some], rcond=1e-6)[0], centre)
 
 
 def _covariance(
@@ -149,12 +137,12 @@ def _covariance(
     the gradients, summed within cubes of 5 pixels whose errors are common. Not in it: that the iteration may stop at
     one of many near minima. NaN where a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
-    jacobian = displacement_jacobian(arm, np.zeros(3))
+    jacobian = registered.displacement_jacobian(arm, np.zeros(3))
     apart, paired, nearest = _pairs(tree, normals, moved_m, limit_m)
     scores = np.einsum("nij,ni->nj", jacobian, apart)
     if normals is not None:
         rows = np.einsum("ni,nij->nj", normals[nearest[paired]], jacobian[paired])
-        return clustered_sandwich(rows.T @ rows, scores - scores.mean(axis=0), moved_m, pitch_m)
+        return registered.clustered_sandwich(rows.T @ rows, scores - scores.mean(axis=0), moved_m, pitch_m)
 
     def half_cost(motion: np.ndarray) -> float:
         # a point without a partner counts as if it were at the limit
@@ -172,7 +160,7 @@ def _covariance(
             both, across = part * (steps[i] + steps[j]), part * (steps[i] - steps[j])
             mixed = half_cost(both) + half_cost(-both) - half_cost(across) - half_cost(-across)
             curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
-    return clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
+    return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
 
 
 def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +180,7 @@ def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, 
     smooth = np.stack([*slopes, -np.ones(len(px))], axis=1)
     smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
     count = min(CORRELATED_PIXELS, len(target))
-    local = local_normals(target[cKDTree(target).query(fixed_m, k=count)[1]].reshape(len(fixed_m), count, 3))
+    local = registered.local_normals(target[cKDTree(target).query(fixed_m, k=count)[1]].reshape(len(fixed_m), count, 3))
     local *= np.where(np.einsum("ni,ni->n", local, smooth) < 0, -1.0, 1.0)[:, None]
     squared = np.sum((local - smooth) ** 2, axis=1)
     # two axes: a squared length has a median of 2 ln 2 variances and exceeds 2 ln(1 / p) with chance p
@@ -270,22 +258,22 @@ def coherent_point_drift(
     return Drift(T @ start, float(np.sqrt(variance)) * scale, matched, iterations, converged, step, background)
 
 
-def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> Registration:
+def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
     Few iterations are the rule, so one that stops by their number fails only where its last step still moved the
     points."""
-    fixed, moving, start, notes, few = clouds_of(reference, view, config.points)
+    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
-        return failed(view, "cpd", start, few, *notes)
+        return registered.failed(view, "cpd", start, few, *notes)
     drift = coherent_point_drift(fixed, moving, config, start)
-    pitch = sampling_of(view).pitch_m
+    pitch = registered.sampling_of(view).pitch_m
     covariance = drift_covariance(fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch)
-    failure = "" if drift.converged else still_moving(drift.step_m, pitch)
+    failure = "" if drift.converged else registered.still_moving(drift.step_m, pitch)
     if not failure and not np.isfinite(covariance).all():
-        failure = SLIDES
+        failure = registered.SLIDES
     if not drift.converged:
         notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
-    return Registration(
+    return registered.Registration(
         view=view.view.name,
         method="cpd",
         T_reference_view=drift.T_fixed_moving,
@@ -320,12 +308,12 @@ def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pit
     scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
     within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
     # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
-    parts = displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
+    parts = registered.displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
     parts[:3] -= parts[3]
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)
     both = 1 + len(fixed_m) / len(moved_m)
-    return clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m) * both
+    return registered.clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m) * both
 
 
 def posterior_moments(
@@ -382,7 +370,7 @@ DEPTH_DIFFERENCE_M = 0.03
 DRIFTS = "no covariance: what Open3D's odometry gives counts its pairs, and does not know how far it slid"
 
 
-def register_by_odometry(views: Sequence[PreparedView]) -> list[Registration]:
+def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Registration]:
     """Register views but the first to the first, in the order given: that of the walk. A view that odometry loses
     (Open3D says so, or less than a tenth of the target's pixels pair) is a failure, and so is every view after it.
     ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
@@ -400,13 +388,15 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[Registration]:
                 # the information's last diagonal element is the sum of 1 over pairs
                 pairs = round(float(information[5, 5])) if success and np.isfinite(step).all() else 0
                 pixels = max(int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before))
-                if pairs < MIN_OVERLAP * pixels:
+                if pairs < registered.MIN_OVERLAP * pixels:
                     lost = f"odometry lost its way at {view.view.name}: {pairs} pixels match the view before it"
             if lost:
-                found.append(failed(view, "odometry", None, lost))
+                found.append(registered.failed(view, "odometry", None, lost))
                 continue
             T_reference_view = T_reference_view @ step
-            found.append(Registration(view.view.name, "odometry", T_reference_view, pairs=pairs, notes=(DRIFTS,)))
+            found.append(
+                registered.Registration(view.view.name, "odometry", T_reference_view, pairs=pairs, notes=(DRIFTS,))
+            )
     return found
 
 

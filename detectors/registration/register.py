@@ -14,22 +14,9 @@ from time import perf_counter
 import numpy as np
 
 from detectors.average import CORRELATED_PIXELS
+from detectors.registration import registered
 from detectors.registration.by_marks import register_by_marks, register_jointly
 from detectors.registration.by_points import register_by_cpd, register_by_icp, register_by_odometry
-from detectors.registration.registered import (
-    MEDIAN_TO_SIGMA,
-    MIN_OVERLAP,
-    Registration,
-    Sampling,
-    guess_of,
-    independent,
-    local_normals,
-    moved_m,
-    predicted_error_m,
-    reference_registration,
-    sampling_of,
-    thinned,
-)
 from detectors.registration.settings import PAIRWISE, AnyRegistration, CpdRegistration, IcpRegistration
 from detectors.views import PreparedView
 from harness.vocabulary.errors import UserError
@@ -73,35 +60,39 @@ class Agreement:
     marks_scatter: float
 
 
-def _agreement(reference: PreparedView, ours: Sampling, view: PreparedView, T_reference_view: np.ndarray) -> Agreement:
+def _agreement(
+    reference: PreparedView, ours: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
+) -> Agreement:
     """The agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ``ours``."""
     from scipy.spatial import cKDTree
 
-    theirs, points, marks = sampling_of(view), reference.points_m, reference.mark_points_m
+    theirs, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
     pitch, noise = max(ours.pitch_m, theirs.pitch_m), float(np.hypot(ours.noise_m, theirs.noise_m))
     beside, together, apart, marks_m = np.zeros(1, bool), np.zeros(1, bool), float("nan"), float("nan")
     fiducial = transform_points(T_reference_view, view.mark_points_m)
     if len(points) >= 3 and view.inside.any():
         # the reference's surface at a point is the plane through its 25 nearest points
-        placed = transform_points(T_reference_view, thinned(view.points_m))
+        placed = transform_points(T_reference_view, registered.thinned(view.points_m))
         count = min(CORRELATED_PIXELS, len(points))
         near = points[cKDTree(points).query(placed, k=count)[1]].reshape(len(placed), count, 3)
-        normals = local_normals(near)
+        normals = registered.local_normals(near)
         across = np.einsum("ni,ni->n", placed - near.mean(axis=1), normals)
         along = np.linalg.norm(placed - across[:, None] * normals - near[:, 0], axis=1)
         beside = along <= pitch
         together = beside & (np.abs(across) <= max(pitch, 3 * noise))
-        apart = float(np.median(np.abs(across[beside]))) * MEDIAN_TO_SIGMA if beside.any() else apart
+        apart = float(np.median(np.abs(across[beside]))) * registered.MEDIAN_TO_SIGMA if beside.any() else apart
         if min(len(fiducial), len(marks)) >= 3:
             distances = np.sort(cKDTree(marks).query(fiducial)[0])[: max(int(TRIMMED * len(fiducial)), 1)]
             marks_m = float(np.sqrt(np.mean(distances**2)))
-    scatter = FALSE_ALARM_SIGMAS * MEDIAN_SCATTER / float(np.sqrt(2 * independent(int(beside.sum()))))
-    marks_scatter = FALSE_ALARM_SIGMAS / float(np.sqrt(2 * independent(len(fiducial))))
+    scatter = FALSE_ALARM_SIGMAS * MEDIAN_SCATTER / float(np.sqrt(2 * registered.independent(int(beside.sum()))))
+    marks_scatter = FALSE_ALARM_SIGMAS / float(np.sqrt(2 * registered.independent(len(fiducial))))
     shares = float(beside.mean()), float(together.mean())
     return Agreement(*shares, apart, marks_m, pitch, noise, pitch / float(np.sqrt(6)), scatter, marks_scatter)
 
 
-def judge(registration: Registration, reference: PreparedView, view: PreparedView) -> Registration:
+def judge(
+    registration: registered.Registration, reference: PreparedView, view: PreparedView
+) -> registered.Registration:
     """Return the registration with its overlap and, where it cannot be trusted, its ``failure`` or, for baselines, a
     note. A failure that the method itself found stays as it is."""
     T = registration.T_reference_view
@@ -112,21 +103,21 @@ def judge(registration: Registration, reference: PreparedView, view: PreparedVie
         broken = "mirrored: the transform is a reflection, not a rotation"
     if broken:
         return replace(registration, overlap=0.0, failure=registration.failure or broken)
-    ours, points = sampling_of(reference), thinned(reference.points_m, 200)
+    ours, points = registered.sampling_of(reference), registered.thinned(reference.points_m, 200)
     agreement = _agreement(reference, ours, view, T)
     judged = replace(registration, overlap=agreement.overlap)
     if judged.failure:
         return judged
-    if not agreement.beside >= MIN_OVERLAP:
+    if not agreement.beside >= registered.MIN_OVERLAP:
         elsewhere = (
             f"the views do not overlap: {100 * agreement.beside:.0f} % of this view's target lies beside the"
-            f" reference's ({100 * MIN_OVERLAP:.0f} % needed)"
+            f" reference's ({100 * registered.MIN_OVERLAP:.0f} % needed)"
         )
     else:
         elsewhere = _jump(judged, reference, view)
     if elsewhere:
         return replace(judged, failure=elsewhere)
-    within, across = predicted_error_m(judged, points, ours.normal)
+    within, across = registered.predicted_error_m(judged, points, ours.normal)
     undetermined, apart = _undetermined(float(np.hypot(within, across)), ours.pitch_m), _apart(agreement)
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
@@ -146,9 +137,9 @@ def _undetermined(error_m: float, pitch_m: float) -> str:
     )
 
 
-def _jump(registration: Registration, reference: PreparedView, view: PreparedView) -> str:
+def _jump(registration: registered.Registration, reference: PreparedView, view: PreparedView) -> str:
     """Return the reason why a pose is too far from its guess to be credible; empty where it is credible."""
-    guess = guess_of(reference, view)
+    guess = registered.guess_of(reference, view)
     if guess is None:
         return ""
     change = registration.T_reference_view @ invert(guess)
@@ -183,8 +174,8 @@ def _apart(agreement: Agreement) -> str:
 
 
 def _widened(
-    registration: Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
-) -> Registration:
+    registration: registered.Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
+) -> registered.Registration:
     """Return the registration with a covariance that includes the errors that a whole view shares, and a note, where
     the views show such errors. Their mean square is the part of the distances between the views that neither noise nor
     the covariance explains. It is added to the shift, across the surface and within it. An offset of a whole view does
@@ -215,14 +206,14 @@ LOOP_POINTS = 500
 """Number of points of the first view's target over which the error of a loop is averaged."""
 
 
-def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[Registration, ...]:
+def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
     """Return one registration for each view; the first is that of the reference. Never raises for the content of the
     views: a registration that cannot be trusted has a ``failure``. Raises UserError where the method needs something
     that these views never have (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)
-    of_reference = reference_registration(views[0].view.name, config.method)
+    of_reference = registered.reference_registration(views[0].view.name, config.method)
     if len(views) == 1:
         return (of_reference,)
     if config.method in PAIRWISE:
@@ -252,7 +243,7 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
                 raise UserError(f"{view.view.name}: registration by {config.method} needs {what}", fix=fix)
 
 
-def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> Registration:
+def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> registered.Registration:
     """Return the registration of a view to a reference that need not be the first view, not judged yet."""
     started = perf_counter()
     if isinstance(config, IcpRegistration):
@@ -263,8 +254,8 @@ def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) 
         found = register_by_marks(reference, view)
     else:
         # nobody has said how good the guess is
-        guess = guess_of(reference, view)
-        found = Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
+        guess = registered.guess_of(reference, view)
+        found = registered.Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)
 
 
@@ -305,6 +296,6 @@ def loop_errors(views: Sequence[PreparedView], config: AnyRegistration, most: in
             T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
             closed = T_ij @ T_jk @ invert(T_ik)
             turn = float(np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2)))
-            shift = moved_m(closed, thinned(views[i].points_m, LOOP_POINTS))
+            shift = registered.moved_m(closed, registered.thinned(views[i].points_m, LOOP_POINTS))
         errors.append(LoopError((names[i], names[j], names[k]), turn, shift, "; ".join(failures)))
     return tuple(errors)

@@ -9,12 +9,6 @@ from pydantic import Field
 from harness.vocabulary.config import Config
 
 
-class NominalRegistration(Config):
-    """The guesses as they are."""
-
-    method: Literal["nominal"] = "nominal"
-
-
 class IcpRegistration(Config):
     """Iterative closest point, from the guess."""
 
@@ -33,26 +27,16 @@ class CpdRegistration(Config):
     tolerance: float = Field(default=1e-5, gt=0)
 
 
-class MarksRegistration(Config):
-    """Centroids of marks, matched by their mutual distances, weighted by their covariances."""
+class PlainRegistration(Config):
+    """Methods without settings. ``nominal``: the guesses as they are. ``marks``: centroids of marks, matched by their
+    mutual distances, weighted by their covariances. ``joint``: marks and the common surface of all views together, from
+    the marks' registration. ``odometry``: RGB-D odometry from view to view (Open3D), no marks: a SLAM system without
+    loop closure."""
 
-    method: Literal["marks"] = "marks"
-
-
-class JointRegistration(Config):
-    """Marks and the common surface of all views together, from the marks' registration."""
-
-    method: Literal["joint"] = "joint"
+    method: Literal["nominal", "marks", "joint", "odometry"]
 
 
-class OdometryRegistration(Config):
-    """RGB-D odometry from view to view (Open3D), no marks: a SLAM system without loop closure."""
-
-    method: Literal["odometry"] = "odometry"
-
-
-OfPairs = NominalRegistration | IcpRegistration | CpdRegistration | MarksRegistration
-AnyRegistration = OfPairs | JointRegistration | OdometryRegistration
+AnyRegistration = IcpRegistration | CpdRegistration | PlainRegistration
 RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="method")]
 PAIRWISE = ("nominal", "icp", "cpd", "marks")
 """Methods that register each view to the first by itself, so that other views cannot change it."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from detectors.mapping.merge import SEVERAL, Mapped
 from detectors.mapping.settings import MappingConfig
 from harness.engine.judge import detector_for, judge
 from harness.engine.plan import Batch, Group, SweepPlan
@@ -17,13 +17,13 @@ from harness.engine.trial import MapMaker, averages_of, capture_of
 from harness.evaluation.profile import HoleInView
 from harness.evaluation.study.limit import SetUpLimit
 from harness.experiment.schema import Point
-from harness.report.clouds import ExampleCloud, FindingSeen, HoleSeen, MappedExample, StudyExample, Where
-from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
+from harness.report.clouds import ExampleCloud, MappedExample, StudyExample, Where
+from harness.report.view3d import Circle3d, Kind, Scene3d
+from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import canonical_json
 from scenes.target.truth import Damage
 
 MOST_POINTS = 60_000  # points of a merged cloud in a picture
-SAME_POINT_M = 0.1 * MM  # a merged point this near to a view's own is that view's: the step of the thesis' merge
 SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}
 """Sizes of damage in a study's pictures, as shares of the limit."""
 MOST_SET_UPS = 6
@@ -143,41 +143,40 @@ def _map_example(maps: MapMaker, point: Point, threshold: float) -> MappedExampl
     shown = np.flatnonzero(cloud.valid.ravel())
     shown = shown[:: max(1, -(-len(shown) // MOST_POINTS))]
     points_m = transform_points(known.T_board_cloud, cloud.points_m.reshape(-1, 3)[shown])
-    names = {finding: str(known.truth[hole].id) for hole, finding in judged.pairs.items()}
-    holes, findings = [], []
+    circles = []
+
+    def add(centre_m: np.ndarray, diameter_m: float, label: str, kind: Kind) -> None:
+        centre_mm = np.array([*centre_m[:2], 0.0]) / MM
+        circles.append(Circle3d(centre_mm, np.array([0.0, 0.0, 1.0]), diameter_m / MM, label, kind))
+
     for n, damage in enumerate(known.truth):
-        x_mm, y_mm = (damage.centre_board_m[:2] / MM).tolist()
-        holes.append(HoleSeen(str(damage.id), x_mm, y_mm, damage.diameter_m / MM, n in judged.pairs))
-    for n, (place, measured) in enumerate(zip((judged.places_m / MM).tolist(), judged.measured, strict=True)):
-        findings.append(
-            FindingSeen(place[0], place[1], measured.extent_diameter_m / MM, measured.score, names.get(n, ""))
-        )
-    # the view whose own point each merged point is; -1 where it is no single view's
-    T_board_reference = known.T_board_cloud @ invert(maps.merged(mapping, frames).T_reference_cloud)
-    view_of, nearest = np.full(len(points_m), -1), np.full(len(points_m), SAME_POINT_M)
-    views = zip(maps.prepared(mapping, frames), maps.registrations(mapping, frames), strict=True)
-    for number, (view, registration) in enumerate(views):
-        if not registration.failure:
-            own = transform_points(T_board_reference @ registration.T_reference_view, view.points_m)
-            distance, _ = cKDTree(own).query(points_m, distance_upper_bound=SAME_POINT_M)
-            closer = distance < nearest
-            view_of[closer], nearest[closer] = number, distance[closer]
-    return MappedExample(
-        variant=point.variant,
-        frames=frames,
-        views=maps.count(mapping),
-        registration=mapping.registration.method,
-        merge=mapping.merge.kind,
+        kind: Kind = "found" if n in judged.pairs else "missed"
+        add(damage.centre_board_m, damage.diameter_m, str(damage.id), kind)
+    for n, (place_m, measured) in enumerate(zip(judged.places_m, judged.measured, strict=True)):
+        diameter_m = measured.extent_diameter_m
+        kind = "finding" if n in judged.pairs.values() else "false call"
+        add(place_m, diameter_m, f"{diameter_m / MM:.1f}", kind)
+    merged = maps.merged(mapping, frames)
+    mapped = Mapped(maps.prepared(mapping, frames), maps.registrations(mapping, frames), merged)
+    count, way = maps.count(mapping), (mapping.registration.method, mapping.merge.kind)
+    names = tuple(view.view.name for view in mapped.views)
+    number_of = np.array([*map(names.index, merged.views_used), SEVERAL])  # a view that failed keeps its number
+    scene = Scene3d(
         points_mm=points_m / MM,
+        frame="board",
         rgb=np.full((len(shown), 3), GREY, np.uint8) if cloud.rgb is None else cloud.rgb.reshape(-1, 3)[shown],
         residual_mm=judged.evidence.residual_m.ravel()[shown] / MM,
         detected=_detected(cloud, judged.detections).ravel()[shown],
-        view_of=view_of,
-        holes=tuple(holes),
-        findings=tuple(findings),
-        view_names=tuple(view.view.name for view in maps.prepared(mapping, frames)),
-        is_variation=point.is_variation,
+        view_of=number_of[mapped.view_of_points()[shown]],
+        view_names=names,
+        circles=tuple(circles),
+        facts=(
+            ("views", f"{count} ({', '.join(way)})"),
+            ("frames a view", str(frames)),
+            ("holes found", f"{len(judged.pairs)} of {len(known.truth)}"),
+        ),
     )
+    return MappedExample(point.variant, frames, count, *way, scene, point.is_variation)
 
 
 # ---------------------------------------------------------------- damages of a study

@@ -18,23 +18,8 @@ from harness.evaluation.set_ups import compare_set_ups, effects_table, set_ups_o
 from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point, SimulatedSource
 from harness.experiment.unfold import FRAMES
+from harness.tables import trials
 from harness.tables.schema import Table, write_table
-from harness.tables.trials import (
-    CLAIMS,
-    EFFECTS,
-    FALSE_CALLS,
-    NOISE,
-    NOISE_BY_FRAMES,
-    PROBES,
-    REGISTRATION_ERRORS,
-    REGISTRATIONS,
-    RUNS,
-    SET_UPS,
-    STUDY_ONLY,
-    SUMMARY,
-    TRIALS,
-    ResultTables,
-)
 from harness.vocabulary.geometry import MM, invert, transform_points
 from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -42,14 +27,14 @@ from scenes.perspectives import poses_of
 from scenes.sensor.camera import camera_of
 from scenes.target.truth import truth_of
 
-RECORDED = {"holes": TRIALS, "runs": RUNS, "noise": NOISE, "registrations": REGISTRATIONS}
+RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, "registrations": trials.REGISTRATIONS}
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
-OF_STUDY = {table.name: table for table in STUDY_ONLY}
+OF_STUDY = {table.name: table for table in trials.STUDY_ONLY}
 RECORDS_AT_ONCE = 100  # records that are held as mappings before they become frames, which take a tenth of the memory
 UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that is not known
 
 
-def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> ResultTables:
+def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
     """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
     every axis is a column of all tables but those of a study alone."""
     frames: dict[str, list[pd.DataFrame]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
@@ -81,7 +66,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> R
         return table.sort_values(order, kind="stable", ignore_index=True)
 
     walls = _walls(experiment) if experiment.config.study is None else pd.DataFrame()
-    return ResultTables(
+    return trials.ResultTables(
         **{name: with_axes(ordered(name, table)) for name, table in RECORDED.items()},
         **{name: ordered(name, table) for name, table in OF_STUDY.items()},
         probes=with_axes(_probes(probes)),
@@ -134,7 +119,7 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
             "repeats": len(mm),
         }
         tables.append(pd.DataFrame(columns))
-    empty = pd.DataFrame(columns=[column.name for column in PROBES.columns])
+    empty = pd.DataFrame(columns=[column.name for column in trials.PROBES.columns])
     return pd.concat(tables, ignore_index=True) if tables else empty
 
 
@@ -216,29 +201,30 @@ def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance:
         write_table(folder, table, frame, {key: provenance[key] for key in keys})
 
 
-def summaries(tables: ResultTables, examples: Sequence[Any] = ()) -> dict[Table, pd.DataFrame]:
+def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict[Table, pd.DataFrame]:
     """Return the summaries of an experiment that is no study: all that its page shows. ``examples``: pictures that
     claims are scored with."""
-    from harness.thesis.claims import claim_c11, claims_table, score_claims
+    from harness.thesis.claims import claim_c11, score_claims
     from harness.thesis.views import score_views
 
     paths, variants = list(tables.axes["path"]), set_ups_of(tables)
     summary = summarise_holes(tables.holes, paths)
-    found = {NOISE_BY_FRAMES: noise_against_frames(tables.probes), FALSE_CALLS: false_calls(tables.runs)}
+    found = {trials.NOISE_BY_FRAMES: noise_against_frames(tables.probes), trials.FALSE_CALLS: false_calls(tables.runs)}
     if not tables.registrations.empty:
         own = tables.registrations[tables.registrations["variant"].isin(variants)]
-        found[SET_UPS] = compare_maps(tables, summary)
-        found[REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
-        found[CLAIMS] = claims_table(score_views(map_cases(tables, summary)))
+        found[trials.SET_UPS] = compare_maps(tables, summary)
+        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
+        verdicts = score_views(map_cases(tables, summary))
     elif len(variants) > 1:
         verdict = claim_c11(summary[summary["variant"].isin(variants)], paths)
-        found[SET_UPS] = compare_set_ups(tables, summary, variants)
-        found[CLAIMS] = claims_table([verdict] if verdict else [])
+        found[trials.SET_UPS] = compare_set_ups(tables, summary, variants)
+        verdicts = [verdict] if verdict else []
         if not (effects := effects_table(tables)).empty:
-            found[EFFECTS] = effects
+            found[trials.EFFECTS] = effects
     else:
-        found[CLAIMS] = claims_table(score_claims(tables, MAIN, examples, summary))
+        verdicts = score_claims(tables, MAIN, examples, summary)
+    found[trials.CLAIMS] = trials.CLAIMS.frame(map(vars, verdicts))
     for frame in found.values():
         for name in {"found", "undecided", "reasons"} & set(frame.columns):
             frame[name] = frame[name].map("; ".join)
-    return {SUMMARY: summary.assign(results_version=RESULTS_VERSION), **found}
+    return {trials.SUMMARY: summary.assign(results_version=RESULTS_VERSION), **found}

@@ -11,7 +11,7 @@ import numpy as np
 
 from harness.report.view3d import Circle3d, Scene3d
 from harness.tables.text import Grid, show
-from harness.vocabulary.geometry import MM, transform_points
+from harness.vocabulary.geometry import MM
 
 if TYPE_CHECKING:
     from detectors.crop import Choice
@@ -210,9 +210,6 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
 # ---------------------------------------------------------------- the scene
 
 
-SEVERAL = -1
-
-
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
     """Return the valid points of the merged cloud in its own frame (x right, y down, z away), millimetres, with a ring
     around each finding of known size."""
@@ -232,7 +229,7 @@ def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
         frame="camera",
         rgb=None if rgb is None else rgb.astype(np.uint8),
         residual_mm=judged.evidence.residual_m.reshape(-1)[valid] / MM,
-        view_of=view_of_points(mapped)[valid],
+        view_of=mapped.view_of_points()[valid],
         view_names=merged.views_used,
         detected=detected[valid],
         circles=tuple(circles),
@@ -243,28 +240,3 @@ def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
             ("findings", str(len(judged.findings))),
         ),
     )
-
-
-def view_of_points(mapped: Mapped) -> np.ndarray:
-    """Return (n,) for each point of the merged cloud the index of the view it comes from, -1 for several or unknown: of
-    a map as it knows, else by the nearest point, several where another view has one within twice that."""
-    from scipy.spatial import cKDTree
-
-    merged = mapped.merged
-    count = merged.cloud.valid.size
-    if merged.surface_map is not None:
-        seen = merged.surface_map.seen_by.reshape(-1, count)
-        return np.where(seen.sum(axis=0) == 1, seen.argmax(axis=0), SEVERAL)
-    points = merged.cloud.points_m.reshape(-1, 3)
-    known = np.isfinite(points).all(axis=1)
-    distances = np.stack(
-        [
-            cKDTree(transform_points(each.T_reference_view, view.points_m)).query(points[known])[0]
-            for view, each in zip(mapped.views, mapped.registrations, strict=True)
-            if each.view in merged.views_used
-        ]
-    )
-    least, second = np.sort(np.vstack([distances, np.full(known.sum(), np.inf)]), axis=0)[:2]
-    indices = np.full(count, SEVERAL)
-    indices[known] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
-    return indices

@@ -48,18 +48,15 @@ def template(name: str, folder: Path | None = None) -> Template:
         "generator": GENERATOR,
         "style": Markup((HERE / "style.css").read_text(encoding="utf-8")),
         "figure": figure,
-        "warning_blocks": lambda texts: joined(map(warning, texts)),
+        "warnings": (),
         "closing": "",
     }
     return environment.get_template(name)
 
 
-def page(
-    title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = (), warnings: Iterable[str] = ()
-) -> str:
-    """A whole page: ``title``, ``warnings``, the ``answer`` in large letters, what stands ``under`` it, the body."""
-    parts = {"body": joined(body), "under": joined(under), "warnings": joined(map(warning, warnings))}
-    return template("page.html").render(title=title, answer=answer, **parts)
+def page(title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = ()) -> str:
+    """A whole page: ``title``, the ``answer`` in large letters, what stands ``under`` it, the body."""
+    return template("page.html").render(title=title, answer=answer, body=joined(body), under=joined(under))
 
 
 def tag(name: str, *content: str | Markup, **attributes: str) -> Markup:
@@ -76,11 +73,6 @@ def joined(parts: Iterable[str | Markup], between: str = "\n") -> Markup:
 
 heading, subheading, paragraph = (partial(tag, name) for name in ("h2", "h3", "p"))
 note = partial(tag, "p", kind="note")
-
-
-def warning(text: str) -> Markup:
-    """A warning, which stands before the answer."""
-    return tag("p", f"warning: {text}", kind="fail")
 
 
 def bullets(items: Iterable[str | Markup]) -> Markup:

@@ -13,6 +13,7 @@ import numpy as np
 
 from harness.evaluation.profile import HoleInView
 from harness.report.blocks import DAMAGE, INK, svg
+from harness.report.view3d import Scene3d
 from harness.tables.text import inches, many
 
 if TYPE_CHECKING:
@@ -66,46 +67,15 @@ class StudyExample:
 
 
 @dataclass(frozen=True)
-class HoleSeen:
-    """One hole: its number, centre (x, y), diameter, and whether it was found in this repeat."""
-
-    hole: str
-    x_mm: float
-    y_mm: float
-    diameter_mm: float
-    found: bool
-
-
-@dataclass(frozen=True)
-class FindingSeen:
-    """One finding by the thesis' measure: centre (x, y), diameter, score, and its hole ("" for a false call)."""
-
-    x_mm: float
-    y_mm: float
-    diameter_mm: float
-    score: float
-    hole: str
-
-
-@dataclass(frozen=True)
 class MappedExample:
-    """One merged cloud of one variant with what was found in it, in the board's true frame, in millimetres.
-    ``points_mm`` (k, 3), ``rgb`` (k, 3) uint8, ``residual_mm`` (k,) behind (+) or before (-) the fitted surface (NaN
-    where not judged), ``detected`` (k,) bool, ``view_of`` (k,): index into ``view_names``, -1 of several views."""
+    """One merged cloud of one variant with the true holes and what was found in it, in the board's true frame."""
 
     variant: str
     frames: int
     views: int
     registration: str
     merge: str
-    points_mm: np.ndarray
-    rgb: np.ndarray
-    residual_mm: np.ndarray
-    detected: np.ndarray
-    view_of: np.ndarray
-    holes: tuple[HoleSeen, ...]
-    findings: tuple[FindingSeen, ...]
-    view_names: tuple[str, ...]
+    scene: Scene3d
     is_variation: bool = False
 
 

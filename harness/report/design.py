@@ -10,17 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from harness.evaluation.intervals import SITES_PER_TARGET
+from harness.evaluation.pod import design as planned
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import (
-    CALLS,
-    LEAST_SIGNALS,
-    LEAST_TARGETS,
-    FramesPlan,
-    HoleFree,
-    Recommendation,
-    RepeatedStudies,
-    StudyPlan,
-)
 from harness.report import blocks
 from harness.report.pod import axis_text, plain
 from harness.tables.schema import Column, Table, jsonable
@@ -50,13 +41,13 @@ class StudyDesign:
     origin: str
     unit: str
     range_of_sizes: tuple[float, float]
-    plans: tuple[StudyPlan, ...]
-    recommended: Recommendation
+    plans: tuple[planned.StudyPlan, ...]
+    recommended: planned.Recommendation
     goal: float | None
     guessed_with: int | None
-    frames: tuple[FramesPlan, ...]
-    repeats: tuple[RepeatedStudies, ...]
-    hole_free: HoleFree | None
+    frames: tuple[planned.FramesPlan, ...]
+    repeats: tuple[planned.RepeatedStudies, ...]
+    hole_free: planned.HoleFree | None
 
     @property
     def size_name(self) -> str:
@@ -147,7 +138,7 @@ def guess_text(design: StudyDesign) -> str:
 class Planned(NamedTuple):
     """A row of the tables of plans: for so many frames, or recommended among others."""
 
-    plan: StudyPlan
+    plan: planned.StudyPlan
     chosen: bool = False
     frames: int = 0
     curve: PodCurve | None = None
@@ -246,7 +237,7 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
     lines += [
         f"to show at most {area.rate_per_m2:g} per m2 with {sure}: {('no', 'one', 'two')[calls]} false "
         f"call{'s' * (calls == 2)} on {square_metres:.4g} m2, which is {area.boards(square_metres)} other boards"
-        for calls, square_metres in zip(CALLS, area.areas_m2, strict=True)
+        for calls, square_metres in zip(planned.CALLS, area.areas_m2, strict=True)
     ]
     return lines
 
@@ -254,7 +245,7 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
 def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, Monte Carlo error, and what the plan rests on."""
     plan, (low, high) = design.recommended.plan, design.range_of_sizes
-    found = [f"the recommended plan: {line}" for line in plan.notes if str(LEAST_TARGETS) not in line]
+    found = [f"the recommended plan: {line}" for line in plan.notes if str(planned.LEAST_TARGETS) not in line]
     if design.goal is not None and not design.recommended.reaches and np.isfinite(plan.high):
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
@@ -271,11 +262,11 @@ def notes(design: StudyDesign) -> list[str]:
         if not low <= each.plan.true_size <= high or each.curve.size_at(0.5) < low:
             found.append(f"with N = {each.frames} much of the guessed curve's rise lies outside the sizes")
     if not design.recommended.enough:
-        found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for")
+        found.append(f"no plan listed has the {planned.LEAST_TARGETS} targets that MIL-HDBK-1823A asks for")
     return [
         *found,
-        f"MIL-HDBK-1823A: {LEAST_TARGETS} independent targets at least for hits and misses, {LEAST_SIGNALS} where "
-        "signals are recorded (a-hat)",
+        f"MIL-HDBK-1823A: {planned.LEAST_TARGETS} independent targets at least for hits and misses, "
+        f"{planned.LEAST_SIGNALS} where signals are recorded (a-hat)",
         f"medians and quantiles of {plan.studies} simulated studies, bound by {plan.method}; the share that "
         f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
         "the plan is as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
@@ -307,7 +298,7 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
         said["hole_free"] = {name: value for name, value in vars(area).items() if name != "areas_m2"}
         said["hole_free"]["upper_bound"] = [
             {"false_calls": calls, "area_m2": size, "boards": area.boards(size)}
-            for calls, size in zip(CALLS, area.areas_m2, strict=True)
+            for calls, size in zip(planned.CALLS, area.areas_m2, strict=True)
         ]
     return dict(jsonable(said))
 

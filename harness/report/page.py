@@ -20,24 +20,8 @@ from harness.evaluation.summary import (
     noise_against_frames,
     summarise_holes,
 )
-from harness.report import sections
-from harness.report.blocks import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    INK,
-    MARKERS,
-    ORANGE,
-    PALE,
-    closing,
-    figure,
-    heading,
-    note,
-    page,
-    paragraph,
-    svg,
-)
+from harness.report import blocks, sections
+from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure, sights_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.view3d import write_view3d
@@ -70,9 +54,9 @@ def errors_figure(rows: pd.DataFrame) -> str:
             strict=True,
         ):
             reach = 0.006 * float(rows[f"true_{what}_mm"].max())
-            axes.axhspan(-RULER_MM, RULER_MM, color=PALE, label="±1/16 in")
-            axes.axhline(0, color=GREY, lw=1)
-            for side, measure, colour in ((-1, "extent", ORANGE), (1, "model", BLUE)):
+            axes.axhspan(-RULER_MM, RULER_MM, color=blocks.PALE, label="±1/16 in")
+            axes.axhline(0, color=blocks.GREY, lw=1)
+            for side, measure, colour in ((-1, "extent", blocks.ORANGE), (1, "model", blocks.BLUE)):
                 seen = rows[rows[f"{measure}_{of}_mm"].notna()]
                 x, std = seen[f"true_{what}_mm"] + side * reach, seen[f"{measure}_{what}_std_mm"].fillna(0)
                 mean = seen[f"{measure}_{of}_mm"]
@@ -82,7 +66,7 @@ def errors_figure(rows: pd.DataFrame) -> str:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     alt = "Error of the measured diameter and of the distance from the largest hole, with one standard deviation."
-    return svg("errors", (10, 4.2), alt, draw)
+    return blocks.svg("errors", (10, 4.2), alt, draw)
 
 
 def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
@@ -101,7 +85,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_title(many(n, "frame"))
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
 
-    return svg("limits", (10, 3.8), "Smallest diameter found by each set-up, in millimetres.", draw)
+    return blocks.svg("limits", (10, 3.8), "Smallest diameter found by each set-up, in millimetres.", draw)
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -113,15 +97,15 @@ def noise_figure(noise: pd.DataFrame) -> str:
         axes = figure.subplots()
         axes.plot(frames, noise["guide_mm"], color=GUIDE, lw=7, solid_capstyle="round", label="1/√N guide")
         for column, colour, marker, label in (
-            ("temporal_rms_mm", BLUE, "o", "temporal noise, rms"),
-            ("systematic_mm", ORANGE, "s", "systematic error (offset and pattern)"),
-            ("pattern_mm", GREEN, "v", "of it, pattern over pixels"),
-            ("total_rms_mm", INK, "D", "total error, rms"),
+            ("temporal_rms_mm", blocks.BLUE, "o", "temporal noise, rms"),
+            ("systematic_mm", blocks.ORANGE, "s", "systematic error (offset and pattern)"),
+            ("pattern_mm", blocks.GREEN, "v", "of it, pattern over pixels"),
+            ("total_rms_mm", blocks.INK, "D", "total error, rms"),
         ):
             values = noise[column].where(noise[column] > 0)
             axes.plot(frames, values, marker=marker, ms=5, lw=1.4, color=colour, label=label)
         if fit is not None and fit.floor_mm > 0:
-            axes.axhline(fit.floor_mm, color=INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {fit.floor_mm:.2f} mm")
+            axes.axhline(fit.floor_mm, color=blocks.INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {fit.floor_mm:.2f} mm")
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(frames, [f"{n:g}" for n in frames])
@@ -133,7 +117,7 @@ def noise_figure(noise: pd.DataFrame) -> str:
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
 
     alt = "Range error in millimetres against the number of averaged frames: noise falls, the systematic error stays."
-    return svg("noise", (10, 4.2), alt, draw)
+    return blocks.svg("noise", (10, 4.2), alt, draw)
 
 
 def cost_text(cost: SwitchCost) -> str:
@@ -153,27 +137,27 @@ def effects_figure(costs: Sequence[EffectCosts]) -> str:
         panels = figure.subplots(1, len(costs), squeeze=False, sharex=True, sharey=True)[0]
         for axes, at in zip(panels, costs, strict=True):
             for shift, colour, label, chosen in (
-                (-0.2, BLUE, "alone, against nothing on", [*(one.alone for one in at.effects), at.together]),
-                (0.2, ORANGE, "on top of all the others", [one.last for one in at.effects]),
+                (-0.2, blocks.BLUE, "alone, against nothing on", [*(one.alone for one in at.effects), at.together]),
+                (0.2, blocks.ORANGE, "on top of all the others", [one.last for one in at.effects]),
             ):
                 places = np.arange(len(chosen)) + shift
                 sizes = np.array([one.mm if np.isfinite(one.mm) else 0.0 for one in chosen])
                 ends = np.array([[one.interval.low, one.interval.high] for one in chosen])
                 errors = np.abs(np.where(np.isfinite(ends), ends, sizes[:, None]) - sizes[:, None]).T
-                axes.barh(places, sizes, 0.36, xerr=errors, color=colour, label=label, ecolor=INK, capsize=2)
+                axes.barh(places, sizes, 0.36, xerr=errors, color=colour, label=label, ecolor=blocks.INK, capsize=2)
                 for place, one in zip(places, chosen, strict=True):
                     if not np.isfinite(one.mm):
-                        axes.text(0, place, " off the ladder", va="center", fontsize=8, color=GREY)
+                        axes.text(0, place, " off the ladder", va="center", fontsize=8, color=blocks.GREY)
             axes.set_title(many(at.frames, "frame"))
             axes.set_xlabel("loss of the 50 % size (mm)")
-            axes.axvline(0, color=GREY, lw=1)
+            axes.axvline(0, color=blocks.GREY, lw=1)
             axes.grid(axis="y", visible=False)
         panels[0].set_yticks(range(len(names) + 1), [*names, "all together"])
         panels[0].invert_yaxis()
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
     alt = "Loss of the 50 per cent detectable diameter in millimetres to each effect, alone and on top of the others."
-    return svg("effects", (10, 0.42 * (len(names) + 1) + 1.6), alt, draw)
+    return blocks.svg("effects", (10, 0.42 * (len(names) + 1) + 1.6), alt, draw)
 
 
 CAMERA = (
@@ -215,20 +199,13 @@ class Layout:
         return Layout(rows, tuple(value_text(paths[-1], v) for v in values), last["name"] + unit, numbers)
 
 
-def set_ups_html(
-    tables: ResultTables,
-    examples: Sequence[ExampleCloud],
-    provenance: Mapping[str, Any],
-    experiment_yaml_text: str,
-    title: str,
-    with_claims: bool = False,
-) -> str:
-    """The page as text; the arguments are those of `harness.report.page.write_report`."""
+def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About) -> str:
+    """The page of several set-ups as text; see `write_report`."""
     axes = [str(path) for path in tables.axes["path"]]
     summary, variants = summarise_holes(tables.holes, axes), set_ups_of(tables)
     compared = compare_set_ups(tables, summary, variants)
     layout, costs, frames = Layout.of(tables), effect_costs(tables), sections.shown_frames(compared)
-    verdict = claim_c11(summary[summary["variant"].isin(variants)], axes) if with_claims else None
+    verdict = claim_c11(summary[summary["variant"].isin(variants)], axes) if about.with_claims else None
     middle = max(0, (len(layout.columns) - 1) // 2)
     clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
     sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}
@@ -238,9 +215,9 @@ def set_ups_html(
     if not costs and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
         figures["sights"] = sights_figure(sights)
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
-    body = [heading("Holes found"), sections.set_ups_grid(compared).html()]
+    body = [blocks.heading("Holes found"), sections.set_ups_grid(compared).html()]
     if "limits" in figures:
-        body.append(figure(figures, "limits", "The smallest diameter from which on every hole is found."))
+        body.append(blocks.figure(figures, "limits", "The smallest diameter from which on every hole is found."))
     body += _effects_section(costs)
     if "sights" in figures:
         at = f" at {layout.columns[middle]}" if layout.columns else ""
@@ -248,17 +225,17 @@ def set_ups_html(
             f"Distance behind (+) or before (−) the fitted surface{at}, most frames, first damaged repeat. Circle: the "
             "true rim. Dots: detected pixels. Grey: no valid point. Linear within ±1 mm, logarithmic beyond."
         )
-        body += [heading("The same hole, as each sees it"), figure(figures, "sights", caption)]
+        body += [blocks.heading("The same hole, as each sees it"), blocks.figure(figures, "sights", caption)]
     body += [
-        heading("Sizes and positions"),
-        paragraph(
+        blocks.heading("Sizes and positions"),
+        blocks.paragraph(
             "Over all single measurements of the holes found: mean error ± standard deviation (number), in mm. "
             "Positions are distances from the largest hole. A set-up that finds small holes is judged by them too."
         ),
         SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
-        heading("What each camera gives"),
+        blocks.heading("What each camera gives"),
         SET_UPS.grid(shown, only=CAMERA).html(),
-        note(CAMERA_NOTE),
+        blocks.note(CAMERA_NOTE),
         *sections.claims_section("The thesis' claim", [verdict] if verdict else []),
     ]
     everything = [str(name) for name in tables.variants["variant"]]
@@ -266,14 +243,14 @@ def set_ups_html(
     calls = false_calls(tables.runs)
     calls = calls[(calls["role"] == "damaged") & calls["variant"].isin(variants) & calls["frames"].isin(frames)]
     body += [
-        heading("Thresholds and false calls"),
-        note(sections.CALLS_NOTE),
+        blocks.heading("Thresholds and false calls"),
+        blocks.note(sections.CALLS_NOTE),
         FALSE_CALLS.grid(sections.records(calls)).html(),
     ]
-    body += closing(provenance, experiment_yaml_text, sections.left_out(tables.runs))
+    body += blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs))
     rule = "Each set-up has hole-free runs and a threshold of its own."
     under = sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule)
-    return page(title, set_ups_answer(compared, layout, costs, verdict), body, [under])
+    return blocks.page(about.title, set_ups_answer(compared, layout, costs, verdict), body, [under])
 
 
 def set_ups_answer(
@@ -316,12 +293,12 @@ def _effects_section(costs: Sequence[EffectCosts]) -> list[Markup]:
     ]
     rows.append(["all together", *(cell for each in costs for cell in (cost_text(each.together), "–"))])
     return [
-        heading("What each effect costs"),
-        paragraph(
+        blocks.heading("What each effect costs"),
+        blocks.paragraph(
             "The loss is the change of the 50 % size when an effect goes on: alone, and on top of all others. The same "
             "noise and holes stand behind both sides. Without noise the rounding of the output is the only error left."
         ),
-        figure(
+        blocks.figure(
             {"effects": effects_figure(costs)},
             "effects",
             "Error bars are 95 % bootstrap intervals over holes of one size and over repeats, paired.",
@@ -343,28 +320,21 @@ def write_report(
     of maps, with a page beside it for each map of ``examples`` that turns in the browser. ``provenance``: see
     `harness.report.blocks.closing`. Claims of the thesis are scored where the ``target`` is "thesis". The same input
     gives the same bytes. Raises UserError where the folder cannot be written."""
-    rest = provenance, experiment_yaml_text, title, target == "thesis"
+    about = sections.About(provenance, experiment_yaml_text, title, target == "thesis")
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
     if len(tables.registrations):
-        text = perspectives_html(tables, maps, *rest)
+        text = perspectives_html(tables, maps, about)
     else:
-        text = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, *rest)
+        text = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, about)
     for name, example in map_files(maps).items():
-        write_view3d(Path(folder) / name, example, map_text(example))
+        write_view3d(Path(folder) / name, example.scene, map_text(example))
     path = Path(folder) / REPORT.name
     write_text(path, text)
     return path
 
 
-def report_html(
-    tables: ResultTables,
-    examples: Sequence[ExampleCloud],
-    provenance: Mapping[str, Any],
-    experiment_yaml_text: str,
-    title: str,
-    with_claims: bool = False,
-) -> str:
+def report_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About) -> str:
     """The page of an experiment with one set-up as text; see `write_report`."""
     summary = summarise_holes(tables.holes)
     main = summary[summary["variant"] == MAIN]
@@ -378,38 +348,38 @@ def report_html(
         figures["residual"] = residual_figure(clouds)
     if len(noise) and (noise["temporal_rms_mm"] > 0).all():
         figures["noise"] = noise_figure(noise)
-    verdicts = score_claims(tables, MAIN, examples, summary) if with_claims else []
+    verdicts = score_claims(tables, MAIN, examples, summary) if about.with_claims else []
     calls = false_calls(tables.runs)
     variants = [MAIN, *(str(name) for name in tables.variants["variant"] if name != MAIN)]
     body = [
-        heading("Holes against frames"),
-        paragraph(
+        blocks.heading("Holes against frames"),
+        blocks.paragraph(
             "Detections of trials, with the 95 % Wilson interval of the rate beneath. The bluer, the more often the "
             "hole was detected."
         ),
         sections.holes_grid(summary).html(),
-        heading("Sizes and positions"),
-        figure(
+        blocks.heading("Sizes and positions"),
+        blocks.figure(
             figures,
             "errors",
             "With the most frames, over the trials that detected the hole: mean less truth ± one standard deviation. "
             "Extent: of the thresholded cluster. Model: a blurred hole fitted to the residuals.",
         ),
         SUMMARY.grid(sections.records(main[main["frames"] == main["frames"].max()])).html(),
-        note(
+        blocks.note(
             "Mean ± one standard deviation over the repeats, which share one fixed pattern: another unit of the camera "
             "differs by more. Depth: along the optical axis to the floor or to what stands behind the hole."
         ),
-        heading("Range residual"),
-        figure(
+        blocks.heading("Range residual"),
+        blocks.figure(
             figures,
             "residual",
             "Distance behind (+) or before (−) the fitted surface, linear within ±1 mm and logarithmic beyond. Magenta:"
             " pixels of findings. Rings: the true holes, dashed where not found. Grey: no valid point, or outside the "
             "crop. These are single clouds; the rates above are over all repeats.",
         ),
-        heading("Noise against frames"),
-        figure(
+        blocks.heading("Noise against frames"),
+        blocks.figure(
             figures,
             "noise",
             "Over the probe pixels of the undamaged face: the temporal noise is the scatter over repeats, "
@@ -423,13 +393,13 @@ def report_html(
             (*frames[:1], *frames[-1:]),
             of=MAIN,
         ),
-        heading("False calls"),
-        note(sections.CALLS_NOTE),
+        blocks.heading("False calls"),
+        blocks.note(sections.CALLS_NOTE),
         FALSE_CALLS.grid(sections.records(calls[calls["variant"] == MAIN]), heads={"set-up": ""}).html(),
-        *closing(provenance, experiment_yaml_text, sections.left_out(tables.runs)),
+        *blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs)),
     ]
     repeats = int(main["n"].max()) if len(main) else 0
-    return page(title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)])
+    return blocks.page(about.title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)])
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:

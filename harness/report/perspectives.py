@@ -3,55 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.maps import (
-    PARTS,
-    MapCase,
-    by_views,
-    compare_maps,
-    frames_text,
-    label_of,
-    map_cases,
-    maps_of,
-    trusted,
-)
+from harness.evaluation import maps
 from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.summary import summarise_holes
-from harness.report.blocks import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    closing,
-    figure,
-    folded,
-    heading,
-    links,
-    note,
-    page,
-    paragraph,
-    svg,
-)
+from harness.report import blocks, sections
 from harness.report.clouds import MappedExample
-from harness.report.sections import (
-    claims_section,
-    left_out,
-    records,
-    rule_note,
-    shown_frames,
-    varied_section,
-    ways_grid,
-)
-from harness.report.view3d import SEVERAL, VIEW_COLOURS
+from harness.report.view3d import KINDS, SEVERAL, VIEW_COLOURS
 from harness.tables.outputs import MAPS
 from harness.tables.text import many
 from harness.tables.trials import REGISTRATION_ERRORS, SET_UPS, ResultTables
@@ -76,22 +39,15 @@ MAPS_NOTE = (
 )
 
 
-def perspectives_html(
-    tables: ResultTables,
-    examples: Sequence[MappedExample],
-    provenance: Mapping[str, Any],
-    experiment_yaml_text: str,
-    title: str,
-    with_claims: bool = False,
-) -> str:
-    """The page as text; the arguments are those of `harness.report.page.write_report`."""
+def perspectives_html(tables: ResultTables, examples: Sequence[MappedExample], about: sections.About) -> str:
+    """The page as text; see `harness.report.page.write_report`."""
     summary = summarise_holes(tables.holes, [str(path) for path in tables.axes["path"]])
-    compared, cases = compare_maps(tables, summary), map_cases(tables, summary)
-    verdicts = score_views(cases) if with_claims else []
+    compared, cases = maps.compare_maps(tables, summary), maps.map_cases(tables, summary)
+    verdicts = score_views(cases) if about.with_claims else []
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     own = tables.registrations[tables.registrations["variant"].isin(set_ups_of(tables))]
-    errors = by_views(own, sorted({one.views for one in maps_of(tables)}))
-    frames = shown_frames(set_ups)[::-1]
+    errors = maps.by_views(own, sorted({one.views for one in maps.maps_of(tables)}))
+    frames = sections.shown_frames(set_ups)[::-1]
     several = [example for example in _in_order(examples) if example.views > 1]
     figures: dict[str, str] = {}
     if len(own):
@@ -99,31 +55,34 @@ def perspectives_html(
     if several:
         figures["merged"] = merged_figure(several[:MOST_CLOUDS])
     body = [
-        *claims_section("The thesis' claims and its proposal", verdicts),
-        heading("Holes found"),
-        paragraph("By the least and the most frames a view; +: undecided."),
-        ways_grid(compared).html(),
-        heading("Registration error"),
-        paragraph(
+        *sections.claims_section("The thesis' claims and its proposal", verdicts),
+        blocks.heading("Holes found"),
+        blocks.paragraph("By the least and the most frames a view; +: undecided."),
+        sections.ways_grid(compared).html(),
+        blocks.heading("Registration error"),
+        blocks.paragraph(
             "The target registration error: how far places on the board lie from where they should, root mean square "
             "over the board, against the truth. What a camera that ranges too far displaces counts, though it does not "
             "blur the map. A registration that failed is found out without the truth, its view left out of the map."
         ),
-        figure(
+        blocks.figure(
             figures,
             "tre",
             "Each registration of a view to the first. The prediction is what the method's own covariance says: noise, "
             "no error that a whole view shares.",
         ),
-        *folded(
-            [(frames_text(n), REGISTRATION_ERRORS.grid(records(errors[errors["frames"] == n])).html()) for n in frames]
+        *blocks.folded(
+            [
+                (maps.frames_text(n), REGISTRATION_ERRORS.grid(sections.records(errors[errors["frames"] == n])).html())
+                for n in frames
+            ]
         ),
-        note(
+        blocks.note(
             "Errors in mm of those that did not fail, both boards. Ratio: actual over predicted, above 1 too sure of "
             "itself, bootstrap over repeats. Before: median error of the nominal pose."
         ),
-        heading("Merged clouds"),
-        figure(
+        blocks.heading("Merged clouds"),
+        blocks.figure(
             figures,
             "merged",
             "Points from the front, thinned out, in the colour of their view. Rings: the true holes, dashed where this "
@@ -131,29 +90,32 @@ def perspectives_html(
         ),
     ]
     if files := map_files(examples):
-        targets = links((map_text(example), name) for name, example in files.items())
-        body.append(paragraph("The same maps, to turn with the mouse: ", targets))
+        targets = blocks.links((map_text(example), name) for name, example in files.items())
+        body.append(blocks.paragraph("The same maps, to turn with the mouse: ", targets))
     body += [
-        heading("What each map gives"),
-        *folded(
+        blocks.heading("What each map gives"),
+        *blocks.folded(
             [
-                (frames_text(n), SET_UPS.grid(records(set_ups[set_ups["frames"] == n]), only=MAPS_SHOWN).html())
+                (
+                    maps.frames_text(n),
+                    SET_UPS.grid(sections.records(set_ups[set_ups["frames"] == n]), only=MAPS_SHOWN).html(),
+                )
                 for n in frames
             ]
         ),
-        note(MAPS_NOTE),
-        *varied_section(tables, compared),
-        *closing(provenance, experiment_yaml_text, left_out(tables.runs)),
+        blocks.note(MAPS_NOTE),
+        *sections.varied_section(tables, compared),
+        *blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs)),
     ]
-    under = rule_note(
+    under = sections.rule_note(
         int(set_ups["repeats"].max()) if len(set_ups) else 0,
         "Each set-up has hole-free runs and a threshold of its own. The same frames feed every set-up; repeats vary "
         "the error of the nominal poses too. Of a single view all ways of registering are the same.",
     )
-    return page(title, answer_sentence(cases, verdicts), body, [under])
+    return blocks.page(about.title, answer_sentence(cases, verdicts), body, [under])
 
 
-def answer_sentence(cases: Sequence[MapCase], verdicts: Sequence[Verdict] = ()) -> str:
+def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
     """Say what the experiment found: the holes found with one view, and with the most views by the way that finds most;
     with verdicts those, too."""
     said = []
@@ -166,13 +128,13 @@ def answer_sentence(cases: Sequence[MapCase], verdicts: Sequence[Verdict] = ()) 
         ways.sort(key=lambda way: (-way[0].views, -way[1].count("found")))
         counts: list[str] = []
         for way, states in [("one view finds", list(case.status(alone).values()))] + [
-            (f"{one.views} views ({label_of(method_text(one.registration), one.merge)})", states)
+            (f"{one.views} views ({maps.label_of(method_text(one.registration), one.merge)})", states)
             for one, states in ways[:1]
         ]:
             open_ = f" ({states.count('undecided')} undecided)" if "undecided" in states else ""
             counts.append(f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}")
         where = f"{case.place}: " if len(cases) > 1 else ""
-        said.append(f"{where}With {frames_text(alone.frames)} {', '.join(counts)}.")
+        said.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
     if not said:
         return "No trial of any set-up finished, so there is no answer."
     if verdicts:
@@ -196,9 +158,12 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
 
 def map_text(example: MappedExample) -> str:
     """One map in words."""
-    way = ", ".join(part for part in (method_text(example.registration), example.merge) if part)
     variation = f": {example.variant}" if example.is_variation else ""
-    return f"{many(example.views, 'view')} ({way}), {frames_text(example.frames)}{variation}"
+    return f"{many(example.views, 'view')} ({_way(example)}), {maps.frames_text(example.frames)}{variation}"
+
+
+def _way(example: MappedExample) -> str:
+    return ", ".join(part for part in (method_text(example.registration), example.merge) if part)
 
 
 def _in_order(examples: Sequence[MappedExample]) -> list[MappedExample]:
@@ -206,7 +171,14 @@ def _in_order(examples: Sequence[MappedExample]) -> list[MappedExample]:
     return sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant))
 
 
-METHOD_COLOURS = {"nominal": GREY, "icp": ORANGE, "cpd": BLUE, "marks": GREEN, "joint": RED, "odometry": PURPLE}
+METHOD_COLOURS = {
+    "nominal": blocks.GREY,
+    "icp": blocks.ORANGE,
+    "cpd": blocks.BLUE,
+    "marks": blocks.GREEN,
+    "joint": blocks.RED,
+    "odometry": blocks.PURPLE,
+}
 PART_NAMES = {"in_plane": "in the plane of the board", "across": "across it"}
 
 
@@ -220,25 +192,25 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
     methods = list(dict.fromkeys(registrations["method"]))
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, len(PARTS), sharey=True)
-        for axes, part in zip(panels, PARTS, strict=True):
+        panels = figure.subplots(1, len(maps.PARTS), sharey=True)
+        for axes, part in zip(panels, maps.PARTS, strict=True):
             for place, method in enumerate(methods):
                 for side, n in enumerate(frames):
                     rows = registrations[(registrations["method"] == method) & (registrations["frames"] == n)]
                     x = place + 0.36 * (side - (len(frames) - 1) / 2)
-                    good, bad = trusted(rows), rows[rows["failure"] != ""]
-                    colour = METHOD_COLOURS.get(method, SKY)
-                    for chosen, marker, shade, size in ((good, "o", colour, 2.2), (bad, "x", INK, 4)):
+                    good, bad = maps.trusted(rows), rows[rows["failure"] != ""]
+                    colour = METHOD_COLOURS.get(method, blocks.SKY)
+                    for chosen, marker, shade, size in ((good, "o", colour, 2.2), (bad, "x", blocks.INK, 4)):
                         values = chosen[f"tre_{part}_mm"].to_numpy(float)
                         values = values[np.isfinite(values) & (values > 0)]
                         # spread evenly by rank, so that the picture is always the same
                         spread = x + 0.26 * (np.modf(np.arange(len(values)) * 0.6180339887)[0] - 0.5)
                         axes.plot(spread, values, ls="none", marker=marker, ms=size, color=shade, alpha=0.45)
                     median = good[f"tre_{part}_mm"].median()
-                    axes.plot([x - 0.16, x + 0.16], [median] * 2, color=INK, lw=2, solid_capstyle="butt")
+                    axes.plot([x - 0.16, x + 0.16], [median] * 2, color=blocks.INK, lw=2, solid_capstyle="butt")
                     predicted = np.sqrt((good[f"predicted_{part}_mm"].dropna() ** 2).mean())
                     if predicted > 0:
-                        axes.plot([x], [predicted], marker="D", ms=6, mfc="white", mec=INK, mew=1.2, ls="none")
+                        axes.plot([x], [predicted], marker="D", ms=6, mfc="white", mec=blocks.INK, mew=1.2, ls="none")
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
             axes.set_xticks(range(len(methods)), [method_text(method) for method in methods])
@@ -248,14 +220,16 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
             heads = " and ".join(many(n, "frame") for n in frames)
             axes.set_xlabel(f"method ({heads}, left to right)", loc="left")
         panels[0].set_ylabel("target registration error (mm)")
-        panels[-1].plot([], [], "o", ms=4, color=GREY, label="one registration")
-        panels[-1].plot([], [], color=INK, lw=2, label="median")
-        panels[-1].plot([], [], marker="D", ms=6, mfc="white", mec=INK, mew=1.2, ls="none", label="predicted, rms")
-        panels[-1].plot([], [], "x", ms=5, color=INK, label="failed, not merged")
+        panels[-1].plot([], [], "o", ms=4, color=blocks.GREY, label="one registration")
+        panels[-1].plot([], [], color=blocks.INK, lw=2, label="median")
+        panels[-1].plot(
+            [], [], marker="D", ms=6, mfc="white", mec=blocks.INK, mew=1.2, ls="none", label="predicted, rms"
+        )
+        panels[-1].plot([], [], "x", ms=5, color=blocks.INK, label="failed, not merged")
         figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
     alt = "Target registration error of every registration in millimetres by method, in the plane and across it."
-    return svg("tre", (10, 4.4), alt, draw)
+    return blocks.svg("tre", (10, 4.4), alt, draw)
 
 
 def merged_figure(examples: Sequence[MappedExample]) -> str:
@@ -265,24 +239,24 @@ def merged_figure(examples: Sequence[MappedExample]) -> str:
         panels = figure.subplots(len(examples), 1, squeeze=False, sharex=True)[:, 0]
         turn = np.linspace(0, 2 * np.pi, 49)
         for axes, example in zip(panels, examples, strict=True):
+            view_of, (x, y, _) = np.asarray(example.scene.view_of), example.scene.points_mm.T
             palette = np.array([*(VIEW_COLOURS[n % len(VIEW_COLOURS)] for n in range(example.views)), SEVERAL])
-            chosen = np.where(example.view_of < 0, example.views, np.minimum(example.view_of, example.views))
-            x, y = example.points_mm[:, 0], example.points_mm[:, 1]
+            chosen = np.where(view_of < 0, example.views, np.minimum(view_of, example.views))
             axes.scatter(x, y, s=1.1, c=palette[chosen], lw=0, rasterized=True)
-            for hole in example.holes:
+            of_kind = {kind: [one for one in example.scene.circles if one.kind == kind] for kind in KINDS}
+            for hole in of_kind["found"] + of_kind["missed"]:
                 radius = max(hole.diameter_mm / 2, 2.5)
-                style = "-" if hole.found else (0, (2, 1.5))
-                ring = hole.x_mm + radius * np.cos(turn), hole.y_mm + radius * np.sin(turn)
-                axes.plot(*ring, color=INK, lw=1.1, ls=style)
-            false = [one for one in example.findings if not one.hole]
-            axes.plot([one.x_mm for one in false], [one.y_mm for one in false], "x", ms=7, mew=1.6, color="#e0201b")
+                style = "-" if hole.kind == "found" else (0, (2, 1.5))
+                ring = hole.centre_mm[0] + radius * np.cos(turn), hole.centre_mm[1] + radius * np.sin(turn)
+                axes.plot(*ring, color=blocks.INK, lw=1.1, ls=style)
+            for false in of_kind["false call"]:
+                axes.plot(*false.centre_mm[:2], "x", ms=7, mew=1.6, color=KINDS[false.kind][1])
             axes.set_aspect("equal")
             axes.set_ylabel("y (mm)")
             axes.grid(visible=False)
-            found = sum(hole.found for hole in example.holes)
-            way = ", ".join(part for part in (method_text(example.registration), example.merge) if part)
-            said = f"{many(example.views, 'view')} ({way}), {many(example.frames, 'frame')} each"
-            axes.set_title(f"{said}: {found} of {len(example.holes)} holes found in this repeat")
+            said = f"{many(example.views, 'view')} ({_way(example)}), {many(example.frames, 'frame')} each"
+            found, holes = len(of_kind["found"]), len(of_kind["found"] + of_kind["missed"])
+            axes.set_title(f"{said}: {found} of {holes} holes found in this repeat")
         panels[-1].set_xlabel("x along the face (mm)")
         most = max(example.views for example in examples)
         for view, colour in enumerate(VIEW_COLOURS[:most]):
@@ -292,4 +266,4 @@ def merged_figure(examples: Sequence[MappedExample]) -> str:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(most + 1, 6))
 
     alt = "Front view of merged clouds, each point in the colour of the view that it came from."
-    return svg("merged", (10, 2.35 * len(examples) + 0.7), alt, draw)
+    return blocks.svg("merged", (10, 2.35 * len(examples) + 0.7), alt, draw)

@@ -20,6 +20,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Row = Mapping[str, Any]
+
+
+class About(NamedTuple):
+    """Title and origin of a report: ``provenance`` as of `harness.report.blocks.closing`, and the resolved experiment.
+    ``with_claims``: whether the target is the thesis' own."""
+
+    provenance: Mapping[str, Any]
+    experiment_yaml_text: str
+    title: str
+    with_claims: bool = False
+
+
 RULES_NOTE = (
     "Each criterion is written in the program and is the same for every run. Where the data leave room for both "
     "answers, the claim is undecided."
@@ -159,9 +171,9 @@ def final_tables(tables: ResultTables) -> list[str | Grid]:
     return [holes_grid(summary, terminal=True)]
 
 
-def holes_grid(summary: pd.DataFrame, variant: str = MAIN, *, terminal: bool = False) -> Grid:
-    """Return detections of trials for each hole and number of frames, with intervals on a page, sizes at a terminal."""
-    summary = summary[summary["variant"] == variant]
+def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
+    """Show the main set-up's detections of trials by hole and frames: with intervals on a page, sizes at a terminal."""
+    summary = summary[summary["variant"] == MAIN]
     frames = sorted(int(n) for n in summary["frames"].unique())
 
     def detected(row: Row) -> Cell:

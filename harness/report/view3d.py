@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.report.blocks import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, template
-from harness.report.clouds import FindingSeen, HoleSeen, MappedExample
 from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
@@ -32,7 +31,8 @@ KINDS: dict[Kind, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A true hole ("found", "missed") or a finding: ``centre_mm`` (3,), unit ``normal`` (3,), in the cloud's frame."""
+    """A true hole ("found", "missed" in this repeat) or a finding (by the thesis' measure): ``centre_mm`` (3,), unit
+    ``normal`` (3,), in the cloud's frame."""
 
     centre_mm: np.ndarray
     normal: np.ndarray
@@ -58,37 +58,11 @@ class Scene3d:
     facts: tuple[tuple[str, str], ...] = ()
 
 
-def scene_of(example: MappedExample) -> Scene3d:
-    """The scene of a merged cloud of the report, with the truth."""
-    circles: list[tuple[HoleSeen | FindingSeen, str, Kind]] = []
-    circles += [(hole, hole.hole, "found" if hole.found else "missed") for hole in example.holes]
-    circles += [(one, f"{one.diameter_mm:.1f}", "finding" if one.hole else "false call") for one in example.findings]
-    normal = np.array([0.0, 0.0, 1.0])
-    return Scene3d(
-        points_mm=example.points_mm,
-        frame="board",
-        rgb=example.rgb,
-        residual_mm=example.residual_mm,
-        view_of=example.view_of,
-        view_names=example.view_names or tuple(f"view {n + 1}" for n in range(example.views)),
-        detected=example.detected,
-        circles=tuple(
-            Circle3d(np.array([of.x_mm, of.y_mm, 0.0]), normal, of.diameter_mm, label, kind)
-            for of, label, kind in circles
-        ),
-        facts=(
-            ("views", f"{example.views} ({example.registration}, {example.merge})"),
-            ("frames a view", str(example.frames)),
-            ("holes found", f"{sum(h.found for h in example.holes)} of {len(example.holes)}"),
-        ),
-    )
-
-
-def write_view3d(path: Path, shown: Scene3d | MappedExample, title: str) -> Path:
+def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:
     """Write one self-contained page that shows the cloud (by WebGL 1) and return its path. Of more than `MOST_POINTS`
     points all detected ones and a sample of the others are kept. Raises UserError where the file cannot be written,
     ValueError where no point is finite."""
-    write_text(Path(path), view3d_html(scene_of(shown) if isinstance(shown, MappedExample) else shown, title))
+    write_text(Path(path), view3d_html(scene, title))
     return Path(path)
 
 

@@ -291,20 +291,6 @@ def _edge_rows(captured: Captured, crossings: np.ndarray, axis: int, pair: tuple
     ]
 
 
-METHOD = (
-    "{frames} frames of a static scene. The planes in it were found, fitted and simulated in closed form, as many "
-    "frames as were captured, with the capture's lens and an albedo of {albedo:g} for all surfaces; one analysis is "
-    "applied to both. Nothing is fitted to make them agree. Not simulated: what is not flat, light that met more than "
-    "one surface, the surfaces' relief and texture. Pixels within 3 px of a plane's rim, and pixels without a range in "
-    "any frame, are left out."
-)
-CAPTION = (
-    "The planes that were found, coloured over the median depth (nearer is lighter). Temporal deviations are rms over "
-    "pixels in bins of 0.1 m, with 95 % intervals of a jackknife over frames; each frame's mean is off correlations."
-)
-NO_EDGE = "No straight edge of one plane before another, at least 30 lines of pixels long and 20 mm high, was found."
-
-
 def run_capture(options: argparse.Namespace, command: str) -> int:
     """Compare, print, write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError for what cannot
     be read or simulated: too few frames, another size, no plane, no lens."""
@@ -335,12 +321,11 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         name=captured.name,
         camera=twin.camera.title,
         answer=answer if ratios else "The simulation sees none of the planes of this capture.",
-        method=METHOD.format(frames=len(captured.z_m), albedo=twin.albedo),
+        frames=len(captured.z_m),
+        albedo=f"{twin.albedo:g}",
         figure=svg("capture", (6.0, 4.2), "Planes found", lambda figure: _draw(figure, captured)),
-        caption=CAPTION,
         numbers=BESIDE.grid(rows).html() if rows else "",
         edges=any("edge" in row.where for row in rows),
-        no_edge=NO_EDGE,
         provenance=[(key, plain(value)) for key, value in provenance.items()],
     )
     write_table(options.out, BESIDE, BESIDE.frame(rows))

@@ -7,7 +7,9 @@ parameter of the experiment, and none is chosen to make a claim come out.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -17,6 +19,7 @@ from harness.evaluation.maps import MANY, span
 from harness.evaluation.profile import hole_shapes
 from harness.evaluation.summary import MAIN, found_holes, hole_list, noise_law, summarise_holes, with_columns
 from harness.tables.trials import ResultTables
+from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:
@@ -41,11 +44,26 @@ class Verdict:
 Rules = dict[str, Callable[[Any], Verdict]]
 
 
-def rule_of(rules: Rules, claim: str, text: str, rule: str) -> Callable[[Callable[[Any], tuple[Answer, str]]], None]:
+@lru_cache
+def declared() -> dict[str, dict[str, str]]:
+    """Claims and their criteria by name, as claims.yaml declares them."""
+    claims: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("claims.yaml")).data
+    return claims
+
+
+def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
+    """The verdict on a claim of claims.yaml."""
+    said = declared()[claim]
+    limits = {"MANY": MANY, "RULER_MM": RULER_MM, "SLOPE_MARGIN": SLOPE_MARGIN}
+    limits |= {"UNCHANGED": UNCHANGED, "FEWEST_RANKED": FEWEST_RANKED}
+    return Verdict(claim, said["says"], answer, evidence, said["criterion"].format_map(limits))
+
+
+def rule_of(rules: Rules, claim: str) -> Callable[[Callable[[Any], tuple[Answer, str]]], None]:
     """Enter a function from a case to (answer, evidence) among ``rules``, as one from a case to a verdict."""
 
     def enter(judge: Callable[[Any], tuple[Answer, str]]) -> None:
-        rules[claim] = lambda case: Verdict(claim, text, *judge(case), rule)
+        rules[claim] = lambda case: verdict_of(claim, *judge(case))
 
     return enter
 
@@ -61,13 +79,6 @@ def decide(parts: Iterable[bool | None]) -> Answer:
 def is_above_zero(interval: Interval) -> bool | None:
     """Return whether a difference is surely above zero; None where its interval has room for both."""
     return True if interval.above(0) else (False if interval.high <= 0 else None)
-
-
-def claims_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
-    """The table of claims.csv: one row for each verdict with the fields of `Verdict`."""
-    import pandas as pd
-
-    return pd.DataFrame([asdict(verdict) for verdict in verdicts], columns=[one.name for one in fields(Verdict)])
 
 
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
@@ -101,23 +112,12 @@ class Case:
 RULES: Rules = {}
 
 
-@rule_of(
-    RULES,
-    "C1",
-    "With 50 averaged frames the holes of 1/4 in and larger (4 to 11) are found.",
-    "Borne out when, with 50 frames, holes 4 to 11 are found and 1 to 3 missed; one hole on the wrong side refutes.",
-)
+@rule_of(RULES, "C1")
 def _c1(case: Case) -> tuple[Answer, str]:
     return _exact_set(case, MANY, FOUND_WITH_MANY)
 
 
-@rule_of(
-    RULES,
-    "C2",
-    "A single frame finds holes 5 to 11 only: its noise forces a higher threshold.",
-    "Borne out when, with 1 frame, holes 5 to 11 are found and 1 to 4 missed, and the calibrated threshold in mm "
-    "(k times scale) is higher than with 50 frames (95 % Welch interval of the difference above 0).",
-)
+@rule_of(RULES, "C2")
 def _c2(case: Case) -> tuple[Answer, str]:
     answer, evidence = _exact_set(case, FEW, FOUND_WITH_FEW)
     set_agrees = {"borne out": True, "not borne out": False, "undecided": None}[answer]
@@ -131,14 +131,7 @@ def _c2(case: Case) -> tuple[Answer, str]:
     return decide([set_agrees, is_above_zero(interval)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
 
 
-@rule_of(
-    RULES,
-    "C3",
-    "From one viewpoint, each hole's mean size lies within one standard deviation of its true size.",
-    "Judged by the thesis' measure on each hole found with 50 frames: |mean - true| <= 1 standard deviation over "
-    "the repeats. Borne out when every hole's 95 % interval of (mean - true)/std lies within -1 to 1; refuted when "
-    "one hole's lies outside.",
-)
+@rule_of(RULES, "C3")
 def _c3(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     if rows.empty:
@@ -158,14 +151,7 @@ def _c3(case: Case) -> tuple[Answer, str]:
     return decide(parts), evidence
 
 
-@rule_of(
-    RULES,
-    "C4",
-    "The error of the measured size grows as the hole shrinks.",
-    "Spearman's rank correlation between the true diameter and |mean size - true size| (thesis' measure) over the "
-    "holes found with 50 frames. Borne out when it is negative with a one-sided permutation p below 0.05; refuted "
-    f"when it is zero or positive; undecided between, or with fewer than {FEWEST_RANKED} holes.",
-)
+@rule_of(RULES, "C4")
 def _c4(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[rows["extent_bias_mm"].notna()]
@@ -181,15 +167,7 @@ def _c4(case: Case) -> tuple[Answer, str]:
     return ("not borne out" if not rho < 0 else "borne out" if p < 0.05 else "undecided"), evidence
 
 
-@rule_of(
-    RULES,
-    "C5",
-    "Mean positions agree with the ruler, and scatter clearly more than the sizes.",
-    "Over the holes found with 50 frames but the reference hole (thesis' measure): every |mean - true| position is "
-    f"at most 1 standard deviation or one ruler graduation (1/16 in = {RULER_MM:.2f} mm), and the median over "
-    "holes of var(position)/var(size) is above 1 with its 95 % bootstrap interval over repeats; refuted when a "
-    "hole disagrees or the interval lies below 1.",
-)
+@rule_of(RULES, "C5")
 def _c5(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
@@ -210,15 +188,7 @@ def _c5(case: Case) -> tuple[Answer, str]:
     return decide([bool(agrees.all()), larger]), evidence
 
 
-@rule_of(
-    RULES,
-    "C6",
-    "A cylindrical hole looks nearly hemispherical in the averaged cloud.",
-    "On the 50-frame cloud, a flat floor and a hemisphere scaled in depth (one free number each) are fitted to the "
-    "pixels inside the outline of every hole with at least 12 valid pixels. A shape fits clearly better when its "
-    "rms misfit is at most 0.8 of the other's. Borne out when most holes look like bowls and none like a cylinder; "
-    "refuted when most look like cylinders and none like a bowl.",
-)
+@rule_of(RULES, "C6")
 def _c6(case: Case) -> tuple[Answer, str]:
     clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
     shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
@@ -245,15 +215,7 @@ def _c6(case: Case) -> tuple[Answer, str]:
     return answer, evidence
 
 
-@rule_of(
-    RULES,
-    "C9",
-    "Averaging lowers the noise but not the systematic error.",
-    f"Borne out when the exponent of the temporal noise against the number of frames is -0.5 within {SLOPE_MARGIN} "
-    f"(whole 95 % interval) and the systematic error of the longest average is above {UNCHANGED} of the shortest's "
-    "(whole 95 % interval, bootstrap over blocks of pixels); refuted when either interval lies wholly on the "
-    "other side.",
-)
+@rule_of(RULES, "C9")
 def _c9(case: Case) -> tuple[Answer, str]:
     law = noise_law(case.probes, case.variant)
     if law is None:
@@ -360,13 +322,6 @@ def _exact_set(case: Case, frames: int, expected: frozenset[str]) -> tuple[Answe
 CAMERA = "source.camera.name"
 BEST = "azure_kinect_nfov"
 OTHERS = ("kinect_v2", "realsense_l515")
-TEXT = "Of the three cameras, Azure Kinect resolves damage best."
-RULE = (
-    f"At each place (distance) the holes found with {MANY} frames are counted; undecided holes leave room for either "
-    "count. Azure Kinect is ahead of another camera where it finds more whatever becomes of the undecided holes, and "
-    "behind where it finds fewer. Borne out when it is ahead of each other camera at one place at least and behind at "
-    "none; refuted when it is behind at any place, or surely ahead of some camera at none."
-)
 
 
 def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
@@ -375,7 +330,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
         return None
     rows = summary[summary["frames"] == MANY]
     if rows.empty:
-        return Verdict("C11", TEXT, "undecided", f"Not judged: no trial has {MANY} frames.", RULE)
+        return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
     others = [path for path in axes if path != CAMERA]
     found = {
         " and ".join(map(value_text, others, values)) or "its one place": {
@@ -402,7 +357,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
         answers.append(answer if judged else None)
         said = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
         evidence += [f"Against {camera}: {said}."] if judged else []
-    return Verdict("C11", TEXT, decide(answers), " ".join(evidence), RULE)
+    return verdict_of("C11", decide(answers), " ".join(evidence))
 
 
 def _bounds(status: pd.Series) -> tuple[int, int]:

@@ -11,25 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from harness.evaluation import intervals
-from harness.evaluation.maps import (
-    FEWEST_BOTH,
-    THESIS_MERGE,
-    THESIS_REGISTRATION,
-    Map,
-    MapCase,
-    against_one,
-    change_text,
-    frames_text,
-    of_map,
-    paired_ratio,
-    per_unit,
-    ratio_text,
-    run_ratio,
-    size_errors,
-    span,
-    trusted,
-)
+from harness.evaluation import intervals, maps
 from harness.evaluation.summary import hole_list
 from harness.tables.text import many
 from harness.thesis.claims import Answer, Rules, Verdict, decide, is_above_zero, rule_of
@@ -47,7 +29,7 @@ RESPECTS = ("holes", "size", "noise")
 VIEW_CLAIMS: Rules = {}
 
 
-def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
+def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
     """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
     verdicts = [(case, rule(case)) for rule in VIEW_CLAIMS.values() for case in cases]
     if len(cases) == 1:
@@ -55,47 +37,38 @@ def score_views(cases: Sequence[MapCase]) -> list[Verdict]:
     return [replace(verdict, evidence=f"{case.place}: {verdict.evidence}") for case, verdict in verdicts]
 
 
-@rule_of(
-    VIEW_CLAIMS,
-    "C7",
-    "ICP and CPD both bring the fiducials of two views into one plane; CPD aligns them better within it.",
-    "Judged on the registration of the second view to the first with 50 frames (else the most). A method brings the "
-    "fiducials into one plane when its median target registration error across the board is at most the noise of a "
-    "single cloud's fitted surface (95 % bootstrap interval over repeats wholly at or below it; wholly above refutes), "
-    "and does not where most of its registrations failed. CPD aligns better when its error in the plane, over ICP's in "
-    "the same repeat, has a geometric mean below 1 (95 % Student interval of the logarithm); above 1 refutes.",
-)
-def _c7(case: MapCase) -> tuple[Answer, str]:
+@rule_of(VIEW_CLAIMS, "C7")
+def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     alone = case.single()
     if alone is None:
         return "undecided", "Not judged: no single view stands beside the registrations."
     rows = case.registrations(alone.frames)
-    pairs = {method: of_map(rows, method, 2) for method in dict.fromkeys(rows["method"])}
+    pairs = {method: maps.of_map(rows, method, 2) for method in dict.fromkeys(rows["method"])}
     if not {"icp", "cpd"} <= set(pairs):
         return "undecided", "Not judged: ICP and CPD were not both tried."
     runs = case.runs(alone)
     noise_mm = float(runs["surface_noise_mm"][runs["role"] == "damaged"].median())
     planes = [_is_in_one_plane(pairs[method], noise_mm) for method in ("icp", "cpd")]
-    ratio, low, high, n = paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
+    ratio, low, high, n = maps.paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
     better = True if high < 1 else (False if low >= 1 else None)
     said = []
     for method, part in pairs.items():
-        good = trusted(part)
+        good = maps.trusted(part)
         plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
         said.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
     evidence = (
-        f"With {frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
+        f"With {maps.frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
         f"{'; '.join(said)}. A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} "
-        f"times the error of ICP ({span(intervals.Interval(low, high))}, {n} pairs)."
+        f"times the error of ICP ({maps.span(intervals.Interval(low, high))}, {n} pairs)."
     )
     return decide([*planes, better]), evidence
 
 
 def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     """Return whether a method's error across the board is at most the noise of a surface."""
-    if intervals.wilson(len(rows) - len(trusted(rows)), len(rows))[0] > 0.5:
+    if intervals.wilson(len(rows) - len(maps.trusted(rows)), len(rows))[0] > 0.5:
         return False
-    across = per_unit(rows, "tre_across_mm").to_numpy(float)
+    across = maps.per_unit(rows, "tre_across_mm").to_numpy(float)
     if not len(across):
         return None
     interval = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
@@ -104,63 +77,45 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     return False if interval.above(noise_mm) else None
 
 
-@rule_of(
-    VIEW_CLAIMS,
-    "C8",
-    "Two merged views size holes of 3/8 in and larger better than one view and smaller ones worse; merging raises the "
-    "threshold.",
-    "By the thesis' measure, with its registration (CPD) and merging (grid), with 50 frames (else the most), paired by "
-    "repeat: the mean of |size error| over the holes of 3/8 in and larger falls, over the smaller holes it grows, and "
-    "the calibrated threshold in mm is higher (95 % Student intervals over repeats). A hole is compared where both "
-    "measure it twice at least; where no smaller hole is compared, the second part holds if one view finds a hole that "
-    "two views miss. One part on the wrong side refutes.",
-)
-def _c8(case: MapCase) -> tuple[Answer, str]:
-    found = against_one(case, THESIS_REGISTRATION, THESIS_MERGE)
+@rule_of(VIEW_CLAIMS, "C8")
+def _c8(case: maps.MapCase) -> tuple[Answer, str]:
+    found = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if found is None:
         why = "one and two views, registered by CPD and merged on the grid, were not both finished"
         return "undecided", f"Not judged: {why}."
     small = True if not found.small.n and found.lost else found.small.is_above
     parts = [
-        f"With {frames_text(found.frames)}, two views less one, |size error| of holes from 3/8 in on "
-        f"{change_text(found.large)}, of smaller ones {change_text(found.small)}.",
-        f"Threshold {change_text(found.threshold)}, surface noise {ratio_text(found.noise)}.",
+        f"With {maps.frames_text(found.frames)}, two views less one, |size error| of holes from 3/8 in on "
+        f"{maps.change_text(found.large)}, of smaller ones {maps.change_text(found.small)}.",
+        f"Threshold {maps.change_text(found.threshold)}, surface noise {maps.ratio_text(found.noise)}.",
     ]
     parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
     parts += [f"Found by two views only: {hole_list(found.gained)}."] if found.gained else []
     return decide([found.large.is_below, small, found.threshold.is_above]), " ".join(parts)
 
 
-@rule_of(
-    VIEW_CLAIMS,
-    "C10",
-    "A SLAM map is noisier and less precise than the single cloud and the merge of two views.",
-    "The map by odometry and volume (as a variation where there is one, with the most views and frames that it has) is "
-    "held against one view and against two merged as the thesis did, both with 50 frames (else the most). Borne out "
-    "when, against both, the noise of its fitted surface is higher (95 % Welch interval) and the root mean square "
-    "errors of size and of position (distance from the largest hole; thesis' measure) over the holes that all three "
-    "measure are larger (95 % bootstrap intervals over repeats). Where it finds no hole and the others do, its "
-    "precision counts as worse. One comparison on the wrong side refutes.",
-)
-def _c10(case: MapCase) -> tuple[Answer, str]:
+@rule_of(VIEW_CLAIMS, "C10")
+def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
     chosen.sort(key=lambda one: (not one.is_variation, -one.views))
-    finished = (Map(one.variant, case.frames(one.variant)[-1], one.views) for one in chosen if case.frames(one.variant))
-    slam, alone, two = next(finished, None), case.single(), case.named(2, THESIS_REGISTRATION, THESIS_MERGE)
+    finished = (
+        maps.Map(one.variant, case.frames(one.variant)[-1], one.views) for one in chosen if case.frames(one.variant)
+    )
+    slam, alone, two = next(finished, None), case.single(), case.named(2, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if slam is None or alone is None or two is None:
         there = {"SLAM map": slam, "single view": alone, "merge of two": two}
         missing = ", no ".join(name for name, found in there.items() if not found)
         return "undecided", f"Not judged: the experiment has no {missing}."
-    maps = (slam, alone, two)
+    three = (slam, alone, two)
     # Holes that each map measures often enough.
-    counts = [case.holes(each).groupby("hole", sort=False)["extent_diameter_mm"].count() for each in maps]
-    common = [str(hole) for hole in counts[0].index if all(count.get(hole, 0) >= FEWEST_BOTH for count in counts)]
+    counts = [case.holes(each).groupby("hole", sort=False)["extent_diameter_mm"].count() for each in three]
+    common = [str(hole) for hole in counts[0].index if all(count.get(hole, 0) >= maps.FEWEST_BOTH for count in counts)]
 
-    def noise(mapped: Map) -> np.ndarray:
+    def noise(mapped: maps.Map) -> np.ndarray:
         runs = case.runs(mapped)
         return runs["surface_noise_mm"][runs["role"] == "damaged"].dropna().to_numpy(float)
 
-    def errors(mapped: Map, measured: str, true: str) -> np.ndarray:
+    def errors(mapped: maps.Map, measured: str, true: str) -> np.ndarray:
         """(repeats, h), NaN where not measured; without the hole from which positions count."""
         rows = case.holes(mapped)
         rows = rows[rows["hole"].isin(common) & (rows[true] > 0)]
@@ -169,23 +124,23 @@ def _c10(case: MapCase) -> tuple[Answer, str]:
 
     parts, said = [], []
     for what, values, size, gap in (
-        ("surface noise", [noise(each) for each in maps], lambda v: float(v.mean()), intervals.mean_difference),
-        ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in maps], _rms, rms_gap),
-        ("position error", [errors(each, "extent_offset_mm", "true_offset_mm") for each in maps], _rms, rms_gap),
+        ("surface noise", [noise(each) for each in three], lambda v: float(v.mean()), intervals.mean_difference),
+        ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in three], _rms, rms_gap),
+        ("position error", [errors(each, "extent_offset_mm", "true_offset_mm") for each in three], _rms, rms_gap),
     ):
         if what == "surface noise" or values[0].size:
             gaps = [gap(values[0], other) for other in values[1:]]
             parts += [is_above_zero(interval) for interval in gaps]
             sizes = [size(each) for each in values]
-            more = " and ".join(map(span, gaps))
+            more = " and ".join(map(maps.span, gaps))
             said.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
     if not common:
-        (_, most), *others = (_bounds(case, each) for each in maps)
+        (_, most), *others = (_bounds(case, each) for each in three)
         parts.append(True if most == 0 and all(least > 0 for least, _ in others) else None)
         said.append("no hole is measured by all three")
     evidence = (
         f"{slam.views} views of {many(slam.frames, 'frame')} against one and two of {many(alone.frames, 'frame')}: "
-        f"{'; '.join(said)}. Found: {', '.join(_found_text(case, each) for each in maps)}."
+        f"{'; '.join(said)}. Found: {', '.join(_found_text(case, each) for each in three)}."
     )
     return decide(parts), evidence
 
@@ -212,18 +167,8 @@ def _rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(errors**2)))
 
 
-@rule_of(
-    VIEW_CLAIMS,
-    "H1",
-    "Mapping with noise reduction beats single clouds.",
-    "The fused map of the most views, registered by marks and surface (else by marks), is held against one view with "
-    "as many frames as each of its views (50, else the most), and against one view with as many exposures in all "
-    "(views times frames; of such pairs that of the most views, then frames) where the experiment has one. Respects: "
-    "holes found (counts, undecided holes leaving room for both), |size error| of the holes that both measure (thesis' "
-    "measure) and noise of the fitted surface (95 % Student intervals over repeats). Borne out when the map is ahead "
-    "of each rival in one respect at least and behind in none; refuted when it is behind any of them in any.",
-)
-def _h1(case: MapCase) -> tuple[Answer, str]:
+@rule_of(VIEW_CLAIMS, "H1")
+def _h1(case: maps.MapCase) -> tuple[Answer, str]:
     duels = duels_of(case)
     if not duels:
         return "undecided", "Not judged: no fused map stands beside a single view."
@@ -234,7 +179,7 @@ def _h1(case: MapCase) -> tuple[Answer, str]:
     return decide(answers), evidence
 
 
-def duels_of(case: MapCase) -> list[tuple[tuple[Standing, ...], str]]:
+def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     """H1's map against one view with as many frames as each of its views, and against one with as many exposures in
     all, where the experiment has them: the standing in each respect, and numbers."""
     fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
@@ -242,7 +187,7 @@ def duels_of(case: MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
     first = case.single()
     equal_frames = (
-        (Map(one.variant, rival.frames, one.views), rival)
+        (maps.Map(one.variant, rival.frames, one.views), rival)
         for one in fused
         for frames in [case.common_frames(one.variant, first.variant if first else None)]
         for rival in [case.single(frames) if frames is not None else None]
@@ -251,7 +196,7 @@ def duels_of(case: MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     lone = [one for one in case.maps if one.views == 1]
     lone.sort(key=lambda one: (first is None or one.variant != first.variant, one.is_variation))
     equal_exposures = (
-        (Map(one.variant, frames, one.views), Map(alone.variant, one.views * frames, 1))
+        (maps.Map(one.variant, frames, one.views), maps.Map(alone.variant, one.views * frames, 1))
         for one in fused
         for frames in reversed(case.frames(one.variant))
         for alone in lone
@@ -261,9 +206,9 @@ def duels_of(case: MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     return [_duel(case, *pair, registration or "") for pair in pairs if pair is not None]
 
 
-def _duel(case: MapCase, mapped: Map, rival: Map, registration: str) -> tuple[tuple[Standing, ...], str]:
-    sizes = size_errors(case.holes(rival), case.holes(mapped)).change()
-    noise = run_ratio(case.runs(rival), case.runs(mapped), "surface_noise_mm")
+def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: str) -> tuple[tuple[Standing, ...], str]:
+    sizes = maps.size_errors(case.holes(rival), case.holes(mapped)).change()
+    noise = maps.run_ratio(case.runs(rival), case.runs(mapped), "surface_noise_mm")
     (low, high), (rival_low, rival_high) = _bounds(case, mapped), _bounds(case, rival)
     sure = low == high == rival_low == rival_high
     standings: tuple[Standing, ...] = (
@@ -274,19 +219,19 @@ def _duel(case: MapCase, mapped: Map, rival: Map, registration: str) -> tuple[tu
     text = (
         f"{mapped.views} views ({registration}, fusion) of {many(mapped.frames, 'frame')} against one of "
         f"{many(rival.frames, 'frame')}: {said}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
-        f"|size error| {change_text(sizes)}; surface noise {ratio_text(noise)}."
+        f"|size error| {maps.change_text(sizes)}; surface noise {maps.ratio_text(noise)}."
     )
     return standings, text
 
 
-def _bounds(case: MapCase, mapped: Map) -> tuple[int, int]:
+def _bounds(case: maps.MapCase, mapped: maps.Map) -> tuple[int, int]:
     """Fewest and most holes that a map finds."""
     states = list(case.status(mapped).values())
     found = states.count("found")
     return found, found + states.count("undecided")
 
 
-def _found_text(case: MapCase, mapped: Map) -> str:
+def _found_text(case: maps.MapCase, mapped: maps.Map) -> str:
     low, high = _bounds(case, mapped)
     total = len(case.status(mapped))
     return f"{low} of {total}" if low == high else f"{low} to {high} of {total}"

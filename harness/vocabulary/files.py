@@ -14,7 +14,7 @@ import stat
 import sysconfig
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -149,23 +149,17 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     new file; what can be made again at no cost may do without. Raises UserError where the folder cannot be written or
     the disk is full."""
     path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def make() -> str:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
         os.close(handle)
-    except OSError as error:
-        raise explained(error, path) from error
-    temporary = Path(name)
-    try:
+        return name
+
+    with _renamed(path, make, 0o666) as temporary:
         yield temporary
         if durable:
             with open(temporary, "rb") as written:
                 os.fsync(written.fileno())
-        _move_shared(temporary, path, 0o666)
-    except OSError as error:
-        raise explained(error, path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -175,28 +169,34 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
         raise UserError(f"{path}: is not empty, and nothing is written over", fix="name a new folder with --out")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def make() -> str:
         if path.exists() and not path.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
-    except OSError as error:
-        raise explained(error, path) from error
-    try:
+        return tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+
+    with _renamed(path, make, 0o777) as temporary:
         yield temporary
-        _move_shared(temporary, path, 0o777)
+
+
+@contextmanager
+def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
+    """Make something temporary and rename it, with the permissions that the user's umask leaves: tempfile makes
+    everything private."""
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(make())
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(mode & ~umask)
+        os.replace(temporary, path)
     except OSError as error:
         raise explained(error, path) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _move_shared(temporary: Path, path: Path, mode: int) -> None:
-    """Rename, with the permissions that the user's umask leaves: tempfile makes everything private."""
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(mode & ~umask)
-    os.replace(temporary, path)
+        if temporary is not None and temporary.exists():
+            shutil.rmtree(temporary, ignore_errors=True) if temporary.is_dir() else temporary.unlink()
 
 
 def inside(folder: Path, *parts: str) -> Path:

@@ -10,8 +10,7 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR
-from scenes.optics import COARSE, FINE, Beams, Quadrilaterals
+from scenes.optics import COARSE, FINE, Beams, Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene
 
 FINEST = 2048
@@ -28,11 +27,6 @@ FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil":
 """Options of compilation; sums are float64, whose order moves a range by 1e-14 m."""
 COMB_TOLERANCE = 1e-9
 """Unevenness, relative to the highest frequency, up to which a comb is summed by a recurrence."""
-
-
-def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return (f,) 2 pi f / c in rad per metre of full path, for the speed of light in air."""
-    return 2 * np.pi * np.array(frequencies_hz, float) / SPEED_OF_LIGHT_AIR
 
 
 def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:

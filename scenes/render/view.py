@@ -18,9 +18,9 @@ from scipy import sparse
 from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
-from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
+from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
 from scenes.perspectives import seen_region
-from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light, wave_numbers
+from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light
 from scenes.render.scene import LIFT_M, LitScene, facing, lit_scene, load_mitsuba
 from scenes.target.mesh import Target
 
@@ -41,20 +41,6 @@ ABOVE_FACE_M = 1 * MM
 
 
 @dataclass(frozen=True)
-class Gathered:
-    """Indirect light at n places: ``sums`` (BATCHES, f + 1, n) complex64, per batch; frequency 0 (intensity) last.
-    Phase counts from the place of gathering on. Units as in `scenes.optics.NoiseFreeView`, without the place's albedo
-    where the start was a surface point, with it where the start was the lens."""
-
-    sums: np.ndarray
-
-    @property
-    def mean(self) -> np.ndarray:
-        """(f + 1, n) mean over batches."""
-        return np.asarray(self.sums.mean(axis=0, dtype=complex))
-
-
-@dataclass(frozen=True)
 class PathWork:
     """Settings of the walk: at which frequencies, with how many reflections beyond the first, and from which seed."""
 
@@ -65,7 +51,7 @@ class PathWork:
 
 def gather_at_points(
     lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int
-) -> Gathered:
+) -> np.ndarray:
     """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo. All points share their low-discrepancy numbers, so that what noise is left is smooth from point to point."""
     import drjit as dr
@@ -82,7 +68,7 @@ def gather_at_points(
     return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True)
 
 
-def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> Gathered:
+def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
     """Gather indirect light (mean over the listed sub-rays of each pixel, its share of the footprint left out) with
     ``samples`` paths each, a number or (p,)."""
     import drjit as dr
@@ -125,17 +111,18 @@ def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
     return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
 
 
-def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, on_surface: bool) -> Gathered:
-    """Walk ``samples`` (n,) paths from each place, in BATCHES batches. ``start`` (place, u1, u2): point from which the
-    path's length counts, origin of the first ray and its direction. ``on_surface``: light that reaches the first hit
-    directly counts (for a start at the lens it is the direct part), and all places share one rotation of the
-    low-discrepancy points (modulo 1). Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce
-    multiplies by its albedo only."""
+def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, on_surface: bool) -> np.ndarray:
+    """Walk ``samples`` (n,) paths from each place; returns the light (BATCHES, f + 1, n) complex64 of each batch,
+    frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in `NoiseFreeView`, without the
+    place's albedo where the start was a surface point, with it where the start was the lens. ``start`` (place, u1, u2):
+    point from which the path's length counts, origin of the first ray and its direction. ``on_surface``: light that
+    reaches the first hit directly counts (for a start at the lens it is the direct part), and all places share one
+    rotation of the low-discrepancy points (modulo 1). Cosine-weighted directions cancel cos/pi of a Lambertian surface,
+    so each bounce multiplies by its albedo only."""
     import drjit as dr
 
     mi, bounces, seed = lit.mi, work.bounces, work.seed
-    waves, step_hz = wave_numbers(work.frequencies_hz), comb_step(work.frequencies_hz)
-    lines, per_batch = len(waves), np.maximum(samples // BATCHES, 1)
+    lines, per_batch = len(work.frequencies_hz), np.maximum(samples // BATCHES, 1)
     rng = np.random.default_rng([seed, 0x1D1EC7])
     dimensions, longest = START_DIMENSIONS + PER_VERTEX * (bounces + 1), int(per_batch.max())
     points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
@@ -148,23 +135,6 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
     of_place, of_batch = np.divmod(pair, BATCHES)
     begin_at = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
     lanes = of_place, of_batch, begin_at, np.minimum(per_batch[of_place] - begin_at, PATHS_A_LANE)
-
-    def added(totals: list[Any], light: Any, length: Any) -> list[Any]:
-        """Add light of a path length to sums of real and imaginary parts, one pair a frequency, intensity last. A comb
-        is followed by multiplying with the phasor of its spacing: 1e-7 a line."""
-        out = []
-        if step_hz is None:
-            for number in waves:
-                sine, cosine = dr.sincos(float(number) * length)
-                out += [light * cosine, light * sine]
-        else:
-            sine, cosine = dr.sincos(float(waves[0]) * length)
-            turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
-            re, im = light * cosine, light * sine
-            for _ in waves:
-                out += [re, im]
-                re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
-        return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
     def walk(here: slice) -> np.ndarray:
         """Return sums over the paths of some lanes: (f + 1, n) complex64, intensity last."""
@@ -193,7 +163,7 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
             throughput = throughput * dr.select(met, hit.bsdf().eval_diffuse_reflectance(hit, met)[0], 0)
             arriving, leg = lit.arriving(hit, met if on_surface else met & ~fresh)
             light = throughput * arriving
-            totals = added(totals, dr.select(met, light, 0), length + leg)
+            totals = _added(totals, dr.select(met, light, 0), length + leg, work.frequencies_hz)
 
             more = met & (vertex < bounces) & (throughput > 0)
             dimension = START_DIMENSIONS + PER_VERTEX * vertex
@@ -216,7 +186,27 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
         here = slice(begin, begin + at_once)
         sums[:, here] = walk(here)
     by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
-    return Gathered(np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64))
+    return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
+
+
+def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
+    """Add light of a path length to sums of real and imaginary parts, one pair a frequency, intensity last. A comb is
+    followed by multiplying with the phasor of its spacing: 1e-7 a line."""
+    import drjit as dr
+
+    out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
+    if step_hz is None:
+        for number in waves:
+            sine, cosine = dr.sincos(float(number) * length)
+            out += [light * cosine, light * sine]
+    else:
+        sine, cosine = dr.sincos(float(waves[0]) * length)
+        turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
+        re, im = light * cosine, light * sine
+        for _ in waves:
+            out += [re, im]
+            re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
+    return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
 
 def face_triangles(target: Target) -> list[np.ndarray]:
@@ -264,8 +254,8 @@ def face_light(
     weights = between_nodes(xs, ys, x_seen, y_seen)
     share = direct.face[:, seen]
     few = noise_lines(work.frequencies_hz)
-    batches = np.stack([share[few] * (weights @ batch[few].T).T for batch in light.sums])
-    return share * (weights @ light.mean.T).T, batches
+    batches = np.stack([share[few] * (weights @ batch[few].T).T for batch in light])
+    return share * (weights @ light.mean(axis=0, dtype=complex).T).T, batches
 
 
 def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
@@ -307,7 +297,7 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     lens = optics.lens
     lit = lit_scene(mi, target.parts, optics, face_triangles(target))
     slopes = lens.region_slopes(region)
-    footprint = footprint_of(lens, region, optics.footprint)
+    footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
     direct = direct_light(lit, slopes, footprint, optics.frequencies_hz, _at_holes(target, optics, slopes))
     phasor, intensity, noise_m = direct.phasor, direct.intensity, np.zeros(region.shape)
     rgb = np.zeros((*region.shape, 3), np.float32)
@@ -372,9 +362,10 @@ def indirect_light(
         if here.size:
             many = _samples_inside(lit, rays, total[:, here], work, config) if inner else config.rest_samples
             light = gather_in_pixels(lit, rays, work, many)
-            indirect[:, here] += share * light.mean
-            total[:, here] += share * light.mean[:-1]
-            batches = share * light.sums[:, noise_lines(frequencies)]
+            mean = share * light.mean(axis=0, dtype=complex)
+            indirect[:, here] += mean
+            total[:, here] += mean[:-1]
+            batches = share * light[:, noise_lines(frequencies)]
             variance[here] += range_noise_m(batches, total[:, here], frequencies) ** 2
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
@@ -387,8 +378,9 @@ def _samples_inside(
     if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
-    batches = rays.share * pilot.sums[:, noise_lines(work.frequencies_hz)]
-    noise_m = range_noise_m(batches, total + rays.share * pilot.mean[:-1], work.frequencies_hz)
+    batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
+    total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
+    noise_m = range_noise_m(batches, total, work.frequencies_hz)
     wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
     doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
     return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)

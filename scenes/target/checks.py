@@ -8,15 +8,7 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, transform_points
-from scenes.target.custom import (
-    BoardConfig,
-    CylinderConfig,
-    DentConfig,
-    HoleConfig,
-    SphereConfig,
-    TapeConfig,
-    TargetConfig,
-)
+from scenes.target import custom
 from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, widest_rim_m
 
 STEEPEST_SLOPE = 4 / 3
@@ -33,7 +25,7 @@ NEAREST_M = 0.05
 """Least distance of the board from the lens plane."""
 
 
-def check_target(config: TargetConfig) -> None:
+def check_target(config: custom.TargetConfig) -> None:
     """Raise UserError that names every part that does not fit, with the numbers; return where all fits."""
     board = config.board
     problems = _board_problems(board)
@@ -51,21 +43,21 @@ def check_target(config: TargetConfig) -> None:
         )
 
 
-def _name(damage: HoleConfig | DentConfig) -> str:
+def _name(damage: custom.HoleConfig | custom.DentConfig) -> str:
     kind, (x, y) = "dent" if damage.kind == "dent" else "hole", damage.centre_mm
     return f"{kind} {damage.id} (diameter {damage.diameter_mm:g} mm at ({x:g}, {y:g}) mm)"
 
 
-def _size(board: BoardConfig) -> str:
+def _size(board: custom.BoardConfig) -> str:
     return f"the board ({board.width_mm:g} x {board.height_mm:g} mm, centred on (0, 0))"
 
 
-def _board_problems(board: BoardConfig) -> list[str]:
+def _board_problems(board: custom.BoardConfig) -> list[str]:
     """Find a face too steep or too tightly bent for its size."""
     shape, half_x, half_y = board.shape, board.width_mm / 2, board.height_mm / 2
-    if isinstance(shape, CylinderConfig | SphereConfig):
+    if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         reach = float(np.hypot(half_x, half_y))
-        if isinstance(shape, CylinderConfig):
+        if isinstance(shape, custom.CylinderConfig):
             reach = half_x if shape.straight_along == "y" else half_y
         if shape.radius_mm * 0.8 < reach:
             return [
@@ -86,7 +78,7 @@ def _board_problems(board: BoardConfig) -> list[str]:
     return []
 
 
-def _damage_problems(damage: HoleConfig | DentConfig, board: BoardConfig, face: Face) -> list[str]:
+def _damage_problems(damage: custom.HoleConfig | custom.DentConfig, board: custom.BoardConfig, face: Face) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
     name, (x, y), depth_mm, problems = _name(damage), damage.centre_m, damage.depth_mm, []
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
@@ -95,14 +87,14 @@ def _damage_problems(damage: HoleConfig | DentConfig, board: BoardConfig, face: 
     tightest = float(np.abs(face.curvatures(x, y)).max())
     if damage.radius_m * tightest > WIDEST_BEND:
         return [f"{name}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
-    if isinstance(damage, DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
+    if isinstance(damage, custom.DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
         ball = f"{damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm"
         return [f"{name}: too shallow ({ball}) for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
     if depth_mm is not None and depth_mm >= board.thickness_mm:
         problems.append(
             f"{name}: depth {depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
         )
-    if isinstance(damage, DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
+    if isinstance(damage, custom.DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
         radius = f"its radius {damage.diameter_mm / 2:g} mm"
         problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, which no spherical cap has")
     # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
@@ -128,14 +120,16 @@ def _damage_problems(damage: HoleConfig | DentConfig, board: BoardConfig, face: 
     return problems
 
 
-def _reach_m(damage: HoleConfig | DentConfig, board: BoardConfig) -> float:
+def _reach_m(damage: custom.HoleConfig | custom.DentConfig, board: custom.BoardConfig) -> float:
     """Return the depth to which a damage keeps its full width: a dent narrows from the face on."""
     if damage.kind == "dent":
         return 0.0
     return (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM
 
 
-def _overlap_problems(damages: list[HoleConfig | DentConfig], board: BoardConfig, face: Face) -> list[str]:
+def _overlap_problems(
+    damages: list[custom.HoleConfig | custom.DentConfig], board: custom.BoardConfig, face: Face
+) -> list[str]:
     """Find pairs without a web between them, at the face or at the depth that both reach."""
     x, y = np.array([damage.centre_m for damage in damages]).reshape(-1, 2).T
     centres, axes = face.point(x, y), face.normal(x, y)
@@ -153,19 +147,19 @@ def _overlap_problems(damages: list[HoleConfig | DentConfig], board: BoardConfig
     ]
 
 
-def _turn(tape: TapeConfig) -> np.ndarray:
+def _turn(tape: custom.TapeConfig) -> np.ndarray:
     """Return the 2x2 matrix from a strip's own axes to the board's."""
     angle = np.deg2rad(tape.angle_deg)
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def off_tape_mm(tape: TapeConfig, places_mm: np.ndarray) -> np.ndarray:
+def off_tape_mm(tape: custom.TapeConfig, places_mm: np.ndarray) -> np.ndarray:
     """Return the distance in plan of places (n, 2) from a strip, mm; 0 on it."""
     beyond = np.abs((places_mm - tape.centre_mm) @ _turn(tape)) - np.array(tape.size_mm) / 2
     return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=-1))
 
 
-def _tape_problems(config: TargetConfig) -> list[str]:
+def _tape_problems(config: custom.TargetConfig) -> list[str]:
     """Find strips off the board, over a damage, or over one another (their upper sides would coincide); in plan."""
     import cv2
 
@@ -190,7 +184,7 @@ def _tape_problems(config: TargetConfig) -> list[str]:
     return problems
 
 
-def _pose_problems(config: TargetConfig) -> list[str]:
+def _pose_problems(config: custom.TargetConfig) -> list[str]:
     """Find a board that reaches behind the lens, through the floor or, with its backing, into the wall."""
     T_camera_board, room, problems = config.pose.T_camera_board, config.room, []
     solid = [face_grid_m(config.board, depth_m).reshape(-1, 3) for depth_m in (0.0, config.board.thickness_mm * MM)]

@@ -22,22 +22,8 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert
 from harness.vocabulary.seeds import random_stream
+from scenes.target import custom
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
-from scenes.target.custom import (
-    Albedo,
-    BackingConfig,
-    BoardConfig,
-    DentConfig,
-    FlatConfig,
-    HoleConfig,
-    MaterialConfig,
-    PoseConfig,
-    Rgb,
-    RoomConfig,
-    TapeConfig,
-    TargetConfig,
-    WavelengthConfig,
-)
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
 Purpose = Literal["calibration", "hole_free", "damaged"]
@@ -96,8 +82,10 @@ class DrawnDents(DrawnThrough):
 class DrawnMaterialConfig(Config):
     """Reflectance of the boards, as in MaterialConfig, but every board has a grain of its own."""
 
-    albedo_850: Albedo = Field(default=0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
-    rgb: Rgb = (0.55, 0.42, 0.28)
+    albedo_850: custom.Albedo = Field(
+        default=0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found"
+    )
+    rgb: custom.Rgb = (0.55, 0.42, 0.28)
     grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = 0.05
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = 8.0
 
@@ -111,8 +99,10 @@ class DrawnTargetConfig(Config):
         default=1, description="of the boards; an experiment's own seed draws the noise, and another keeps the boards"
     )
     damage: Annotated[DrawnThrough | DrawnBlind | DrawnDents, Field(discriminator="kind")]
-    board: BoardConfig = Field(
-        default_factory=lambda: BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=FlatConfig()),
+    board: custom.BoardConfig = Field(
+        default_factory=lambda: custom.BoardConfig(
+            width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
+        ),
         description="the thesis' half an inch of plywood, of 12 x 8 in: its face has as many pixels as the thesis' "
         "board of 24 x 4.5 in, and less of it lies near the edge",
     )
@@ -126,7 +116,7 @@ class DrawnTargetConfig(Config):
         description="least distance of a rim from the board's edge. A crop takes 3 or 4 pixels off the edge, 6 mm at "
         "0.7 m and 12 mm at 1.5 m: what lies there is missed for its place, not for its size",
     )
-    tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = Field(
+    tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field(
         default=(), description="the same on all boards; none: one view needs no marks"
     )
     distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = 0.7
@@ -141,12 +131,12 @@ class DrawnTargetConfig(Config):
     )
     roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(default=2.0, description="a board is set down by eye")
     material: DrawnMaterialConfig = DrawnMaterialConfig()
-    backing: BackingConfig | None = Field(
-        default=BackingConfig(distance_mm=20.0),
+    backing: custom.BackingConfig | None = Field(
+        default=custom.BackingConfig(distance_mm=20.0),
         description="as behind the thesis' board. Without a size it fills every hole in every pose that can be drawn",
     )
-    room: RoomConfig | None = RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5)
-    other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
+    room: custom.RoomConfig | None = custom.RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5)
+    other_wavelengths: Annotated[tuple[custom.WavelengthConfig, ...], Field(max_length=20)] = Field(
         default=(), description="for cameras that do not work near 850 nm"
     )
 
@@ -193,11 +183,11 @@ class DrawnTargetConfig(Config):
         shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
         return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
 
-    def declare(self) -> TargetConfig:
+    def declare(self) -> custom.TargetConfig:
         """Return the first damaged board, for programs that look at one target."""
         return self.drawn("damaged", 0)
 
-    def drawn(self, purpose: Purpose, number: int) -> TargetConfig:
+    def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
         """Return a board of the family, with its damage; ids count from 1 in the order of size. Boards that are to be
         hole-free have damage too: call ``hole_free()`` on the answer, and what was left out are unflawed sites, placed
         as damage is. Raises UserError where the board is too full for the damage."""
@@ -210,7 +200,7 @@ class DrawnTargetConfig(Config):
             return drawn
 
         damage, count, depths = self.damage, self.damage.per_board, stream("depths")
-        made: list[HoleConfig | DentConfig] = []
+        made: list[custom.HoleConfig | custom.DentConfig] = []
         (low, high), parts = damage.diameter_mm, (np.arange(count) + stream("diameters").random(count)) / count
         sizes = low * (high / low) ** parts if damage.sizes == "log" else low + (high - low) * parts
         quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
@@ -224,14 +214,18 @@ class DrawnTargetConfig(Config):
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
                     least, most = max(least, legal[0]), min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
-            made.append(DentConfig(**facts) if damage.kind == "dent" else HoleConfig(**facts, kind=damage.kind))
+            made.append(
+                custom.DentConfig(**facts) if damage.kind == "dent" else custom.HoleConfig(**facts, kind=damage.kind)
+            )
         common: dict[str, Any] = {key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")}
         common["dents" if damage.kind == "dent" else "holes"] = tuple(made)
         pose = within("offset", self.offset_mm, 2) + within("tilt", self.tilt_deg, 2) + within("roll", self.roll_deg, 1)
-        config = TargetConfig(
+        config = custom.TargetConfig(
             board=self.board,
             **common,
-            material=MaterialConfig(**self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))),
+            material=custom.MaterialConfig(
+                **self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))
+            ),
             pose=self._posed(*within("distance", self.distance_jitter_mm, 1), *pose),
         )
         if self.backing is None or self.backing.size_mm is not None:
@@ -240,7 +234,7 @@ class DrawnTargetConfig(Config):
         size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
         return config.model_copy(update={"backing": self.backing.model_copy(update={"size_mm": size_mm})})
 
-    def extreme_poses(self) -> tuple[PoseConfig, ...]:
+    def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
         """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways
         and upwards: what is in view in all of these is in view in every pose."""
         diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
@@ -276,10 +270,10 @@ class DrawnTargetConfig(Config):
             fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board",
         )
 
-    def _posed(self, jitter_mm: float, *others: float) -> PoseConfig:
+    def _posed(self, jitter_mm: float, *others: float) -> custom.PoseConfig:
         """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a roll."""
         names = ("offset_x_mm", "offset_y_mm", "tilt_x_deg", "tilt_y_deg", "roll_deg")
-        return PoseConfig(distance_m=self.distance_m + jitter_mm * MM, **dict(zip(names, others, strict=True)))
+        return custom.PoseConfig(distance_m=self.distance_m + jitter_mm * MM, **dict(zip(names, others, strict=True)))
 
 
 def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
@@ -291,7 +285,7 @@ def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, floa
 
 
 @lru_cache(maxsize=256)
-def _tightest_per_mm(board: BoardConfig) -> float:
+def _tightest_per_mm(board: custom.BoardConfig) -> float:
     """Return a face's largest curvature; 0 where its shape does not reach, which `check_target` tells."""
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T
     tightest = float(np.abs(face_of(board).curvatures(x_m, y_m)).max()) * MM

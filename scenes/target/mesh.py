@@ -1,4 +1,5 @@
-"""Built targets, a renderer's input: parts with meshes and reflectances (wood grain), and the truth beside them.
+"""Built targets, a renderer's input: parts with meshes and reflectances (wood grain), and the truth beside them; as
+files: PLY or GLB for viewers, JSON for the truth.
 
 A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x), v = 1/2 - y /
 height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is at u = (column
@@ -6,8 +7,10 @@ height runs with the rows from the top (+y): row 0 begins at v = 0. The centre o
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +18,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_bytes, write_text
 from harness.vocabulary.geometry import MM, transform_points
+from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
 from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, TargetConfig
@@ -297,3 +302,63 @@ def subtract(body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh]) -> trime
     result = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract).to_mesh64()
     faces = result.tri_verts.astype(np.int64)
     return trimesh.Trimesh(vertices=result.vert_properties[:, :3], faces=faces, process=False)
+
+
+MESH_SUFFIXES = (".glb", ".ply")
+
+
+def write_mesh(target: Target, path: Path) -> None:
+    """Write all parts, in metres, by the suffix of ``path``; colours are sRGB. ``.ply``: one binary mesh in the
+    camera's frame (z forward, y down), each part's mean colour at its vertices. ``.glb``: one node a part, the grain as
+    a texture, in glTF's frame (y up, the camera at the origin looks along -z). Raises UserError for another suffix or
+    where the file cannot be written."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise UserError(f"{path}: no mesh format is called {suffix or 'nothing'!r}", legal=" or ".join(MESH_SUFFIXES))
+    write_bytes(path, _ply(target) if suffix == ".ply" else _glb(target))
+
+
+def write_truth(target: Target, path: Path) -> None:
+    """Write as JSON: version, declaration, ``T_camera_board`` (metres) and one row in millimetres per damage."""
+    data = {"results_version": RESULTS_VERSION, "target": target.config.to_data()}
+    data |= {"T_camera_board": target.T_camera_board.tolist(), "damages": [each.to_row() for each in target.truth]}
+    write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def _ply(target: Target) -> bytes:
+    import trimesh
+
+    coloured = []
+    for part in target.parts:
+        colours = np.tile(np.append(_srgb_bytes(part.rgb), np.uint8(255)), (len(part.mesh.vertices), 1))
+        coloured.append(trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, vertex_colors=colours, process=False))
+    return trimesh.util.concatenate(coloured).export(None, file_type="ply")
+
+
+def _glb(target: Target) -> bytes:
+    import trimesh
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
+
+    scene = trimesh.Scene()
+    upright = np.diag([1.0, -1.0, -1.0, 1.0])
+    for part in target.parts:
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "name": part.name}
+        if part.uv is None or part.texture_rgb is None:
+            material = PBRMaterial(baseColorFactor=[*part.rgb, 1.0], **rough)
+            visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(part.mesh.vertices), 2)), material=material)
+        else:
+            material = PBRMaterial(baseColorTexture=Image.fromarray(_srgb_bytes(part.texture_rgb)), **rough)
+            # trimesh counts v upwards from the image's lower edge.
+            visual = trimesh.visual.TextureVisuals(uv=part.uv * (1, -1) + (0, 1), material=material)
+        mesh = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
+        # No normals: glTF viewers then shade each facet flat, which keeps the rims of holes sharp.
+        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name, transform=upright)
+    return scene.export(file_type="glb", include_normals=False)
+
+
+def _srgb_bytes(linear: np.ndarray) -> np.ndarray:
+    """Return linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
+    linear = np.asarray(linear, dtype=float)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.round(255 * encoded).astype(np.uint8)

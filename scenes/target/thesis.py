@@ -9,26 +9,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import INCH, MM
-from scenes.target.custom import (
-    Albedo,
-    BackingConfig,
-    BoardConfig,
-    Coordinate,
-    FlatConfig,
-    HoleConfig,
-    Length,
-    MaterialConfig,
-    PoseConfig,
-    Rgb,
-    RoomConfig,
-    TapeConfig,
-    TargetConfig,
-    WavelengthConfig,
-)
+from scenes.target import custom
 from scenes.target.drawn import DrawnTargetConfig
 
 THICKNESS_MM = 12.7
@@ -58,7 +43,7 @@ class ThesisTargetConfig(Config):
         "Only points with z < 1.1 m and a range < 1 m are kept, and the holes still show points at depth, so something "
         "stood close behind; a sheet leaning on a wall leaves centimetres. none: nothing behind.",
     )
-    backing_albedo_850: Albedo = _open(0.6, "Painted walls and wood lie near it. A guess.")
+    backing_albedo_850: custom.Albedo = _open(0.6, "Painted walls and wood lie near it. A guess.")
     hole_spacing_mm: Annotated[float, Field(ge=30.0, le=100.0)] = _open(
         50.8, "2 in by the ruler readings of holes 4 to 11; taken to be the same for 1 to 3."
     )
@@ -74,8 +59,8 @@ class ThesisTargetConfig(Config):
         "The camera's lower limit is 0.5 m; a range < 1 m at the board's end, 0.305 m off the axis, bounds it by "
         "0.95 m. The middle.",
     )
-    offset_x_mm: Coordinate = _open(0.0, "A board is put before the camera's centre.")
-    offset_y_mm: Coordinate = _open(0.0, "A board is put before the camera's centre.")
+    offset_x_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
+    offset_y_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
     tilt_x_deg: Degrees = _open(
         3.0,
         "A sheet put up by hand is never frontal, and a frontal one would hide noise under the camera's rounding to "
@@ -83,10 +68,10 @@ class ThesisTargetConfig(Config):
     )
     tilt_y_deg: Degrees = _open(4.0, "As tilt_x_deg.")
     roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = _open(0.0, "A board is set down level.")
-    plywood_albedo_850: Albedo = _open(
+    plywood_albedo_850: custom.Albedo = _open(
         0.6, "No published value for plywood at 850 nm was found. Pale wood: 0.5 to 0.7."
     )
-    plywood_rgb: Rgb = _open((0.55, 0.42, 0.28), "Pale wood. A guess.")
+    plywood_rgb: custom.Rgb = _open((0.55, 0.42, 0.28), "Pale wood. A guess.")
     grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(
         0.05, "Standard deviation of the albedo over its mean. A guess: moderate."
     )
@@ -94,46 +79,46 @@ class ThesisTargetConfig(Config):
         8.0, "Spacing of the dark lines of a peeled softwood veneer. A guess."
     )
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(1, "Which board out of all alike.")
-    tape_length_mm: Length = _open(40.0, "Four strips, one near each corner, clear of the row.")
-    tape_width_mm: Length = _open(12.0, "Half-inch tape.")
+    tape_length_mm: custom.Length = _open(40.0, "Four strips, one near each corner, clear of the row.")
+    tape_width_mm: custom.Length = _open(12.0, "Half-inch tape.")
     tape_x_mm: Place = _open(200.0, "The strips' centres: +-x.")
     tape_y_mm: Place = _open(38.0, "The strips' centres: +-y.")
     tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(0.15, "Vinyl tape is 0.13 to 0.18 mm thick.")
-    tape_albedo_850: Albedo = _open(0.6, "Red dyes are clear in the near infrared. A guess.")
-    tape_rgb: Rgb = _open(
+    tape_albedo_850: custom.Albedo = _open(0.6, "Red dyes are clear in the near infrared. A guess.")
+    tape_rgb: custom.Rgb = _open(
         (0.85, 0.08, 0.08),
         "The strips are told by a red channel above mean + 2.6 standard deviations: redder than the wood.",
     )
     floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(
         0.75, "A table's height. A guess; none: no floor."
     )
-    floor_albedo_850: Albedo = _open(0.3, "A guess.")
+    floor_albedo_850: custom.Albedo = _open(0.3, "A guess.")
     back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(
         2.5, "The wall of a small laboratory. A guess; none: no wall."
     )
-    back_wall_albedo_850: Albedo = _open(0.6, "A painted wall. A guess.")
-    other_wavelengths: Annotated[tuple[WavelengthConfig, ...], Field(max_length=20)] = Field(
+    back_wall_albedo_850: custom.Albedo = _open(0.6, "A painted wall. A guess.")
+    other_wavelengths: Annotated[tuple[custom.WavelengthConfig, ...], Field(max_length=20)] = Field(
         default=(), description="for cameras that do not work near 850 nm, as the thesis' three do"
     )
 
-    def declare(self) -> TargetConfig:
+    def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Whether the parts fit together is checked when it is built."""
         middle = (len(DIAMETERS_IN) - 1) / 2
-        room = {key: getattr(self, key) for key in RoomConfig.model_fields if hasattr(self, key)}
+        room = {key: getattr(self, key) for key in custom.RoomConfig.model_fields if hasattr(self, key)}
         backing = None
         if self.backing_distance_mm is not None:
-            backing = BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
+            backing = custom.BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
         sizes = {"width_mm": self.board_width_mm, "height_mm": self.board_height_mm, "thickness_mm": THICKNESS_MM}
         strip: dict[str, Any] = {
             "rgb": self.tape_rgb,
             "albedo_850": self.tape_albedo_850,
             "thickness_mm": self.tape_thickness_mm,
         }
-        return TargetConfig(
-            board=BoardConfig(**sizes, shape=FlatConfig()),
+        return custom.TargetConfig(
+            board=custom.BoardConfig(**sizes, shape=custom.FlatConfig()),
             # hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle
             holes=tuple(
-                HoleConfig(
+                custom.HoleConfig(
                     id=number,
                     diameter_mm=round(diameter_in * INCH / MM, 6),
                     centre_mm=(round((number - 1 - middle) * self.hole_spacing_mm, 6), self.row_offset_y_mm),
@@ -143,7 +128,7 @@ class ThesisTargetConfig(Config):
                 for number, diameter_in in enumerate(DIAMETERS_IN, start=1)
             ),
             tapes=tuple(
-                TapeConfig(
+                custom.TapeConfig(
                     centre_mm=(side_x * self.tape_x_mm, side_y * self.tape_y_mm),
                     size_mm=(self.tape_length_mm, self.tape_width_mm),
                     **strip,
@@ -151,26 +136,21 @@ class ThesisTargetConfig(Config):
                 for side_y in (1, -1)
                 for side_x in (-1, 1)
             ),
-            material=MaterialConfig(
+            material=custom.MaterialConfig(
                 albedo_850=self.plywood_albedo_850,
                 rgb=self.plywood_rgb,
                 **{key: getattr(self, key) for key in ("grain_contrast", "grain_period_mm", "grain_seed")},
             ),
             backing=backing,
-            room=RoomConfig(**room) if room["floor_below_lens_m"] or room["back_wall_distance_m"] else None,
-            pose=PoseConfig(**{key: getattr(self, key) for key in PoseConfig.model_fields}),
+            room=custom.RoomConfig(**room) if room["floor_below_lens_m"] or room["back_wall_distance_m"] else None,
+            pose=custom.PoseConfig(**{key: getattr(self, key) for key in custom.PoseConfig.model_fields}),
             other_wavelengths=self.other_wavelengths,
         )
 
 
-AnyTargetConfig = Annotated[ThesisTargetConfig | TargetConfig | DrawnTargetConfig, Field(discriminator="name")]
-TARGETS: dict[str, type[ThesisTargetConfig] | type[TargetConfig] | type[DrawnTargetConfig]] = {
+AnyTargetConfig = Annotated[ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig, Field(discriminator="name")]
+TARGETS: dict[str, type[ThesisTargetConfig] | type[custom.TargetConfig] | type[DrawnTargetConfig]] = {
     "thesis": ThesisTargetConfig,
-    "custom": TargetConfig,
+    "custom": custom.TargetConfig,
     "drawn": DrawnTargetConfig,
 }
-
-
-def target_from_data(data: Any) -> ThesisTargetConfig | TargetConfig | DrawnTargetConfig:
-    """Validate plain data (as of YAML and JSON). Raises pydantic.ValidationError; its ``loc`` starts with the kind."""
-    return TypeAdapter(AnyTargetConfig).validate_python(data)

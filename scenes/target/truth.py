@@ -11,17 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
-from scenes.target.custom import (
-    BackingConfig,
-    BoardConfig,
-    CylinderConfig,
-    DentConfig,
-    HoleConfig,
-    PolynomialConfig,
-    RoomConfig,
-    SphereConfig,
-    TargetConfig,
-)
+from scenes.target import custom
 
 OUTLINE_STEPS = 64
 """Points along each side of the outline."""
@@ -76,11 +66,11 @@ class Face:
         return np.stack([spread - mean, -spread - mean], axis=-1)
 
 
-def face_of(board: BoardConfig) -> Face:
+def face_of(board: custom.BoardConfig) -> Face:
     """Return the face that a board's declaration describes."""
     shape = board.shape
-    if isinstance(shape, CylinderConfig | SphereConfig):
-        straight = shape.straight_along if isinstance(shape, CylinderConfig) else ""
+    if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
+        straight = shape.straight_along if isinstance(shape, custom.CylinderConfig) else ""
         radius_m, sign = shape.radius_mm * MM, 1.0 if shape.bulge == "towards" else -1.0
         bent_x, bent_y = float(straight != "x"), float(straight != "y")
 
@@ -98,7 +88,7 @@ def face_of(board: BoardConfig) -> Face:
 
         return Face(round_face)
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    terms = shape.terms if isinstance(shape, PolynomialConfig) else ()
+    terms = shape.terms if isinstance(shape, custom.PolynomialConfig) else ()
     coefficients = np.zeros(
         tuple(max((getattr(t, key) for t in terms), default=0) + 1 for key in ("power_x", "power_y"))
     )
@@ -116,7 +106,7 @@ def face_of(board: BoardConfig) -> Face:
     return Face(polynomial)
 
 
-def outline_board_m(board: BoardConfig) -> np.ndarray:
+def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
     """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame."""
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
     side, end = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False), np.ones(OUTLINE_STEPS)
@@ -124,14 +114,14 @@ def outline_board_m(board: BoardConfig) -> np.ndarray:
     return face_of(board).point(half_x * x, half_y * y)
 
 
-def face_grid_m(board: BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
+def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
     """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the board; board frame."""
     face, places = face_of(board), np.linspace(-0.5, 0.5, steps + 1)
     x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
     return face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
 
 
-def backing_corners_board_m(config: TargetConfig, backing: BackingConfig) -> np.ndarray:
+def backing_corners_board_m(config: custom.TargetConfig, backing: custom.BackingConfig) -> np.ndarray:
     """Return the backing's corners in the board's frame; it faces the board."""
     deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
     z_m = deepest_m + backing.distance_mm * MM
@@ -141,14 +131,14 @@ def backing_corners_board_m(config: TargetConfig, backing: BackingConfig) -> np.
     return np.column_stack([_UNIT_CORNERS * size_m, np.full(4, -z_m)])
 
 
-def floor_corners_camera_m(room: RoomConfig, floor_below_lens_m: float) -> np.ndarray:
+def floor_corners_camera_m(room: custom.RoomConfig, floor_below_lens_m: float) -> np.ndarray:
     """Return the floor's corners in the camera's frame; it faces up and reaches from the lens to the back wall."""
     far_m = room.back_wall_distance_m or OPEN_FLOOR_M
     x, z = room.width_m * _UNIT_CORNERS[:, 0], far_m * (_UNIT_CORNERS[:, 1] + 0.5)
     return np.column_stack([x, np.full(4, floor_below_lens_m), z])
 
 
-def wall_corners_camera_m(room: RoomConfig, back_wall_distance_m: float) -> np.ndarray:
+def wall_corners_camera_m(room: custom.RoomConfig, back_wall_distance_m: float) -> np.ndarray:
     """Return the back wall's corners in the camera's frame, on the floor (without a floor, centred on the axis)."""
     foot_m = room.height_m / 2 if room.floor_below_lens_m is None else room.floor_below_lens_m
     x, up = room.width_m * _UNIT_CORNERS[:, 0], room.height_m * (_UNIT_CORNERS[:, 1] + 0.5)
@@ -183,14 +173,14 @@ class Damage:
         return row
 
 
-def truth_of(config: TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
+def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
     """Return the truth of a declaration: holes, then dents, in the order of their declaration."""
     face, truth = face_of(config.board), []
     for item in config.damages:
         centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.normal, face.curvatures))
         radius_m = item.radius_m
         depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
-        if isinstance(item, DentConfig):
+        if isinstance(item, custom.DentConfig):
             # The sphere's curvature gives paraboloids of the two principal curvatures the same volume as the face;
             # exact on flat and spherical faces.
             bend = (math.sqrt(float(np.prod(1 + item.ball_m * bends))) - 1) / item.ball_m
@@ -205,7 +195,7 @@ def truth_of(config: TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, 
     return tuple(truth)
 
 
-def _lens(dent: DentConfig, bend: float) -> tuple[float, float]:
+def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
     """Return rim radius and volume that a dent's ball shares with a sphere of curvature ``bend``."""
     depth_m = dent.depth_mm * MM
     half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
@@ -215,8 +205,8 @@ def _lens(dent: DentConfig, bend: float) -> tuple[float, float]:
     return math.sqrt(rim_square), sum(caps)
 
 
-def widest_rim_m(item: HoleConfig | DentConfig, face: Face) -> float:
+def widest_rim_m(item: custom.HoleConfig | custom.DentConfig, face: Face) -> float:
     """Return the largest radius of a rim: a dent's in the direction in which the face bends towards the ball most."""
-    if isinstance(item, HoleConfig):
+    if isinstance(item, custom.HoleConfig):
         return item.radius_m
     return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]

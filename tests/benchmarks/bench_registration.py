@@ -22,19 +22,17 @@ from detectors.registration.settings import (
     AnyRegistration,
     CpdRegistration,
     IcpRegistration,
-    JointRegistration,
-    MarksRegistration,
-    OdometryRegistration,
+    PlainRegistration,
 )
 
 POSES = [pose(5 * np.sin(2 * t), 6 * t - 24, t, (0.002 * t, 0.0, 0.002 * t)) for t in range(9)]
 METHODS: dict[str, AnyRegistration] = {
-    "marks": MarksRegistration(),
-    "joint": JointRegistration(),
+    "marks": PlainRegistration(method="marks"),
+    "joint": PlainRegistration(method="joint"),
     "cpd": CpdRegistration(),
     "icp": IcpRegistration(),
     "icp of targets": IcpRegistration(points="target", estimation="point_to_plane"),
-    "odometry": OdometryRegistration(),
+    "odometry": PlainRegistration(method="odometry"),
 }
 
 

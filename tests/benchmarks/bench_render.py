@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from harness.vocabulary.geometry import Lens
-from scenes.optics import BeamFootprint, Optics, RenderConfig, footprint_of
+from scenes.optics import Optics, RenderConfig, footprint_of
 from scenes.render.direct import direct_light
 from scenes.render.scene import lit_scene, load_mitsuba
 from scenes.render.view import face_triangles, render_view, target_region
@@ -27,7 +27,7 @@ SCANNER = replace(
     full_half_angle_deg=50.0,
     cutoff_half_angle_deg=55.0,
     frequencies_hz=tuple(25e6 * k for k in range(1, 33)),
-    footprint=BeamFootprint(2e-3),
+    beam_fwhm_rad=2e-3,
 )
 """As fine as a scanner of 1024 x 768 beams, with 32 lines of a comb."""
 

@@ -100,8 +100,8 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     count = np.full(len(rows), SIDE**2)
     rays = OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
     light = gather_in_pixels(scene.lit, rays, PathWork(frequencies, LONGEST, seed=777), paths)
-    total = direct + light.mean[:-1]
-    reference_m = range_noise_m(light.sums[:, :-1], total, frequencies)
+    total = direct + light.mean(axis=0, dtype=complex)[:-1]
+    reference_m = range_noise_m(light[:, :-1], total, frequencies)
     error_m = range_change_m(scene.view.phasor[:, rows, cols].astype(complex) - total, total, frequencies)
     rms_m = np.sqrt(max((error_m**2).mean() - (reference_m**2).mean(), 0.0))
     return Error(

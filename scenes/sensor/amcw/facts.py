@@ -12,7 +12,7 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR
-from scenes.optics import Optics, PixelFootprint
+from scenes.optics import Optics
 from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, PositiveInt, checked
 
 
@@ -299,7 +299,7 @@ class AmcwCamera(CameraFacts):
             full_half_angle_deg=self.emitter.full_half_angle_deg.value,
             cutoff_half_angle_deg=self.emitter.cutoff_half_angle_deg.value,
             frequencies_hz=self.frequencies_hz,
-            footprint=PixelFootprint(),
+            beam_fwhm_rad=None,
             wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
             nearest_m=self.engine.min_range_mm.value * MM,

@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2
-from scenes.optics import FWHM_PER_DEVIATION, BeamFootprint, Optics
+from scenes.optics import FWHM_PER_DEVIATION, Optics
 from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, Share, checked
 
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
@@ -184,7 +184,7 @@ class ScannedLidar(CameraFacts):
             full_half_angle_deg=self.receiver.full_half_angle_deg.value,
             cutoff_half_angle_deg=self.receiver.cutoff_half_angle_deg.value,
             frequencies_hz=tuple(float(k / self.period_s) for k in range(1, len(self.weights) + 1)),
-            footprint=BeamFootprint(self.beam.fwhm_mrad.value * MRAD),
+            beam_fwhm_rad=self.beam.fwhm_mrad.value * MRAD,
             wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
             nearest_m=self.engine.min_range_mm.value * MM,
