@@ -81,7 +81,7 @@ def test_torch_has_the_same_statistics():
     from scenes.sensor import tabled_torch
 
     table = table_of("azure_kinect_nfov")
-    noise, same = tabled_torch.DepthNoise(table), DepthNoise(table)
+    noise, same = tabled_torch.TorchDepthNoise(table), DepthNoise(table)
     z, bright = torch.ones(2 * PAIRS, *noise.stretch.shape), torch.full(noise.stretch.shape, 0.6)
     frames = [frame[200:300, 250:400].double().numpy() for frame in noise(z, bright.expand_as(z))]
     rng = np.random.default_rng(1)

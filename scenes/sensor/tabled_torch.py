@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 
-class DepthNoise:
+class TorchDepthNoise:
     """Noise of one unit of a camera whose images are (h, w). ``table``: the arrays of the camera's file, or its path;
     ``device`` as torch names it; ``seed``: which unit."""
 
