@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
 ALBEDO = 0.6
-"""Of the planes; farther and nearer than the camera ranges, darker and brighter planes stand for distance."""
+"""Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance."""
 DARKEST = 0.02
 MEASURED, PER_OCTAVE = 2, 16
 """Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
