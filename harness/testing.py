@@ -315,7 +315,7 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
 
 
 def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
-    """What a detector that can learn returns can be stored and is the same twice; with it, it is sound on the cloud."""
+    """Learning returns arrays that can be stored, the same twice; with them the detector is sound on the cloud."""
     detector = make()
     if not isinstance(detector, Calibratable):
         return

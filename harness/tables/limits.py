@@ -149,10 +149,11 @@ LIMITS = Table(
         *CALLS,
         Column(
             "beside_per_m2",
-            "beside damage/m² (95 %)",
+            "beside/m²",
             ("beside.rate_per_m2", "beside.interval_per_m2"),
             "findings on damaged boards that count for no damage, with the exact 95 % Poisson interval",
             CALLS[0].text,
+            brief=lambda rate: text.UNKNOWN_TEXT if np.isnan(rate.value) else f"{rate.value:.2g}",
         ),
         Column("beside_calls", "", "beside.calls", "such findings counted"),
         Column("", "found", _found, brief=False),
@@ -161,7 +162,7 @@ LIMITS = Table(
         Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
         Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
         Column("hit_rate", "", ("rate", "rate_interval"), "hits by inspections, with an interval over boards"),
-        Column("targets", "targets", "targets", "damages, each counted once"),
+        Column("targets", "targets", "targets", "damages, each counted once", brief=False),
         Column("boards", "boards", "boards", "damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
         Column("threshold", "", "record.threshold", "in the detector's units"),
@@ -182,7 +183,7 @@ def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid
     if any(limit.over_units for limit in limits):
         return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
     grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
-    return replace(grid, title=f"{ONE_UNIT}: {grid.title}")
+    return replace(grid, title=f"{ONE_UNIT}: {grid.title.partition(': ')[2]}")
 
 
 def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:

@@ -231,7 +231,8 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     swept = any("source.target.damage.kind".startswith(axis) for axis in sweep)
     only = f": all are {KINDS[kind]}" if kind in KINDS and not swept else ""
     controls = any(limit.record.detector in TESTS_THE_HARNESS for limit in limits)
-    one_unit = "camera" in source and all(limit.record.units == 1 for limit in limits)
+    one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
+    one_unit &= all(limit.record.units == 1 for limit in limits)
     simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
     rules = (
         (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
