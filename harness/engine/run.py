@@ -195,7 +195,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
     outcome.failures += failures
     lost = {failure.what for failure in failures}
     jobs = [
-        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds), group.damaged.paths)
+        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds), _needs(group, outcome))
         for number, group in enumerate(groups)
         if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
     ]
@@ -205,6 +205,12 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
             outcome.examples += ends[job.name].value
         else:
             outcome.failures.append(_failure(job.name, ends[job.name]))
+
+
+def _needs(group: Group, outcome: Outcome) -> tuple[Path, ...]:
+    """Files that the pictures of a group need: views, and what detectors have learned."""
+    learned = (Path(file) for point, file in group.learned.items() if point in outcome.thresholds)
+    return (*group.damaged.paths, *learned)
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:

@@ -35,8 +35,7 @@ def _word(name: str | None) -> str:
     return name or "as declared"
 
 
-REPEAT = "number of the draw of noise; modulo study.units, on damaged boards, that of the camera's unit"
-COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat=REPEAT)
+COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat="draw of noise, and of study.units")
 BOARD = _columns(board="number of the board, in a study")
 POINT = _columns(point="digest of the set-up with its frames")
 ROLE = _columns(role="damaged, hole_free or calibration")
