@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -122,6 +123,22 @@ class ToldTheTruth(Protocol):
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
+        ...
+
+
+@runtime_checkable
+class Calibratable(Protocol):
+    """A detector that learns from hole-free clouds before it judges: the noise's spectrum, its tails, a memory of the
+    undamaged face. What it learns is plain arrays, so that it can be stored and sent; names are identifiers."""
+
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return what the clouds teach, as arrays without objects; empty where there is nothing to learn. The clouds
+        were taken as those that will be judged (camera, frames, average), of targets without damage. Changes neither
+        the detector nor the clouds. Raises UserError where they cannot be judged or are too few."""
+        ...
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
+        """Return the detector, of the same name and version, that uses what `calibrate` has returned."""
         ...
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
-NO_PROGRAMS = ("__init__", "__main__", "exchange", "listing", "testing", "prepare")
+PART_OF_SET_UP = "prepare"
 TASKS = (
     ("run an experiment and read its report", "tofpod sweep averaging"),
     ("state the smallest hole that a camera finds", "tofpod sweep detection_limit"),
@@ -53,9 +53,10 @@ def programs() -> dict[str, str]:
     """Return the programs by name, each with the first sentence of its description."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        if path.stem not in NO_PROGRAMS:
-            # read, not imported: the list is there at once
-            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        # read, not imported: the list is there at once
+        source = path.read_text(encoding="utf-8")
+        if "\ndef main(" in source and path.stem not in ("__main__", PART_OF_SET_UP):
+            text = ast.get_docstring(ast.parse(source)) or ""
             found[path.stem] = text.splitlines()[0].split(": ", 1)[-1].rstrip(".")
     return found
 

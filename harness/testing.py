@@ -12,6 +12,7 @@ Every check is a function of its own in `harness.testing`, listed in `CHECKS`.
 
 from __future__ import annotations
 
+import io
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,12 +22,26 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from detectors.interface import Detection, Detector, Evidence, Measurement
+from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement
+from harness.synthetic_clouds import (
+    DAMAGE,
+    DISTANCE_M,
+    LENS,
+    SHAPE,
+    cylinder,
+    plane,
+    synthetic_clouds,
+    with_gaps,
+    without,
+)
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Cloud, Lens, MapViews, Reason, Region, transform_points
+from harness.vocabulary.geometry import Cloud, Lens, MapViews, Region, transform_points
 
-__all__ = ["CHECKS", "check_detector"]
+__all__ = [
+    "CHECKS", "DAMAGE", "DISTANCE_M", "LENS", "SHAPE", "check_detector", "cylinder", "plane", "synthetic_clouds",
+    "with_gaps", "without",
+]  # fmt: skip
 
 
 def check_detector(
@@ -40,7 +55,7 @@ def check_detector(
     ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) are then validated by its
     ``settings_type``; or a function without arguments that makes a detector anew at each call. ``clouds``: what it is
     checked on, by default three small synthetic ones 0.7 m before the camera, within 90 mm of its axis, each with
-    damage of centimetres (`harness.testing`). Something must be found on one of them at least, at any
+    damage of centimetres (`harness.synthetic_clouds`). Something must be found on one of them at least, at any
     threshold, or nothing would have been checked.
 
     Not checked: whether the detector is any good, which is what a study measures.
@@ -59,74 +74,6 @@ def check_detector(
     detector = made()
     loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
     require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
-
-
-# ---------------------------------------------------------------- clouds
-
-
-SHAPE = (90, 120)  # rows and columns: 126 by 168 mm at 0.7 m
-DISTANCE_M, NOISE_M, FRAMES = 0.7, 3e-4, 20
-LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, 59.5, 44.5)
-DAMAGE = ((-0.04, -0.02, 0.010, 0.012), (0.03, 0.02, 0.007, 0.008), (0.05, -0.03, 0.008, -0.006))
-"""x, y and radius on the face, and depth behind it (before it, where negative), metres: two holes and a bump."""
-
-
-def synthetic_clouds() -> tuple[Cloud, ...]:
-    """A tilted plane, a cylinder's face, and a tilted plane some of whose pixels have no range; each with `DAMAGE`."""
-    return plane(seed=1), cylinder(seed=2), with_gaps(plane(seed=3), seed=4)
-
-
-def plane(seed: int, tilt: float = 0.1) -> Cloud:
-    """A plane whose z grows by ``tilt`` metres with each metre in x."""
-    return _seen(seed, lambda x, y: DISTANCE_M + tilt * x)
-
-
-def cylinder(seed: int, radius_m: float = 0.5) -> Cloud:
-    """The convex face of a cylinder about the y axis."""
-    return _seen(seed, lambda x, y: DISTANCE_M + radius_m - np.sqrt(radius_m**2 - x**2))
-
-
-def with_gaps(cloud: Cloud, seed: int, share: float = 0.05) -> Cloud:
-    """The cloud without a share of its pixels, without a block of them, and without its last column."""
-    gone = np.random.default_rng(seed).random(cloud.valid.shape) < share
-    gone[10:14, 20:26] = True
-    gone[:, -1] = True
-    return without(cloud, gone)
-
-
-def without(cloud: Cloud, gone: np.ndarray) -> Cloud:
-    """The cloud with no range at the pixels ``gone`` (h, w) bool."""
-    return replace(
-        cloud,
-        points_m=np.where(gone[..., None], np.nan, cloud.points_m),
-        reason=np.where(gone, Reason.NO_RETURN, cloud.reason).astype(np.uint8),
-        count=np.where(gone, 0, cloud.count),
-        variance_m2=np.where(gone, np.nan, cloud.variance_m2),
-    )
-
-
-def _seen(seed: int, face: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Cloud:
-    slopes = LENS.region_slopes(LENS.whole)
-    z = np.full(SHAPE, DISTANCE_M)
-    # the ray meets the face where z = face(z * slopes); the slopes are small, so that this converges by itself
-    for _ in range(60):
-        z = face(slopes[..., 0] * z, slopes[..., 1] * z)
-    x, y = slopes[..., 0] * z, slopes[..., 1] * z
-    for centre_x, centre_y, radius, depth in DAMAGE:
-        z = z + depth * (np.hypot(x - centre_x, y - centre_y) < radius)
-    z = z + NOISE_M * np.random.default_rng(seed).standard_normal(SHAPE)
-    points = np.concatenate([slopes, np.ones((*SHAPE, 1))], axis=-1) * z[..., None]
-    flat = np.zeros(SHAPE, dtype=np.uint8)
-    return Cloud(
-        points_m=points,
-        reason=flat,
-        count=flat.astype(np.int64) + FRAMES,
-        variance_m2=np.full(SHAPE, FRAMES * NOISE_M**2),
-        region=Region(0, SHAPE[0], 0, SHAPE[1]),
-        z_step_m=0.0,
-        n_frames=FRAMES,
-        lens=LENS,
-    )
 
 
 # ---------------------------------------------------------------- checks
@@ -367,6 +314,31 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
         require(_same(there, result), "a detector that was pickled gave another result")
 
 
+def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
+    """Learning returns arrays that can be stored, the same twice; with them the detector is sound on the cloud."""
+    detector = make()
+    if not isinstance(detector, Calibratable):
+        return
+    before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
+    given = [_with_arrays(one, _read_only) for one in clouds]
+    with no_crash("`calibrate`"):
+        learned, again = (dict(detector.calibrate(given)) for _ in range(2))
+    require(_same(learned, again), "the second time the same clouds taught something else")
+    file = io.BytesIO()
+    with no_crash("storing what was learned as an .npz without pickling"):
+        np.savez(file, **learned)  # type: ignore[arg-type]
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
+            restored = dict(stored)
+    require(_same(learned, restored), "what was learned is not the same once it is stored: no plain arrays")
+    with no_crash("`calibrated`"):
+        taught: Any = detector.calibrated(restored)
+    require((taught.name, taught.version) == (detector.name, detector.version), "learning changed name or version")
+    require(_same(before, Look.at(detector, cloud).everything()), "learning changed the detector that was asked")
+    for check in (gives_sound_evidence, is_silent_at_the_quiet_threshold, survives_pickling):
+        check(lambda: taught, cloud)
+
+
 def turns_with_the_cloud(make: Make, cloud: Cloud) -> None:
     """The camera turned about its optical axis by 90 and by 180 degrees, grid and lens with it."""
     look = Look.at(make(), cloud)
@@ -401,6 +373,7 @@ CHECKS = (
     refuses_an_empty_cloud,
     measures_extents,
     survives_pickling,
+    learns_plain_arrays,
     turns_with_the_cloud,
     moves_with_the_cloud,
 )

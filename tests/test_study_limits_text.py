@@ -65,16 +65,18 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
         assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in said
-    assert study_answer(two) == " ".join(limit_sentence(limit) for limit in two)
+    assert study_answer(two) == "One unit of the camera: " + " ".join(limit_sentence(limit) for limit in two)
 
 
 def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
     said = study_answer([*two, *two, nothing_found])
-    assert said.startswith(f"Of 5 set-ups, the smallest limit (a90/95) is {two[1].a90_95.value:.2f} mm (50 frames)")
+    assert said.startswith(
+        f"One unit of the camera: Of 5 set-ups, the smallest limit (a90/95) is {two[1].a90_95.value:.2f} mm (50 frames)"
+    )
     assert f"the largest {two[0].a90_95.value:.2f} mm (1 frame)" in said
     assert said.endswith("; 1 of 5 set-ups demonstrates no limit within the sizes inspected.")
     none = "None of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
-    assert study_answer([nothing_found] * 4) == none
+    assert study_answer([nothing_found] * 4) == f"One unit of the camera: {none}"
     assert study_answer([]) == "No set-up was inspected, so there is no answer."
 
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from detectors import DETECTORS, load_detector
-from detectors.interface import Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
+from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
-from harness.engine.setup import KnownCloud, highest_within
+from harness.engine.setup import KnownCloud, at_hand, highest_within
 from harness.evaluation.match import match
 from harness.vocabulary.geometry import MM
 from scenes.target.truth import Damage
@@ -27,7 +27,6 @@ FINDING_OCTAVES = (-2, 3)
 """Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
 PIXEL_OCTAVES = (-6, 4)
 """Other thresholds for pixels: reaches down to where a third of the undamaged face and more lies above."""
-_detector = lru_cache(maxsize=32)(lambda name, settings_json: load_detector(name, json.loads(settings_json)))
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,12 @@ def judge(
     radius_m: float,
     *,
     hole_free: bool,
+    learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge one detector on one cloud. Without a threshold only the quiet one is found."""
+    """Judge one detector on one cloud. Without a threshold only the quiet one is found. ``learned``: file of what the
+    detector has learned."""
     cloud = known.cloud
-    detector = detector_for(known, detector_name, settings_json, hole_free=hole_free)
+    detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)
     residual_m = evidence.residual_m[known.undamaged]
     residual_m = residual_m[np.isfinite(residual_m)]
@@ -87,9 +88,21 @@ def judge(
     return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, measured)
 
 
-def detector_for(known: KnownCloud, name: str, settings_json: str, *, hole_free: bool) -> Detector:
+@lru_cache(maxsize=32)
+def detector_of(name: str, settings_json: str, learned: str | None = None) -> Detector:
+    """Return a detector, with what it has learned where there is such a file."""
+    detector = load_detector(name, json.loads(settings_json))
+    if learned is None or not isinstance(detector, Calibratable):
+        return detector
+    with np.load(at_hand(learned), allow_pickle=False) as arrays:
+        return detector.calibrated(dict(arrays))
+
+
+def detector_for(
+    known: KnownCloud, name: str, settings_json: str, *, hole_free: bool, learned: str | None = None
+) -> Detector:
     """Return the detector that is to see a cloud. tofpod's own oracle is handed the truth; a plug-in never is."""
-    detector: Detector = _detector(name, settings_json)
+    detector = detector_of(name, settings_json, learned)
     if not (isinstance(detector, ToldTheTruth) and DETECTORS.offer(name).built_in):
         return detector
     truth = (
@@ -165,10 +178,16 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     score, threshold = judged.evidence.score, judged.run["threshold"]
     run = {**judged.run, "inspected_m2": known.area_m2(np.isfinite(score))}
     if np.isnan(threshold):
-        # the place on the board of the pixel with the highest score; NaN where it is off the board
-        loudest = int(np.nanargmax(score)) if np.isfinite(score).any() else None
-        x_m, y_m = (np.nan, np.nan) if loudest is None else known.places_m.reshape(-1, 2)[loudest]
-        return {"runs": [run | {"loudest_x_mm": float(x_m) / MM, "loudest_y_mm": float(y_m) / MM}], "holes": []}
+        # the place on the board, and on the sensor, of the pixel with the highest score; NaN where it is on neither
+        x_m = y_m = u_px = v_px = np.nan
+        if np.isfinite(score).any():
+            loudest, cloud = int(np.nanargmax(score)), known.cloud
+            x_m, y_m = known.places_m.reshape(-1, 2)[loudest]
+            if cloud.organised and cloud.projection == "central":
+                v_px, u_px = np.add(np.unravel_index(loudest, score.shape), (cloud.region.row0, cloud.region.col0))
+        run |= {"loudest_x_mm": float(x_m) / MM, "loudest_y_mm": float(y_m) / MM}
+        run |= {"loudest_u_px": float(u_px), "loudest_v_px": float(v_px)}
+        return {"runs": [run], "holes": []}
     without_return, run["no_return_calls"] = _without_return(known, judged, radius_m, hole_free=hole_free)
     signals = highest_within(known.places_m, score, _centres_m(known), radius_m).tolist()
     counts_for = {} if hole_free else {finding: str(known.truth[i].id) for i, finding in judged.pairs.items()}

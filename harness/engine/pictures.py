@@ -75,7 +75,8 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
             averages[name] = averages_of(capture, counts, asked.average, exact=asked.exact)
         cloud = averages[name][asked.frames]
         known = known_view(set_up, cloud, hole_free=False)
-        detector = detector_for(known, settings.name, canonical_json(settings.settings), hole_free=False)
+        named, learned = (settings.name, canonical_json(settings.settings)), group.learned.get(point.digest)
+        detector = detector_for(known, *named, hole_free=False, learned=learned)
         evidence = detector.analyse(cloud)
         detections = detector.find(cloud, evidence, thresholds[point.digest])
         example = ExampleCloud(
@@ -127,19 +128,20 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
     clouds = [averages_of(capture, [most], asked.average, exact=asked.exact) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0))
     chosen = [point for (count, _), point in last.items() if count in ends]
-    return [_map_example(maps, point, thresholds[point.digest]) for point in chosen]
+    return [_map_example(maps, point, thresholds[point.digest], group.learned.get(point.digest)) for point in chosen]
 
 
 def _mapping(point: Point) -> MappingConfig:
     return cast("MappingConfig", point.config.mapping)
 
 
-def _map_example(maps: MapMaker, point: Point, threshold: float) -> MappedExample:
+def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | None) -> MappedExample:
     mapping, frames = _mapping(point), point.config.capture.frames
     known = maps.known(mapping, frames, hole_free=False)
     cloud = known.cloud
     settings, radius_m = canonical_json(point.config.detector.settings), point.config.matching.radius_mm * MM
-    judged = judge(known, point.config.detector.name, settings, threshold, radius_m, hole_free=False)
+    named = (point.config.detector.name, settings, threshold, radius_m)
+    judged = judge(known, *named, hole_free=False, learned=learned)
     shown = np.flatnonzero(cloud.valid.ravel())
     shown = shown[:: max(1, -(-len(shown) // MOST_POINTS))]
     points_m = transform_points(known.T_board_cloud, cloud.points_m.reshape(-1, 3)[shown])
@@ -223,12 +225,12 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))
     asked = next(found for found in task.points if found.digest == point.digest)
-    set_up = load_set_up(batch.set_ups[0])
+    set_up = load_set_up(task.set_ups[0])
     capture = capture_of(set_up, 0, task, asked.frames)
     cloud = averages_of(capture, [asked.frames], asked.average, exact=asked.exact)[asked.frames]
     known = known_view(set_up, cloud, hole_free=False)
     given = (asked.detector, asked.settings_json, asked.threshold, asked.radius_m)
-    judged = judge(known, *given, hole_free=False)
+    judged = judge(known, *given, hole_free=False, learned=asked.learned)
     damage = next(found for found in known.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))

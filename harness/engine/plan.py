@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 from detectors import DETECTORS
 from harness.engine.journal import JOURNAL_VERSION
+from harness.engine.learning import LEARNING_BOARDS, learns
 from harness.engine.setup import SetUpRef
 from harness.engine.trial import PointTask, Role, TrialTask
 from harness.engine.work import Shard
@@ -18,7 +19,7 @@ from harness.experiment.schema import Experiment, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import source_digest
-from harness.vocabulary.seeds import canonical_json, digest
+from harness.vocabulary.seeds import canonical_json, digest, random_stream
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews, poses_of
 from scenes.render.cache import render_key
@@ -26,7 +27,7 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 
-CODE = "harness.engine.trial"
+CODE = "harness.engine.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
@@ -58,35 +59,59 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: one for each view.
-    ``board``: its number among a study's boards of this role; None for any other experiment."""
+    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: one for each view,
+    of all targets in a row where the role is "learning". ``board``: its number among a study's boards of this role;
+    None for any other experiment. ``units``: cameras that take the repeats in turn; none: that of the set-ups."""
 
     role: Role
     renders: tuple[RenderJob, ...]
     set_ups: tuple[SetUpRef, ...]
     board: int | None = None
+    units: tuple[CameraConfig, ...] = ()
 
     @cached_property
     def paths(self) -> tuple[Path, ...]:
         """The files of its views."""
         return tuple(job.path for job in self.renders)
 
+    def before(self, repeat: int) -> tuple[SetUpRef, ...]:
+        """Return the set-ups of a repeat, with its unit of the camera."""
+        if not self.units:
+            return self.set_ups
+        camera = self.units[repeat % len(self.units)]
+        return tuple(replace(ref, camera=camera) for ref in self.set_ups)
+
 
 @dataclass(frozen=True)
 class Group:
-    """Points that share their frames: one set-up, one seed. The batches ``first`` are hole-free and set the points'
-    thresholds; ``then`` those judged by them. ``poses``: the declaration of the views, where there are several."""
+    """Points that share their frames: one set-up, one seed. On the batch ``learning`` detectors that can do so learn;
+    the batches ``first`` are hole-free and set the points' thresholds; ``then`` those judged by them. ``poses``: the
+    declaration of the views, where there are several. ``folder``: the place of files of what was learned."""
 
     points: tuple[Point, ...]
+    learning: tuple[Batch, ...]
     first: tuple[Batch, ...]
     then: tuple[Batch, ...]
     seed: int
+    folder: Path
     poses: AnyViews | None = None
 
     @property
     def batches(self) -> tuple[Batch, ...]:
         """All, in the order in which they run."""
-        return (*self.first, *self.then)
+        return (*self.learning, *self.first, *self.then)
+
+    @cached_property
+    def learners(self) -> tuple[Point, ...]:
+        """Points whose detector learns."""
+        asked = ((point, point.config.detector) for point in self.points)
+        return tuple(point for point, detector in asked if learns(detector.name, detector.settings))
+
+    @cached_property
+    def learned(self) -> dict[str, str]:
+        """Files, by point digest, of what detectors learn: each has the name of its trial in the journal."""
+        trials = (trial for batch in self.learning for trial in self.trials(batch, None))
+        return {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
 
     @property
     def is_study(self) -> bool:
@@ -100,32 +125,49 @@ class Group:
 
     def repeats(self, batch: Batch, point: Point) -> int:
         """Return the number of trials of a batch that a point wants: with a given threshold, as many hole-free as
-        damaged ones; one of each board that sets a study's threshold."""
+        damaged ones; one of each board that sets a study's threshold; of damaged boards one, times ``repeats``, for
+        each unit."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
         if batch.role == "hole_free" and calibrate is not None and calibrate.repeats is not None:
             return calibrate.repeats
-        return point.config.repeats
+        return point.config.repeats * max(len(batch.units), 1)
 
     def most_repeats(self, batch: Batch) -> int:
-        """Return the number of trials of a batch."""
+        """Return the number of trials of a batch: of learning one for each learner."""
+        if batch.role == "learning":
+            return len(self.learners)
         return max(self.repeats(batch, point) for point in self.points)
 
     def trials(
-        self, batch: Batch, thresholds: Mapping[str, float] | None, repeats: Iterable[int] | None = None
+        self,
+        batch: Batch,
+        thresholds: Mapping[str, float] | None,
+        repeats: Iterable[int] | None = None,
+        without: Collection[str] = (),
     ) -> Iterator[tuple[str, TrialTask]]:
         """Yield (journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest,
-        empty while calibrating; a point that got none is not judged; None names trials that cannot be judged."""
+        empty while calibrating; a point that got none is not judged, nor is one of those ``without``; None names trials
+        that cannot be judged."""
+        if batch.role == "learning":
+            for number in range(len(self.learners)) if repeats is None else repeats:
+                learner = (_point_task(self.learners[number], None, None),)
+                task = TrialTask(batch.set_ups, self.seed, batch.role, 0, learner, self.poses)
+                yield self._key(batch, task), task
+            return
         given = {point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k) for point in self.points}
         unjudged = thresholds is None or batch in self.first
         points = [point for point in self.points if unjudged or given[point.digest] is not None]
-        asked = {point.digest: _point_task(point, given[point.digest]) for point in points}
+        points = [point for point in points if point.digest not in without]
+        learned = self.learned
+        asked = {one.digest: _point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
             if wanted:
-                task = TrialTask(batch.set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
+                set_ups = batch.before(repeat)
+                task = TrialTask(set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
                 yield self._key(batch, task), task
 
     def _key(self, batch: Batch, task: TrialTask) -> str:
@@ -137,18 +179,22 @@ class Group:
             task.role,
             task.board,
             task.repeat,
-            [[point.digest, point.variant, point.threshold] for point in task.points],
+            [ref.camera.unit_seed for ref in task.set_ups],
+            [[point.digest, point.variant, point.threshold, _name(point.learned)] for point in task.points],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"
 
 
-def _point_task(point: Point, threshold: float | None) -> PointTask:
+def _name(path: str | None) -> str | None:
+    return None if path is None else Path(path).name
+
+
+def _point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
     asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
-    return PointTask(
-        point.digest, point.variant, capture.frames, *asked, mapping=point.config.mapping, exact=capture.exact
-    )
+    further = (point.config.mapping, capture.exact, learned)
+    return PointTask(point.digest, point.variant, capture.frames, *asked, *further)
 
 
 @dataclass(frozen=True)
@@ -169,36 +215,62 @@ class SweepPlan:
         return sum(group.most_repeats(batch) for group in self.groups for batch in group.batches)
 
 
-def plan_of(experiment: Experiment, cache: Path) -> SweepPlan:
-    """Group the points of an experiment by the frames that they share."""
+def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
+    """Group the points of an experiment by the frames that they share. ``folder``: its results; None: the cache."""
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
-    return SweepPlan(tuple(_group(tuple(points), cache) for points in by_frames.values()))
+    return SweepPlan(tuple(_group(tuple(points), cache, folder or cache) for points in by_frames.values()))
 
 
-def _group(points: tuple[Point, ...], cache: Path) -> Group:
+def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     source, study = points[0].config.source, points[0].config.study
     assert isinstance(source, SimulatedSource)
     target, seed = source.target, points[0].config.seed
     if study is not None and isinstance(target, DrawnTargetConfig):
         calibrate = points[0].config.threshold.calibrate
         boards = 0 if calibrate is None else calibrate.boards or 0
-        counts: dict[Role, int] = {"calibration": boards, "hole_free": study.hole_free_boards, "damaged": study.boards}
-        first, hole_free, damaged = (
-            tuple(_batch(target.drawn(role, n), role, source, cache, n) for n in range(count))
-            for role, count in counts.items()
-        )
-        return Group(points, first, (*damaged, *hole_free), seed, source.views)
-    declared = target.declare()
-    if not declared.damages:
-        what = "the target has neither holes nor dents, so that there is nothing to find"
-        raise UserError(what, fix="declare source.target.holes or source.target.dents")
-    first, then = ((_batch(declared, role, source, cache),) for role in ("hole_free", "damaged"))
-    return Group(points, first, then, seed, source.views)
+
+        def batches(role: Role, count: int) -> tuple[Batch, ...]:
+            """Damaged boards stand before all units in turn, every other board before one of its own."""
+            made = []
+            for board in range(count):
+                numbers = range(study.units or 0) if role == "damaged" else [board] if study.units else []
+                units = tuple(_unit(source.camera, seed, role, number) for number in numbers)
+                made.append(_batch(target.drawn(role, board), role, source, cache, board, units))
+            return tuple(made)
+
+        learning, first = batches("learning", LEARNING_BOARDS), batches("calibration", boards)
+        then = (*batches("damaged", study.boards), *batches("hole_free", study.hole_free_boards))
+    else:
+        declared = target.declare()
+        if not declared.damages:
+            what = "the target has neither holes nor dents, so that there is nothing to find"
+            raise UserError(what, fix="declare source.target.holes or source.target.dents")
+        learning = (_batch(declared, "learning", source, cache),) * LEARNING_BOARDS
+        first, then = ((_batch(declared, role, source, cache),) for role in ("hole_free", "damaged"))
+    group = Group(points, (), first, then, seed, folder, source.views)
+    if not group.learners:
+        return group
+    renders = {job.path: job for batch in learning for job in batch.renders}
+    set_ups = tuple(ref for batch in learning for ref in batch.before(0))
+    return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
 
 
-def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None) -> Batch:
+def _unit(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
+    """The camera of a unit that was drawn for boards of a role."""
+    stream = random_stream(seed, "unit of the camera", camera.unit_seed, role, number)
+    return camera.model_copy(update={"unit_seed": int(stream.integers(2**32))})
+
+
+def _batch(
+    declared: TargetConfig,
+    role: Role,
+    source: SimulatedSource,
+    cache: Path,
+    board: int | None = None,
+    units: tuple[CameraConfig, ...] = (),
+) -> Batch:
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
     renders, set_ups, damaged = [], [], role == "damaged"
@@ -207,7 +279,7 @@ def _batch(declared: TargetConfig, role: Role, source: SimulatedSource, cache: P
         shown = placed if damaged else placed.hole_free()
         renders.append(RenderJob(shown, source.camera, source.render, cache))
         set_ups.append(SetUpRef(str(renders[-1].path), source.camera, placed, damaged))
-    return Batch(role, tuple(renders), tuple(set_ups), board)
+    return Batch(role, tuple(renders), tuple(set_ups), board, units)
 
 
 class PlanPart(NamedTuple):
@@ -221,8 +293,8 @@ class PlanPart(NamedTuple):
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
-    """Cut a plan, by group, into parts that set its thresholds, and judged parts that are the shard's. A group of which
-    the shard judges nothing has neither."""
+    """Cut a plan, by group, into parts that set its thresholds, those of learning first, and judged parts that are the
+    shard's. A group of which the shard judges nothing has neither."""
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)
@@ -239,6 +311,6 @@ def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[
             judged += cut(number, batch, range(max(mine.start - before, 0), min(mine.stop - before, count)), False)
             before += count
         then.append(judged)
-        calibrating = group.first if judged else ()
+        calibrating = (*group.learning, *group.first) if judged else ()
         first.append([part for one in calibrating for part in cut(number, one, range(group.most_repeats(one)), True)])
     return first, then

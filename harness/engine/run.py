@@ -1,5 +1,6 @@
-"""The run of a plan: renders feed trials; hole-free trials set thresholds first, then judged trials use these. All ends
-are in the journal; trials that the journal holds are not run again, and views that only they need are not rendered.
+"""The run of a plan: renders feed trials; detectors that can do so learn on hole-free boards, then hole-free trials set
+thresholds, then judged trials use both. All ends are in the journal; trials that the journal holds are not run again,
+and views that only they need are not rendered.
 
 Every shard calibrates for itself, and unlike processors give unlike last digits. So the journal stores the thresholds
 that were used beside the trials, and a merge keeps all work: trials that were judged at a threshold which agrees with
@@ -19,6 +20,7 @@ import numpy as np
 
 from harness.engine.journal import THRESHOLDS, Journal, record_text
 from harness.engine.judge import FINDING_OCTAVES, PIXEL_OCTAVES, grid
+from harness.engine.learning import learn, learned_file
 from harness.engine.pictures import pictures_of
 from harness.engine.plan import Group, PlanPart, RenderJob, SweepPlan, parts_of
 from harness.engine.processes import render_into_cache
@@ -27,6 +29,7 @@ from harness.engine.work import WHOLE, Ended, Failure, Job, JobEngine, Outcome, 
 from harness.evaluation.intervals import threshold_for_rate
 from harness.experiment.schema import Point
 from harness.vocabulary.errors import DiskFull, UserError
+from harness.vocabulary.files import write_bytes
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
@@ -40,6 +43,8 @@ class Calibration:
 
     def __init__(self, group: Group) -> None:
         self._group = group
+        self.unlearned: set[str] = set()
+        """Points whose detector should have learned and did not: they have no threshold, not even a given one."""
         self._quiet: dict[str, dict[str, tuple[float, float]]] = {}
         """Quiet threshold and judged area in m2, by point, then by trial."""
 
@@ -57,6 +62,9 @@ class Calibration:
         for point in self._group.points:
             quiet = self._quiet.get(point.digest, {})
             threshold, why = None, "no hole-free run ended"
+            if point.digest in self.unlearned:
+                failures.append(Failure(f"threshold of {point.label}", "its detector has learned nothing"))
+                continue
             try:
                 threshold = threshold_of(point, [quiet[key] for key in sorted(quiet)])
             except UserError as error:
@@ -159,7 +167,10 @@ def run_plan(
     outcome.trials.total = sum(len(part.repeats) for parts in (*first, *then) for part in parts)
     run.judged_paths = {n: [path for part in parts for path in part.batch.paths] for n, parts in enumerate(then)}
     try:
-        run.carry_out([part for parts in first for part in shard.rotated(parts)])
+        before = [part for parts in first for part in shard.rotated(parts)]
+        run.carry_out([part for part in before if part.batch.role == "learning"])
+        run.take_learned()
+        run.carry_out([part for part in before if part.batch.role != "learning"])
         run.carry_out([part for number, parts in enumerate(then) if parts for part in run.calibrated(number, parts)])
         while run.under_way:  # renders that nobody needs
             run.step()
@@ -184,7 +195,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
     outcome.failures += failures
     lost = {failure.what for failure in failures}
     jobs = [
-        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds), group.damaged.paths)
+        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds), _needs(group, outcome))
         for number, group in enumerate(groups)
         if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
     ]
@@ -194,6 +205,12 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
             outcome.examples += ends[job.name].value
         else:
             outcome.failures.append(_failure(job.name, ends[job.name]))
+
+
+def _needs(group: Group, outcome: Outcome) -> tuple[Path, ...]:
+    """Files that the pictures of a group need: views, and what detectors have learned."""
+    learned = (Path(file) for point, file in group.learned.items() if point in outcome.thresholds)
+    return (*group.damaged.paths, *learned)
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
@@ -311,6 +328,17 @@ class _Run:
             self._count(work, ended)
         self._report(self.outcome)
 
+    def take_learned(self) -> None:
+        """Write what detectors have learned into files, from which trials read it."""
+        for group, calibration in zip(self._groups, self._calibrations, strict=True):
+            for point, file in group.learned.items():
+                path = Path(file)
+                entry = self._journal.read(path.stem)
+                if entry is None or entry.record is None:
+                    calibration.unlearned.add(point)
+                elif not path.exists():
+                    write_bytes(path, learned_file(entry.record))
+
     def calibrated(self, number: int, judged: list[PlanPart]) -> list[PlanPart]:
         """Set the thresholds of a group; returns the parts that can be judged by them."""
         calibration = self._calibrations[number]
@@ -366,12 +394,15 @@ class _Run:
                 return
         self._begun += 1
         self.under_way[trial.key] = trial
-        self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,), trial.part.batch.paths))
+        learned = (Path(point.learned) for point in trial.task.points if point.learned is not None)
+        needs = (*trial.part.batch.paths, *learned)
+        self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,), needs))
 
     def _trials(self, part: PlanPart) -> list[_Trial]:
         """The trials of a part; judged ones that others judged at agreeing thresholds are filed under their keys."""
         group = self._groups[part.group]
-        made = group.trials(part.batch, self.outcome.thresholds, part.repeats)
+        unlearned = self._calibrations[part.group].unlearned
+        made = group.trials(part.batch, self.outcome.thresholds, part.repeats, unlearned)
         found = [_Trial(part, key, task) for key, task in made]
         self.outcome.trials.total += len(found) - len(part.repeats)
         if part.sets_threshold:
@@ -435,4 +466,4 @@ class _Run:
 
 def trial_as_text(task: TrialTask) -> str:
     """Return a trial's record as the journal keeps it; made where the trial runs, as it takes a millisecond."""
-    return record_text(run_trial(task))
+    return record_text(learn(task) if task.role == "learning" else run_trial(task))

@@ -156,14 +156,20 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
 
 
 sent_views: Path | None = None
-"""The folder, in a process that does not see the driver's cache, where views that were sent lie under their names."""
+"""The folder, in a process that does not see the driver's cache, where files that were sent lie under their names."""
+
+
+def at_hand(path: str) -> Path:
+    """Return the path of a stored file in this process: its own, or that of what was sent."""
+    place = Path(path)
+    return sent_views / place.name if sent_views is not None and not place.exists() else place
 
 
 @lru_cache(maxsize=32)
 def load_set_up(ref: SetUpRef) -> SetUp:
     """Return the set-up behind a reference, kept for the worker's next trials."""
-    place, T_camera_board = Path(ref.view_path), ref.target.pose.T_camera_board
-    view = read_view(sent_views / place.name if sent_views is not None and not place.exists() else place)
+    place, T_camera_board = at_hand(ref.view_path), ref.target.pose.T_camera_board
+    view = read_view(place)
     if view is None:
         raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")
     unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)

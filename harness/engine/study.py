@@ -59,7 +59,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     _refuse_newer(folder)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
-        plan = plan_of(experiment, cache)
+        plan = plan_of(experiment, cache, folder)
         # the first file written: an unwritable folder shows before any work is done
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         journal = Journal(folder / "journal")
@@ -306,8 +306,18 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     targets = [[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards]
     renders = (path.stem for batch in group.then for path in batch.paths)
     by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
-    unflawed = judged[judged["role"] == "hole_free"]
-    no_return = unflawed["no_return_calls"].to_numpy(int)
+
+    def false_calls(role: str) -> Unflawed:
+        ran = judged[judged["role"] == role]
+        no_return = ran["no_return_calls"].to_numpy(int)
+        return Unflawed(
+            board=ran["board"].to_numpy(int),
+            repeat=ran["repeat"].to_numpy(int),
+            calls=ran["false_calls"].to_numpy(int) + no_return,
+            area_m2=ran["inspected_m2"].to_numpy(float),
+            no_return_calls=no_return,
+        )
+
     loudest = calibrating[calibrating["quiet_threshold"].notna()]  # runs that judged no pixel are left out
     return SetUpRecord(
         variant=point.variant,
@@ -323,7 +333,14 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
         targets_digest=digest(targets),
         # equal where every frame of every judged board is
         frames_digest=digest(
-            [source_digest(SIMULATION, PACKAGES), *renders, point.frames_key, config.capture.to_data(), config.repeats]
+            [
+                source_digest(SIMULATION, PACKAGES),
+                *renders,
+                point.frames_key,
+                config.capture.to_data(),
+                config.repeats,
+                None if config.study is None else config.study.units,
+            ]
         ),
         inspected=Inspected(
             **{name.removeprefix("true_"): holes[name].to_numpy(kind) for name, kind in INSPECTED.items()},
@@ -331,13 +348,9 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             by_depth=by_depth,
             by_no_return=by_no_return,
         ),
-        unflawed=Unflawed(
-            board=unflawed["board"].to_numpy(int),
-            repeat=unflawed["repeat"].to_numpy(int),
-            calls=unflawed["false_calls"].to_numpy(int) + no_return,
-            area_m2=unflawed["inspected_m2"].to_numpy(float),
-            no_return_calls=no_return,
-        ),
+        unflawed=false_calls("hole_free"),
+        beside=false_calls("damaged"),
+        units=1 if config.study is None else config.study.units or 1,
         calibrated=None
         if loudest.empty
         else Calibrated(
@@ -346,6 +359,8 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             score=loudest["quiet_threshold"].to_numpy(float),
             x_mm=loudest["loudest_x_mm"].to_numpy(float),
             y_mm=loudest["loudest_y_mm"].to_numpy(float),
+            u_px=loudest["loudest_u_px"].to_numpy(float),
+            v_px=loudest["loudest_v_px"].to_numpy(float),
         ),
     )
 
@@ -355,7 +370,7 @@ def failed_by_point(plan: SweepPlan, whats: Iterable[str], thresholds: Mapping[s
     keys, counts = set(whats), Counter[str]()
     for group in plan.groups if keys else ():
         for batch in group.batches:
-            for key, task in group.trials(batch, {} if batch in group.first else thresholds):
+            for key, task in group.trials(batch, thresholds if batch in group.then else {}):
                 counts.update(asked.digest for asked in task.points if key in keys)
     return counts
 

@@ -303,9 +303,9 @@ def registration_error_m(
 # ---------------------------------------------------------------- trials
 
 
-Role = Literal["calibration", "hole_free", "damaged"]
-"""The purpose of a trial's target. Only in a study do boards that set a threshold ("calibration") differ from those on
-which false calls are counted at it ("hole_free")."""
+Role = Literal["learning", "calibration", "hole_free", "damaged"]
+"""The purpose of a trial's target. Detectors learn on those of "learning" (`harness.engine.learning`). Only in a study
+do boards that set a threshold ("calibration") differ from those on which false calls are counted ("hole_free")."""
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 LAGS = (1, 2, 3)  # distances in pixels at which the noise's correlation is taken
 FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its standard error would exceed 0.14
@@ -313,7 +313,8 @@ FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its 
 
 @dataclass(frozen=True)
 class PointTask:
-    """The demands of a point on a trial. ``threshold`` is None while it is being calibrated."""
+    """The demands of a point on a trial. ``threshold`` is None while it is being calibrated. ``learned``: file of what
+    its detector has learned; None for one that learns nothing, or is learning."""
 
     digest: str
     variant: str
@@ -325,6 +326,7 @@ class PointTask:
     threshold: float | None
     mapping: MappingConfig | None = None
     exact: bool = False
+    learned: str | None = None
 
 
 @dataclass(frozen=True)
@@ -373,6 +375,15 @@ def run_trial(task: TrialTask) -> Rows:
     return record
 
 
+def cloud_of(task: TrialTask, point: PointTask) -> Cloud:
+    """Return the cloud, or the map, that a point's detector sees in a trial."""
+    set_ups = [load_set_up(ref) for ref in task.set_ups]
+    clouds = [_clouds(set_up, number, task, [point]) for number, set_up in enumerate(set_ups)]
+    if task.poses is None or point.mapping is None:
+        return clouds[0][point.frames]
+    return MapMaker(set_ups, clouds, task.poses, task.labels).merged(point.mapping, point.frames).cloud
+
+
 def _clouds(set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointTask]) -> dict[int, Cloud]:
     """One view's averages, of as many frames as the points that use this view ask for."""
     views = [None if point.mapping is None else point.mapping.views for point in points]
@@ -414,7 +425,7 @@ def _point_rows(
         source = maps.key(mapping, point.frames)
     began = time.perf_counter()
     asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
-    key = canonical_json([source, *asked])
+    key = canonical_json([source, *asked, point.learned])
     if key not in done:
         if maps is None or mapping is None:
             known = known_view(first, views[point.frames], hole_free=task.hole_free)
@@ -423,7 +434,7 @@ def _point_rows(
             if task.hole_free and task.board is None:
                 errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
                 probes = [{"error_tenth_um": _tenth_um(errors_m)}]
-        judged = judge(known, *asked, hole_free=task.hole_free)
+        judged = judge(known, *asked, hole_free=task.hole_free, learned=point.learned)
         if task.board is None:
             done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}
         else:

@@ -41,7 +41,7 @@ TRACEBACK_CHARACTERS = 4000
 @dataclass(frozen=True)
 class Job:
     """``function(*arguments)``, somewhere. The function is importable by its name; arguments and result are plain data
-    or frozen dataclasses. ``needs``: stored views that it reads."""
+    or frozen dataclasses. ``needs``: stored views, and other files, that it reads."""
 
     name: str
     stage: Stage

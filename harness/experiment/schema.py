@@ -165,10 +165,16 @@ class SensitivityConfig(Config):
 class StudyConfig(Config):
     """A study of the probability of detection: the target is a family of boards, each one drawn at random. ``boards``
     with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the experiment
-    is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each."""
+    is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each.
+
+    ``units`` draws units of the camera, each with a fixed pattern of its own: every damaged board is inspected by all
+    of them, every other board, those that set the threshold too, by a unit of its own."""
 
     boards: Boards
     hole_free_boards: Boards
+    units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
+        None, description="of the camera; none: one unit, source.camera.unit_seed, for which alone limits then hold"
+    )
 
 
 class ExperimentConfig(Config):

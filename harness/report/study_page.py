@@ -17,7 +17,7 @@ from harness.report.clouds import StudyExample, examples_figure
 from harness.report.page import COLOURS, MARKERS
 from harness.report.pod import draw_hits, draw_pod, draw_signals, hits_in_view, plain, plain_numbers
 from harness.tables import study
-from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, name_of, study_answer
+from harness.tables.limits import is_within_sizes, limit_notes, limit_sentence, limits_grid, name_of, study_answer
 from harness.tables.outputs import REPORT
 from harness.tables.schema import Table
 from harness.tables.text import Grid, unbroken
@@ -280,7 +280,7 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     """Return what a terminal shows of a study: warnings, limits, what to know beside them, the answer."""
     warnings = [f"warning: {text}" for text in study.threshold_warnings(result.limits)]
     notes = limit_notes(result.limits)
-    grid = LIMITS.grid(result.limits, terminal=True)
+    grid = limits_grid(result.limits, terminal=True)
     return [*warnings, grid, *([""] if notes else []), *notes, "", study_answer(result.limits)]
 
 
@@ -322,7 +322,7 @@ def study_html(
         rule="Fixed beforehand: a damage is found where the centre of a finding lies within "
         f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
         "board are no further targets.",
-        limits=table(LIMITS),
+        limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(note) for note in limit_notes(limits)],
         set_ups=len(limits),
         most_panels=MOST_PANELS,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,8 +17,10 @@ from harness.evaluation.pod.curve import Bound
 from harness.evaluation.study.limit import SetUpLimit
 from harness.tables import text
 from harness.tables.schema import Column, Estimate, Table
+from harness.tables.text import Grid
 
 MOST_ANSWERS = 3
+ONE_UNIT = "One unit of the camera"
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
 """Words of a statement's note on an extrapolated bound; pages have words of their own for it."""
@@ -68,6 +71,19 @@ CALLS = (
 )
 
 
+def quoted(limit: SetUpLimit) -> Bound:
+    """Return the limit to quote: a new unit's where there are several, else a90/95 of the one unit."""
+    return limit.a90_95 if limit.over_units is None else limit.over_units.new_unit
+
+
+def _one_unit(limit: SetUpLimit) -> Estimate:
+    """a90/95 as a study of one unit alone would state it: of several units the median, with the least and the most."""
+    bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
+    middle, low, high = (float(of(bounds)) for of in (np.median, np.min, np.max))
+    ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
+    return Estimate(middle if np.isfinite(middle) else np.nan, *ends, limit.largest_mm)
+
+
 def _verdict(limit: SetUpLimit, bound: Bound) -> str:
     beyond = "beyond the sizes inspected" if bound.demonstrated else NOT_DEMONSTRATED
     return "demonstrated" if is_within_sizes(limit, bound) else beyond
@@ -114,19 +130,39 @@ LIMITS = Table(
             tone=lambda one: "" if is_within_sizes(one, one.over_boards) else "bad",
         ),
         Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), "likewise"),
+        Column(
+            "new_unit_mm",
+            "new unit (mm)",
+            lambda one: bound_estimate(one, quoted(one)) if one.over_units else None,
+            "of several units: upper bound at 95 % confidence of the a90 of a unit drawn anew",
+            lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
+        ),
+        Column("new_unit_verdict", "", lambda one: _verdict(one, quoted(one)) if one.over_units else None, "likewise"),
+        Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of one unit alone: median, least, most", **BRIEF),
+        Column("unit_spread", "", "over_units.spread", "standard deviation of ln a90 between units, noise included"),
+        Column("units", "", "record.units", "units of the camera"),
         Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
         Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, likewise", **BRIEF),
         Column("is_at_most", "", "is_at_most", "everything was found: a50 and a90 are at most this"),
         Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest diameter inspected"),
         Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest diameter inspected"),
         *CALLS,
+        Column(
+            "beside_per_m2",
+            "beside/m²",
+            ("beside.rate_per_m2", "beside.interval_per_m2"),
+            "findings on damaged boards that count for no damage, with the exact 95 % Poisson interval",
+            CALLS[0].text,
+            brief=lambda rate: text.UNKNOWN_TEXT if np.isnan(rate.value) else f"{rate.value:.2g}",
+        ),
+        Column("beside_calls", "", "beside.calls", "such findings counted"),
         Column("", "found", _found, brief=False),
         Column("hits", "", "hits", "damages found"),
         Column("inspections", "", "inspections", "damages inspected, repeats counted"),
         Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
         Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
         Column("hit_rate", "", ("rate", "rate_interval"), "hits by inspections, with an interval over boards"),
-        Column("targets", "targets", "targets", "damages, each counted once"),
+        Column("targets", "targets", "targets", "damages, each counted once", brief=False),
         Column("boards", "boards", "boards", "damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
         Column("threshold", "", "record.threshold", "in the detector's units"),
@@ -141,26 +177,40 @@ LIMITS = Table(
 )
 
 
+def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
+    """Return the table for a page or a terminal; columns on units only where there are several, and with one unit its
+    first words say so."""
+    if any(limit.over_units for limit in limits):
+        return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
+    grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
+    return replace(grid, title=f"{ONE_UNIT}: {grid.title.partition(': ')[2]}")
+
+
 def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
     sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
     return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return what the study says: a sentence for each set-up, or the span of the limits of many."""
+    """Return what the study says: a sentence for each set-up, or the span of the limits of many. With one unit of the
+    camera it says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
+    return _answer(limits) if any(limit.over_units for limit in limits) else f"{ONE_UNIT}: {_answer(limits)}"
+
+
+def _answer(limits: Sequence[SetUpLimit]) -> str:
     if len(limits) <= MOST_ANSWERS:
         return " ".join(limit_sentence(limit) for limit in limits)
-    shown = sorted((one for one in limits if is_within_sizes(one)), key=lambda one: one.a90_95.value)
+    shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
     if not shown:
         return (
             f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected{_sizes(*limits)}."
         )
     best, worst = shown[0], shown[-1]
     span = (
-        f"Of {len(limits)} set-ups, the smallest limit (a90/95) is {text.size(best.a90_95.value)} mm "
-        f"({best.record.label}), the largest {text.size(worst.a90_95.value)} mm ({worst.record.label})"
+        f"Of {len(limits)} set-ups, the smallest limit (a90/95) is {text.size(quoted(best).value)} mm "
+        f"({best.record.label}), the largest {text.size(quoted(worst).value)} mm ({worst.record.label})"
     )
     without = len(limits) - len(shown)
     few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
@@ -169,30 +219,35 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
 
 def limit_sentence(limit: SetUpLimit) -> str:
     """Return ``50 frames: damage of 5.31 mm is found 90 % of the time with 95 % confidence (a90/95), at ...``."""
-    if not limit.a90_95.demonstrated:
-        reason = _reason(limit)
+    quote, new = quoted(limit), ""
+    if limit.over_units is not None:
+        new = f" by a new unit of the camera, judged from {limit.over_units.units},"
+    if not quote.demonstrated:
+        reason = _reason(quote)
         if reason.startswith("a chance that does not grow with size"):
             reason = "the hits do not grow clearly with diameter"
         # without its statistics, which stand in the notes
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
-    elif not is_within_sizes(limit):
+    elif not is_within_sizes(limit, quote):
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
     else:
-        confidence = f"{100 * limit.a90_95.confidence:.0f} %"
-        size = text.size(limit.a90_95.value)
-        found = f"damage of {size} mm is found 90 % of the time with {confidence} confidence (a90/95)"
+        confidence, size = f"{100 * quote.confidence:.0f} %", text.size(quote.value)
+        found = f"damage of {size} mm is found 90 % of the time{new} with {confidence} confidence (a90/95)"
     calls, rate = limit.false_calls, ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
+        if limit.over_units is not None:  # a board is a unit: calls of one are not independent
+            over = limit.false_calls_interval_per_m2
+            ends = (ends[0], float(np.fmin(ends[1], over.low)), float(np.fmax(ends[2], over.high)))
         at, low, high = (f"{end:.2g}" if end < 99.5 else f"{end:.0f}" for end in ends)
-        joint = ", at" if is_within_sizes(limit) else ";"
+        joint = ", at" if is_within_sizes(limit, quote) else ";"
         rate = f"{joint} {at} false call{'' if at == '1' else 's'} per m² ({low} to {high})"
     return f"{limit.record.label}: {found}{rate}."
 
 
 def notes_of(limit: SetUpLimit) -> list[str]:
     """Return why there is no limit, or what makes it a cautious or a doubtful one."""
-    said = [] if limit.a90_95.demonstrated else [_reason(limit)]
+    said = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
     if stated is None:
         said += [limit.a90_95.method] if limit.a90_95.demonstrated else []
@@ -207,7 +262,7 @@ def notes_of(limit: SetUpLimit) -> list[str]:
                 f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.targets} "
                 "targets"
             )
-    if limit.boards_matter:
+    if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
         said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
     only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
@@ -226,8 +281,8 @@ def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     return [f"{name}: {'; '.join(said)}" for name, said in own if said]
 
 
-def _reason(limit: SetUpLimit) -> str:
-    return limit.a90_95.why.removeprefix(f"{NOT_DEMONSTRATED}: ")
+def _reason(bound: Bound) -> str:
+    return bound.why.removeprefix(f"{NOT_DEMONSTRATED}: ")
 
 
 def _sizes(*limits: SetUpLimit) -> str:

@@ -27,6 +27,7 @@ REPORT = Output("report.html", "the report, one file, readable offline")
 EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
 PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
 STUDY = Output("study.json", "every inspection of every set-up: what `harness.compare` reads", of="study")
+LEARNED = Output("learning-*.npz", "what a detector has learned from hole-free boards of their own: arrays by name")
 MAPS = Output("map-*.html", "a map that turns in the browser", of="views")
 CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
@@ -40,7 +41,7 @@ TARGETS = Output("targets.png", "targets that were found, and the chosen one", "
 BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
 CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
 FILES = (
-    REPORT, EXPERIMENT, PROVENANCE, STUDY, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE,
+    REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE,
     FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"

@@ -31,6 +31,8 @@ from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import Grid
 from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text
 
+BLOB_PX = 5.0
+"""Distance on the sensor up to which two highest scores are those of one blob: the window of a camera's filter."""
 HIGH_THRESHOLD = 10.0
 """Deviations: the highest of a hole-free board is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
@@ -98,7 +100,8 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run whose highest score is a set-up's threshold, its rank, and the highest score of all."""
+    """The hole-free run whose highest score is a set-up's threshold, its rank, and the highest score of all.
+    ``same_pixels``: runs, itself included, whose highest score lies on the same pixels of the sensor."""
 
     limit: SetUpLimit
     board: int
@@ -108,6 +111,7 @@ class SetBy:
     runs: int
     highest_score: float
     highest_board: int
+    same_pixels: int | None
 
     @property
     def place(self) -> str:
@@ -123,7 +127,11 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
             at, top = int(np.abs(runs.score - limit.record.threshold).argmin()), int(runs.score.argmax())
             place = (int(runs.board[at]), float(runs.x_mm[at]), float(runs.y_mm[at]))
             rank = 1 + int((runs.score > runs.score[at]).sum())
-            found.append(SetBy(limit, *place, rank, len(runs.score), float(runs.score[top]), int(runs.board[top])))
+            same = None
+            if runs.u_px is not None and runs.v_px is not None:
+                same = int((np.hypot(runs.u_px - runs.u_px[at], runs.v_px - runs.v_px[at]) <= BLOB_PX).sum())
+            highest = (float(runs.score[top]), int(runs.board[top]))
+            found.append(SetBy(limit, *place, rank, len(runs.score), *highest, same))
     return found
 
 
@@ -141,14 +149,22 @@ SET_BY = Table(
         Column("runs", "of runs", "runs", "calibration runs"),
         Column("highest_score", "highest of all", "highest_score", "highest score of all runs"),
         Column("highest_board", "on board", "highest_board", "its board"),
+        Column("same_pixels", "runs highest on these pixels", "same_pixels", "runs highest on the same pixels"),
     ),
 )
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return a sentence for each calibrated threshold that is too high for noise to have set it."""
+    """Return a sentence for each calibrated threshold that is too high for noise to have set it, or that the same
+    pixels of the sensor set on half of the boards."""
     said = []
     for one in set_by(limits):
+        if (one.same_pixels or 0) > max(one.runs / 2, 1):
+            said.append(
+                f"{one.limit.record.label}: {one.same_pixels} of {one.runs} calibration boards are loudest on the same "
+                "pixels of the sensor: the threshold is that of one place of this unit's pattern, not of many "
+                "(study.units draws units)"
+            )
         threshold = one.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
             where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"

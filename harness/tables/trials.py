@@ -35,7 +35,7 @@ def _word(name: str | None) -> str:
     return name or "as declared"
 
 
-COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat="number of the draw of noise")
+COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat="draw of noise, and of study.units")
 BOARD = _columns(board="number of the board, in a study")
 POINT = _columns(point="digest of the set-up with its frames")
 ROLE = _columns(role="damaged, hole_free or calibration")
@@ -124,6 +124,8 @@ RUNS = Table(
             no_return_calls="of a study: false calls without return",
             loudest_x_mm="of calibration: place of the highest score",
             loudest_y_mm="likewise",
+            loudest_u_px="its column on the sensor",
+            loudest_v_px="its row on the sensor",
             views_used="of maps: views merged",
             views_left_out="of maps: views left out after a failed registration",
             seconds_map="of maps: time of making the map",

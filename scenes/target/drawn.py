@@ -26,8 +26,9 @@ from scenes.target import custom
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
-Purpose = Literal["calibration", "hole_free", "damaged"]
-"""Purpose of boards: to set a threshold, to count false calls, to be inspected; each has boards of its own."""
+Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
+"""Purpose of boards: for detectors to learn on, to set a threshold, to count false calls, to be inspected; each has
+boards of its own."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Limits of a pose's distance, jitter included."""
 WIDEST_BACKING_MM = 1e4

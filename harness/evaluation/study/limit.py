@@ -30,7 +30,8 @@ from harness.evaluation.pod.curve import (
 from harness.evaluation.pod.hit_miss import HitMissFit, band, bound, fit_hit_miss
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
-from harness.evaluation.study.record import Inspected, SetUpRecord
+from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.evaluation.study.units import OverUnits, over_units
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
@@ -40,12 +41,14 @@ DRAWS = 500
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Damages, one a row: ``board`` (n,), ``size_mm`` (n,), ``hits`` of ``inspections`` (n,)."""
+    """Damages, one a row: ``board`` (n,), ``size_mm`` (n,), ``hits`` of ``inspections`` (n,); ``unit`` (n,) of the
+    camera where each unit's inspections of a damage are a row of their own."""
 
     board: np.ndarray
     size_mm: np.ndarray
     hits: np.ndarray
     inspections: np.ndarray
+    unit: np.ndarray | None = None
 
     @property
     def boards(self) -> int:
@@ -83,6 +86,8 @@ def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], d
     centre, spread = float(x.mean()), float(x.std()) or 1.0
     z = (x - centre) / spread
     weights = row_weights(targets.board, draws)
+    if targets.unit is not None:
+        weights = weights * row_weights(targets.unit, draws, "units")
     hits, misses = weights * targets.hits, weights * (targets.inspections - targets.hits)
     largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
     smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
@@ -253,7 +258,9 @@ class SetUpLimit:
     one order for all set-ups of as many boards. ``over_boards``: a90/95 were damages of one board as alike as the data
     say. Where everything is found the estimates are the smallest size inspected, which they do not exceed; where
     nothing is, or POD does not grow with size, they are NaN and their draws infinite. ``signals``: a second opinion,
-    the signal's regression with the threshold as decision, or ``signals_why`` not."""
+    the signal's regression with the threshold as decision, or ``signals_why`` not. ``over_units``: limits of the units
+    of a study with several and of a new one; draws are then over boards and units. ``beside``: findings on damaged
+    boards that count for no damage."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -277,6 +284,8 @@ class SetUpLimit:
     signals: PodStatement | None
     signals_why: str
     largest_mm: float
+    over_units: OverUnits | None
+    beside: FalseCallRate | None
 
     @property
     def is_at_most(self) -> bool:
@@ -299,10 +308,11 @@ def limit_of(
     """Judge ``record``. ``noise_floor``: signals up to this are what unflawed places give too, so they enter the
     regression of signals as censored; NaN where unknown. ``tested``: for a floor and a ceiling too, with a note.
     Deterministic. No error for data without a curve: ``why``."""
-    seen, unflawed = record.inspected, record.unflawed
+    seen = record.inspected
     targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
     statement: PodStatement | None = None
     why, effect, n = "no damage was inspected", np.nan, len(seen.hit)
+    units: OverUnits | None = None
     if n:
         try:
             statement, why = state_hits(_rows(record, seen.hit, np.ones(n, bool)), unit="mm", tested=tested), ""
@@ -314,11 +324,18 @@ def limit_of(
             note = f"depths from {low:.3g} to {high:.3g} mm: one curve over all depths"
             statement = replace(statement, notes=(*statement.notes, note))
         a90_95, a50, a90 = statement.bound, statement.a50, statement.a90
-        of_a50, of_a90 = refitted_sizes(targets, statement.curve, (0.5, POD), draws)
+        apart = targets
+        if record.units > 1:
+            unit, ones = seen.repeat % record.units, np.ones(n)
+            apart = Targets(seen.board, seen.diameter_mm, seen.hit.astype(float), ones, unit)
+        of_a50, of_a90 = refitted_sizes(apart, statement.curve, (0.5, POD), draws)
         fit = fit_of(record, statement)
         if fit.method == "ML":
             effect = design_effect(targets, statement.curve, POD)
         over_boards = bound(fit, design_effect=effect) if effect > 1 else a90_95
+        if apart.unit is not None:
+            rows = (apart.size_mm, seen.hit, target_names(seen), apart.unit)
+            units = over_units(*rows, statement.curve, over_boards)
     elif n and seen.hit.all():
         # Were the POD of the 29th smallest target below 90 %, so would those of the 28 smaller ones be, and all 29
         # would be found in less than 5 % of studies. So a90 lies below its size, with no assumption but that POD grows.
@@ -331,14 +348,11 @@ def limit_of(
         a50 = a90 = np.nan
         a90_95 = over_boards = Bound(POD, CONFIDENCE, "likelihood ratio", np.inf, f"not demonstrated: {why}")
         of_a50 = of_a90 = np.full(draws, np.inf)
-    rate_interval = calls_interval = UNKNOWN
+    rate_interval = UNKNOWN
     if targets.hits.sum() not in (0.0, targets.inspections.sum()):
         rate_interval = _over_boards(targets.board, targets.hits, targets.inspections, draws, "damaged")
-    calls = None
-    if len(unflawed.board):
-        calls = false_call_rate(int(unflawed.calls.sum()), float(unflawed.area_m2.sum()))
-        if calls.calls:
-            calls_interval = _over_boards(unflawed.board, unflawed.calls, unflawed.area_m2, draws, "hole-free")
+    calls, calls_interval = _false_calls(record.unflawed, draws, "hole-free")
+    beside, _ = _false_calls(record.beside, draws, "damaged")
     judged = np.isfinite(seen.signal)  # where no pixel was judged there is no signal
     signals: PodStatement | None = None
     signals_why = f"{int(judged.sum())} signals"
@@ -354,7 +368,7 @@ def limit_of(
     counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n, float(seen.hit.mean()) if n else np.nan)
     estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
     largest_mm = float(seen.diameter_mm.max()) if n else np.nan
-    further = (signals_why, largest_mm)
+    further = (signals_why, largest_mm, units, beside)
     return SetUpLimit(
         record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
     )
@@ -370,6 +384,14 @@ def fit_of(record: SetUpRecord, statement: PodStatement) -> HitMissFit:
 def target_names(seen: Inspected) -> np.ndarray:
     """Name (n,) what each row inspects: repeats of one damage of one board have the same name."""
     return np.array([f"{board}:{hole}" for board, hole in zip(seen.board, seen.hole, strict=True)], dtype=str)
+
+
+def _false_calls(runs: Unflawed | None, draws: int, population: str) -> tuple[FalseCallRate | None, Interval]:
+    """The rate of false calls in runs, and its interval over boards; unknown without runs or calls."""
+    if runs is None or not len(runs.board):
+        return None, UNKNOWN
+    rate = false_call_rate(int(runs.calls.sum()), float(runs.area_m2.sum()))
+    return rate, _over_boards(runs.board, runs.calls, runs.area_m2, draws, population) if rate.calls else UNKNOWN
 
 
 def _over_boards(board: np.ndarray, count: np.ndarray, of: np.ndarray, draws: int, population: str) -> Interval:

@@ -117,8 +117,9 @@ class Inspected:
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
-    """Runs on hole-free boards that set no threshold: ``board``, ``repeat`` (m,) int, ``calls`` (m,) int false calls,
-    ``area_m2`` (m,) of face that was judged; ``no_return_calls`` (m,) int: calls without return among them, or None."""
+    """Runs on boards of one kind that set no threshold, hole-free or damaged: ``board``, ``repeat`` (m,) int, ``calls``
+    (m,) int false calls, ``area_m2`` (m,) of face that was judged; ``no_return_calls`` (m,) int: calls without return
+    among them, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -131,7 +132,8 @@ class Unflawed:
 @dataclass(frozen=True, eq=False)
 class Calibrated:
     """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int; ``score`` (k,): of the highest pixel, above
-    which the run has no finding; ``x_mm``, ``y_mm`` (k,): where that pixel lies on the board, NaN where off it."""
+    which the run has no finding; ``x_mm``, ``y_mm`` (k,): where that pixel lies on the board, NaN where off it;
+    ``u_px``, ``v_px`` (k,): its column and row on the sensor, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -139,6 +141,8 @@ class Calibrated:
     score: Numbers
     x_mm: NumbersOrNull
     y_mm: NumbersOrNull
+    u_px: NumbersOrNull | None = None
+    v_px: NumbersOrNull | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +150,10 @@ class SetUpRecord:
     """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold`` in the detector's
     units, ``threshold_mm`` NaN where it has no scale; ``calibration_runs`` hole-free runs on boards of their own set it
     (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and damage, ``frames_digest`` those with
-    camera, noise seed and the code that simulates. ``calibrated``: what those runs found, where kept."""
+    camera, noise seed and the code that simulates. ``calibrated``: what those runs found, where kept. ``beside``: runs
+    on the damaged boards, where kept, whose false calls are findings that count for no damage. ``units`` of the camera:
+    of more than one, repeat r of a damaged board is before unit r modulo ``units``, and every other board before a unit
+    of its own."""
 
     __pydantic_config__ = FORM
     variant: Name
@@ -163,6 +170,8 @@ class SetUpRecord:
     inspected: Annotated[Inspected, AfterValidator(_one_table)]
     unflawed: Annotated[Unflawed, AfterValidator(_one_table)]
     calibrated: Annotated[Calibrated, AfterValidator(_one_table)] | None = None
+    beside: Annotated[Unflawed, AfterValidator(_one_table)] | None = None
+    units: Annotated[Whole, Field(ge=1)] = 1
 
     @property
     def label(self) -> str:

@@ -177,12 +177,18 @@ def _departures(
     simulated = facts.get("source", {}).get("kind") == "simulated"
     repeated = any(limit.inspections > limit.targets for limit in limits)
     calibrated = any(limit.record.calibration_runs for limit in limits)
+    units = max((limit.record.units for limit in limits), default=1)
     independent = "a90/95 takes them as independent; the bound with their design effect stands beside it"
     counted = "and count once each, the criterion of a90/95 scaled by the number of inspections"
     rules = (
         (simulated, "Boards and camera are simulated. The handbook speaks of real flaws and the real system."),
         (a_board > 1, f"Targets share boards, {a_board:.3g} to a board. {independent} (Rao and Scott 1984)."),
         (repeated, f"Targets were inspected more than once with new noise {counted}."),
+        (
+            units > 1,
+            f"{units} units of the camera inspected each damaged board, and every other board was before a unit of its "
+            "own. Intervals of sizes are over units and boards drawn again; patches of one sensor are taken as alike.",
+        ),
         (calibrated, "Other calibration boards would give another threshold, which is in no interval here."),
         # the handbook's curve has one size; depth is a second one
         (depths, f"Depths of {span} share one curve over diameter: the limits are not those of any one depth."),
@@ -226,13 +232,18 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     only = f": all are {KINDS[kind]}" if kind in KINDS and not swept else ""
     controls = any(limit.record.detector in TESTS_THE_HARNESS for limit in limits)
     one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
+    one_unit &= all(limit.record.units == 1 for limit in limits)
     simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
     rules = (
         (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
         (True, "An inspector, who can miss findings and doubt others: the POD is that of the program alone."),
         (drawn, f"Damage that is not round, that stands in rows or clusters, or several kinds on one board{only}."),
         (simulated, "Gloss, translucency, undeclared light, motion, dirt and wear: all surfaces are Lambertian."),
-        (one_unit, "Other units of the camera: fixed pattern and offset are those of one unit."),
+        (
+            one_unit,
+            "Other units of the camera: fixed pattern and offset are those of one unit. What many frames leave over "
+            "lies on the same pixels of all its boards, which are not as independent as the intervals take them to be.",
+        ),
         (
             any(limit.boards for limit in limits),
             "Boards of another family: intervals are over boards drawn like these.",

@@ -1,0 +1,57 @@
+"""Hole-free boards on which a detector learns before its threshold is calibrated.
+
+Detectors that can do so implement `detectors.interface.Calibratable`. What one has learned is stored in the journal, as
+thresholds are, so that it is resumed, merged and shared by shards; and in a file of the same name, from which trials
+read it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from dataclasses import replace
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+
+from detectors import load_detector
+from detectors.interface import Calibratable
+from harness.engine.judge import Rows, detector_of
+from harness.engine.trial import TrialTask, cloud_of
+from harness.vocabulary.seeds import canonical_json
+
+LEARNING_BOARDS = 8
+"""Boards, outside of a study repeats of the one target, on which a detector learns, and on which nothing else is done:
+some 200,000 pixels of a board at 0.7 m, so that a spectrum is known to a few per cent."""
+
+
+def learns(detector: str, settings: dict[str, object]) -> bool:
+    """Return whether a detector can learn."""
+    return _learns(detector, canonical_json(settings))
+
+
+@lru_cache(maxsize=1000)
+def _learns(detector: str, settings_json: str) -> bool:
+    return isinstance(load_detector(detector, json.loads(settings_json)), Calibratable)
+
+
+def learn(task: TrialTask) -> Rows:
+    """Return the record of what the one detector of a task learns: its arrays as an ``.npz`` in base 64. The task's
+    set-ups are those of `LEARNING_BOARDS` boards in a row."""
+    (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
+    boards = (
+        replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)
+        for number in range(LEARNING_BOARDS)
+    )
+    clouds = [cloud_of(board, point) for board in boards]
+    learned = cast("Calibratable", detector_of(point.detector, point.settings_json)).calibrate(clouds)
+    file = io.BytesIO()
+    np.savez_compressed(file, **dict(learned))  # type: ignore[arg-type]
+    return {"runs": [], "learned": [{"arrays": base64.b64encode(file.getvalue()).decode()}]}
+
+
+def learned_file(record: Rows) -> bytes:
+    """Return the ``.npz`` that a record of `learn` holds."""
+    return base64.b64decode(record["learned"][0]["arrays"])

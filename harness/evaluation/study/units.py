@@ -1,0 +1,70 @@
+"""Limits over units of a camera: each unit's own, and the limit of a unit drawn anew.
+
+All units inspect the same boards, so that their limits differ by the unit and by noise alone. Logarithms of the units'
+a90 are taken as normal (a random effect of the unit). With 95 % confidence that of a new unit lies less than
+t(0.95, U - 1) s sqrt(1 + 1 / U) above their mean, where s is the standard deviation of U units. The mean has an error
+from the boards, which all units share: that of a90/95 over boards, ln(a90/95) - ln(a90). Both are independent, and
+their margins are joined as the root of the sum of squares (Zou and Donner, Statistics in Medicine 27 (2008), 1693).
+``tests/validation/units_coverage.py`` measures how often a new unit keeps to the limit. Not modelled: units that differ
+in more than their fixed pattern (temperature, age, a maker's change of parts)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.evaluation.pod.curve import Bound, PodCurve
+from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
+from harness.evaluation.pod.statement import CONFIDENCE, POD
+from harness.vocabulary.errors import UserError
+
+METHOD = "prediction of a new unit over units and boards"
+
+
+@dataclass(frozen=True, eq=False)
+class OverUnits:
+    """``a90_mm``, ``a90_95_mm`` (u,): those of each unit alone, with link and axis of all units; infinite where a unit
+    has none. ``spread``: standard deviation of ln a90 between units, noise of their hits included.
+    ``new_unit``: upper bound, at 95 % confidence, of the a90 of a unit drawn anew."""
+
+    a90_mm: np.ndarray
+    a90_95_mm: np.ndarray
+    spread: float
+    new_unit: Bound
+
+    @property
+    def units(self) -> int:
+        """Number of units."""
+        return len(self.a90_mm)
+
+
+def over_units(
+    size_mm: np.ndarray, hit: np.ndarray, target: np.ndarray, unit: np.ndarray, curve: PodCurve, limit: Bound
+) -> OverUnits:
+    """Judge inspections, one a row (n,): ``hit`` bool, names of what was inspected (``target``), and ``unit`` numbers.
+    ``curve`` is that of all units together, ``limit`` its a90/95 over boards. A unit that found all or nothing has no
+    limit of its own, and then none is demonstrated for a new one."""
+    from scipy.stats import t
+
+    found = []
+    for number in np.unique(unit):
+        own = unit == number
+        asked = {"link": curve.link, "log_size": curve.log_size, "inspections": target[own]}
+        try:
+            fit = fit_hit_miss(size_mm[own], hit[own], **asked)
+            found.append((fit.curve.size_at(POD), bound(fit).value))
+        except UserError:
+            found.append((np.inf, np.inf))
+    a90_mm, a90_95_mm = np.array(found, float).T
+    units = len(a90_mm)
+    with np.errstate(invalid="ignore"):
+        spread = float(np.log(a90_mm).std(ddof=1)) if np.isfinite(a90_mm).all() else np.inf
+    margin = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
+    value, why = np.inf, f"not demonstrated: {limit.why.removeprefix('not demonstrated: ')}"
+    if not np.isfinite(spread):
+        why = "not demonstrated: a unit found every damage or none, so that units cannot be compared"
+    elif limit.demonstrated:
+        a90 = float(curve.size_at(POD))
+        value, why = a90 * float(np.exp(np.hypot(np.log(limit.value / a90), margin))), ""
+    return OverUnits(a90_mm, a90_95_mm, spread, Bound(POD, CONFIDENCE, METHOD, value, why))
