@@ -23,6 +23,7 @@ that template.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import cv2
@@ -44,6 +45,7 @@ from detectors.whitening import (
     spectrum,
     worths,
 )
+from harness.vocabulary.geometry import Cloud
 
 WINDOW_RADII, LEAST_WINDOW = 6, 32
 """Half of the window in which scores are set beside their own scatter: so many radii, and pixels at least."""
@@ -65,7 +67,7 @@ RIM_PX = 6
 """Depth of the target's rim: the camera's window and lens reach so far over its edge."""
 WIDE_PX = 6.0
 """Radius from which on noise may break a template's finding into several peaks."""
-TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 4.0, 0.0005, 3.29
+TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Radius up to which a template's scores tell their own tail, the share of pixels beyond it on either side, and where
 a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
@@ -102,6 +104,34 @@ class MatchedDetector(LocalDetector):
         text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm of the narrowest"
         return signed, depth_m, text
 
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return the mean covariance of the clouds' residuals, in squared deviations of the noise round about, by
+        lag."""
+        learner = _Learner(self.settings)
+        for cloud in hole_free:
+            learner.analyse(cloud)
+        return {"covariance": np.mean(learner.seen, axis=0)} if learner.seen else {}
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
+        """Return the detector that whitens by the learned covariance instead of the capture's own."""
+        return type(self)(self.settings, learned.get("covariance"))
+
+
+class _Learner(MatchedDetector):
+    """Keeps the covariance of each cloud that it analyses."""
+
+    def __init__(self, settings: MatchedConfig) -> None:
+        super().__init__(settings)
+        self.seen: list[np.ndarray] = []
+
+    def scored(
+        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    ) -> tuple[np.ndarray, float, str]:
+        """Return scores of 0."""
+        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
+        self.seen.append(_covariance(values, known))
+        return np.zeros(values.shape), float(np.median(unit_m[known])), ""
+
 
 def _in_deviations(
     residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
@@ -116,9 +146,11 @@ def _in_deviations(
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of the residuals that do not stand out."""
+    """Return the covariance of the residuals that do not stand out, off the rim unless most pixels lie there."""
+    inner = known & (_depth_px(known) > RIM_PX)
+    inner = inner if 2 * inner.sum() > known.sum() else known
     loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
-    return noise_covariance(noise, known & (loud == 0), grid_of(noise.shape))
+    return noise_covariance(noise, inner & (loud == 0), grid_of(noise.shape))
 
 
 def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -185,14 +217,15 @@ def _cores(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (r, c) bool: the loud pixels, and what lies between them, that peaks of the scores' ``size`` stand on,
     where they fill the disc of the template (r, c) that the peak is ``by``: of what is wide and shallow only the
-    loudest pixels would go. Further their signed scores (r, c), the peak's in proportion to the residual, so that two
-    holes that touch keep two peaks, and more where the loud pixels' median exceeds the clipped size; and these
-    templates (r, c)."""
+    loudest pixels would go. Further their signed scores (r, c), in proportion to the residual over 3 x 3 pixels, so
+    that two holes that touch keep two peaks, and higher where the loud pixels' median exceeds the clipped size; and
+    these templates (r, c)."""
     peaks = (size > STRONG) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
     core, signed, found_by = np.zeros(size.shape, bool), np.zeros(size.shape), np.zeros(size.shape, np.int64)
     if not peaks.any():
         return core, signed, found_by
     loud = known & (np.abs(noise) > LOUD_SIGMAS)
+    smooth = cv2.blur(np.where(known, noise, np.float32(0.0)), (3, 3)) / cv2.blur(known.astype(np.float32) + 1e-6, (3, 3))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(
         cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
     )
@@ -206,8 +239,11 @@ def _cores(
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
-        heights = noise[cut][part].astype(np.float64)
-        louder = max(float(np.median(np.abs(heights)[np.abs(heights) > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
+        sizes, heights = np.abs(noise[cut][part]), smooth[cut][part].astype(np.float64)
+        louder = max(float(np.median(sizes[sizes > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
+        # quiet pixels between loud ones are no finding of the other sign
+        side = np.sign(heights[np.abs(heights).argmax()])
+        heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
         signed[cut][part] = score[number] * louder * heights / np.abs(heights).max()
         core[cut] |= part
         found_by[cut][part] = template[number]
