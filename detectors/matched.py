@@ -225,7 +225,8 @@ def _cores(
     if not peaks.any():
         return core, signed, found_by
     loud = known & (np.abs(noise) > LOUD_SIGMAS)
-    smooth = cv2.blur(np.where(known, noise, np.float32(0.0)), (3, 3)) / cv2.blur(known.astype(np.float32) + 1e-6, (3, 3))
+    around = (cv2.blur(each, (3, 3)) for each in (np.where(known, noise, np.float32(0.0)), known.astype(np.float32)))
+    smooth = next(around) / np.maximum(next(around), 0.1)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(
         cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
     )
