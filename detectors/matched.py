@@ -31,11 +31,13 @@ import numpy as np
 import scipy.fft
 from pydantic import model_validator
 
+from detectors.interface import Evidence
 from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, local_sigma
 from detectors.masks import grown
 from detectors.whitening import (
     ALL_RADII_PX,
     GRID,
+    LONGEST_LAG_PX,
     ROUGHLY_CONVERGED,
     grid_of,
     inverse_times,
@@ -103,6 +105,17 @@ class MatchedDetector(LocalDetector):
         depth_m = narrowest * float(np.median(unit_m[known]))
         text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm of the narrowest"
         return signed, depth_m, text
+
+    def correlation(self, evidence: Evidence) -> np.ndarray:
+        """Return the learned correlation of the noise by lag, or that of the residuals."""
+        covariance = self._covariance
+        if covariance is None:
+            known = np.isfinite(evidence.residual_m)
+            residual_m = np.where(known, evidence.residual_m, 0.0)
+            covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
+        reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+        lags = scipy.fft.irfft2(spectrum(covariance, (GRID, GRID)), (GRID, GRID))[np.ix_(reach, reach)]
+        return np.asarray(lags / lags[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals, in squared deviations of the noise round about, by

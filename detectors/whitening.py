@@ -7,12 +7,14 @@ by the longest lag, so that nothing wraps around.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import scipy.fft
+from scipy.linalg import solve_triangular
 
 RADII_PX = (0.5, 1.5, 2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
 """Radii of discs seen through a window of 5 x 5 pixels, as continuous-wave cameras filter their phasors."""
@@ -30,6 +32,7 @@ that 30,000 pixels tell each of its values to some per cent."""
 LEAST_POWER = 0.3
 """The spectrum is nowhere below this share of its mean: frequencies that a filter or an interpolation took out hold no
 signal either. 0.02 to 0.3 give the same limits with known cameras, 1.0 gives larger ones."""
+MOST_WHITENED = 2000  # pixels whose dense covariance is factored: 0.2 s and 64 MB
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
 CONVERGED, ROUGHLY_CONVERGED, MOST_ITERATIONS = 0.01, 0.1, 30
@@ -144,3 +147,31 @@ def _drawn(radius_px: float, blur_px: float, *, dent: bool = False) -> np.ndarra
     height = np.maximum(1.0 - apart**2, 0.0) if dent else (apart < 1.0).astype(float)
     pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
     return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
+
+
+def whitener(
+    used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the function that turns the values (n, ...) of the ``used`` pixels (r, c) into others whose errors are
+    independent, with deviation 1; None where there are too many pixels, or the correlation is not known or none. Errors
+    are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
+    rows, columns = np.nonzero(used)
+    if correlation is None or len(rows) > MOST_WHITENED:
+        return None
+    reach = correlation.shape[0] // 2
+    lags = np.stack([rows[:, None] - rows, columns[:, None] - columns]) + reach
+    inside = ((lags >= 0) & (lags <= 2 * reach)).all(axis=0)
+    alike = np.where(inside, correlation[tuple(np.clip(lags, 0, 2 * reach))], 0.0)
+    try:
+        factor = np.linalg.cholesky(alike * (deviation**2 + np.outer(model_error[used], model_error[used])))
+    except np.linalg.LinAlgError:
+        return None
+    return partial(solve_triangular, factor, lower=True, check_finite=False)
+
+
+def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
+    """Return S' S (p, p) with S the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
+    padded = np.pad(np.moveaxis(columns, 0, -1), ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
+    summed = cv2.boxFilter(padded, -1, (across, down), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    flat = summed.reshape(-1, len(columns))
+    return np.asarray(flat.T @ flat)
