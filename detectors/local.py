@@ -173,7 +173,11 @@ class LocalDetector:
         """Measure the thesis' extents, and the model of a blurred hole, of the finding's core."""
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
-        return measure_detection(cloud, evidence, core, self.settings.hole_model)
+        return measure_detection(cloud, evidence, core, self.settings.hole_model, self.correlation(evidence))
+
+    def correlation(self, evidence: Evidence) -> np.ndarray | None:
+        """Return the noise's correlation (odd, odd) by lag, by which sizes are weighed; None where it is not known."""
+        return None
 
 
 def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:

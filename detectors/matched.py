@@ -1,8 +1,8 @@
 """Holes, dents and bumps by a bank of matched filters on whitened noise.
 
 The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the capture itself, off what
-stands out. Each template t (discs of several radii through a camera's window or lens, and dents) is then compared with
-the residuals r under that covariance C, restricted to the pixels that are known:
+stands out, or learned from hole-free clouds. Each template t (discs of several radii through a camera's window or lens,
+and dents) is then compared with the residuals r under that covariance C, restricted to the pixels that are known:
 
     score = t' C^-1 r / sqrt(t' C^-1 t)
 
@@ -11,17 +11,19 @@ gradients, so missing pixels and borders add nothing and need no filling. Backgr
 part of the covariance, and counts as little as its power demands.
 
 What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter
-sees the shoulder of a neighbour's hole.
+sees the shoulder of a neighbour's hole. What pixels along the target's outline share is subtracted: what lies behind
+the edge, and light from beside, have a part in them.
 
 Not modelled: slots and scratches, missing returns (`detectors.missing` finds them), templates' distortion where a
-surface is steep, tails of the noise that are heavier than Gaussian. The denominator takes the share of a template's
-whitened energy on known pixels for t' C^-1 t, which is exact where all of the template is seen; places where less than
-`LEAST_SEEN` of it is seen are not judged by that template.
+surface is steep. Tails that are heavier than Gaussian scale the narrow templates' scores as a whole. The denominator
+takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely,
+which is exact where all of the template is seen; places where less than `LEAST_SEEN` of it is seen are not judged by
+that template.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import cv2
@@ -29,26 +31,26 @@ import numpy as np
 import scipy.fft
 from pydantic import model_validator
 
-from detectors.local import LocalConfig, LocalDetector, local_sigma
+from detectors.interface import Evidence
+from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, local_sigma
+from detectors.masks import grown
+from detectors.whitening import (
+    ALL_RADII_PX,
+    GRID,
+    LONGEST_LAG_PX,
+    ROUGHLY_CONVERGED,
+    grid_of,
+    inverse_times,
+    noise_covariance,
+    response,
+    spectra,
+    spectrum,
+    worths,
+)
+from harness.vocabulary.geometry import Cloud
 
-RADII_PX = (0.5, 1.5, 2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
-"""Radii of discs seen through a window of 5 x 5 pixels, as continuous-wave cameras filter their phasors."""
-SHARP_RADII_PX = (0.6, 1.2, 2.0)
-"""Radii of discs blurred by `LENS_BLUR_PX` only: cameras without such a window."""
-DENT_RADII_PX = (6.0, 9.0, 13.0, 18.0)
-"""Radii of paraboloids."""
-ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX)
 WINDOW_RADII, LEAST_WINDOW = 6, 32
 """Half of the window in which scores are set beside their own scatter: so many radii, and pixels at least."""
-WINDOW = (0.6, 1.0, 1.0, 1.0, 0.6)
-LENS_BLUR_PX = 0.6
-DENT_BLUR_PX = 1.0
-LONGEST_LAG_PX = 20
-"""Lag at which the covariance has faded (Parzen's window): long enough for the pattern of known cameras, short enough
-that 30,000 pixels tell each of its values to some per cent."""
-LEAST_POWER = 0.3
-"""The spectrum is nowhere below this share of its mean: frequencies that a filter or an interpolation took out hold no
-signal either. 0.02 to 0.3 give the same limits with known cameras, 1.0 gives larger ones."""
 LEAST_SEEN = 0.5
 QUIET_SIGMAS = 4.0
 """Pixels beyond it, and their neighbours, do not count for the covariance."""
@@ -57,13 +59,19 @@ CLIP_SIGMAS = 5.0
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
+ROUGHLY = (0, 2, 4, 6, 8, 9, 11, 13, 15)
+"""Templates that tell what stands out strongly."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
 ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
-MOST_PASSES = 4
-CONVERGED, MOST_ITERATIONS = 0.003, 30
-"""Relative residual at which C^-1 r counts as solved."""
+RIM_PX = 6
+"""Depth of the target's rim: the camera's window and lens reach so far over its edge."""
+WIDE_PX = 6.0
+"""Radius from which on noise may break a template's finding into several peaks."""
+TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
+"""Radius up to which a template's scores tell their own tail, the share of pixels beyond it on either side, and where
+a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
 
 class MatchedConfig(LocalConfig):
@@ -81,163 +89,197 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 1
+    version = 2
+
+    def __init__(self, settings: MatchedConfig, covariance: np.ndarray | None = None) -> None:
+        """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
+        super().__init__(settings)
+        self._covariance = covariance
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and the unit."""
-        known = weights > 0
-        floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
-        # residuals in units of the noise round about, louder where a point's own variance says so
-        values = np.where(known, residual_m * np.sqrt(weights), np.nan)
-        unit_m = np.maximum(local_sigma(values, floor=floor_m), floor_m)
-        signed, narrowest = _judged(np.where(known, values / unit_m, 0.0), known)
+        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
+        signed, narrowest = _judged(values, known, self._covariance)
         depth_m = narrowest * float(np.median(unit_m[known]))
         text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm of the narrowest"
         return signed, depth_m, text
 
+    def correlation(self, evidence: Evidence) -> np.ndarray:
+        """Return the learned correlation of the noise by lag, or that of the residuals."""
+        covariance = self._covariance
+        if covariance is None:
+            known = np.isfinite(evidence.residual_m)
+            residual_m = np.where(known, evidence.residual_m, 0.0)
+            covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
+        reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+        lags = scipy.fft.irfft2(spectrum(covariance, (GRID, GRID)), (GRID, GRID))[np.ix_(reach, reach)]
+        return np.asarray(lags / lags[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
 
-def _judged(noise: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return the mean covariance of the clouds' residuals, in squared deviations of the noise round about, by
+        lag."""
+        learner = _Learner(self.settings)
+        for cloud in hole_free:
+            learner.analyse(cloud)
+        return {"covariance": np.mean(learner.seen, axis=0)} if learner.seen else {}
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
+        """Return the detector that whitens by the learned covariance instead of the capture's own."""
+        return type(self)(self.settings, learned.get("covariance"))
+
+
+class _Learner(MatchedDetector):
+    """Keeps the covariance of each cloud that it analyses."""
+
+    def __init__(self, settings: MatchedConfig) -> None:
+        super().__init__(settings)
+        self.seen: list[np.ndarray] = []
+
+    def scored(
+        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    ) -> tuple[np.ndarray, float, str]:
+        """Return scores of 0."""
+        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
+        self.seen.append(_covariance(values, known))
+        return np.zeros(values.shape), float(np.median(unit_m[known])), ""
+
+
+def _in_deviations(
+    residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return residuals (r, c) in units of the noise round about, louder where a point's own variance says so, and less
+    what they share along the outline; that unit (r, c) in metres; and (r, c) bool, what is known."""
+    known = weights > 0
+    floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
+    values = np.where(known, residual_m * np.sqrt(weights), np.nan)
+    unit_m = np.maximum(local_sigma(values, floor=floor_m), floor_m)
+    return _without_rim(np.where(known, values / unit_m, 0.0), known), unit_m, known
+
+
+def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the covariance of the residuals that do not stand out, off the rim unless most pixels lie there."""
+    inner = known & (_depth_px(known) > RIM_PX)
+    inner = inner if 2 * inner.sum() > known.sum() else known
+    loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
+    return noise_covariance(noise, inner & (loud == 0), grid_of(noise.shape))
+
+
+def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    shape = tuple(scipy.fft.next_fast_len(side + 2 * LONGEST_LAG_PX, real=True) for side in noise.shape)
-    sizes = np.abs(noise)
-    noise = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS).astype(np.float32)
-    quiet = known & (cv2.dilate((sizes > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0)
-    power = noise_power(noise, quiet, shape)
-    loud = sizes > LOUD_SIGMAS
-    steps = np.arange(-MARGIN_PX, MARGIN_PX + 1)
-    around = (np.hypot(steps[:, None], steps) <= MARGIN_PX + 0.5).astype(np.uint8)
-    seen, taken = known, np.zeros(noise.shape)
-    for number in range(MOST_PASSES):
-        scores, narrowest = _scores(np.where(seen, noise, 0.0).astype(np.float32), seen, power, shape)
-        best_by = np.abs(scores).argmax(axis=0)
-        best = np.take_along_axis(scores, best_by[None], axis=0)[0]
-        louder = _cores(best, np.asarray(ALL_RADII_PX)[best_by], np.where(loud & seen, sizes, 0.0), seen)
-        core = louder > 0.0
-        if number == MOST_PASSES - 1 or not core.any():
-            break
-        taken = np.where(core, best * louder, taken)
-        seen = seen & (cv2.dilate(core.astype(np.uint8), around) == 0)
-    # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
-    signed = np.zeros(noise.shape)
-    for k, radius_px in zip(range(len(scores)), ALL_RADII_PX, strict=False):
-        judged = np.where(scores[k] != 0.0, scores[k], np.nan)
-        scatter = np.maximum(local_sigma(judged, int(max(WINDOW_RADII * radius_px, LEAST_WINDOW))), 1.0)
-        score = scores[k] / scatter
-        signed = np.where((taken == 0.0) & (np.abs(score) > np.abs(signed)), score, signed)
-        # which template fits a strong finding best hangs on little; the narrowest's scatter stands for all
-        signed = np.where(taken != 0.0, taken / scatter, signed) if k == 0 else signed
-    return np.where(known, signed, 0.0), narrowest
+    grid = grid_of(noise.shape)
+    covariance = _covariance(noise, known) if covariance is None else covariance
+    power, worth_of = spectrum(covariance, grid), worths(spectrum(covariance, (GRID, GRID)))
+    clipped = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS)
+
+    # what stands out strongly: its pixels count as unknown for the rest
+    rough = scipy.fft.rfft2(inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED), grid)
+    first = [response(rough, spectra(grid)[k], noise.shape) * worth_of[k].energy ** -0.5 for k in ROUGHLY]
+    size = np.abs(first)
+    core, taken, taken_by = _cores(size.max(axis=0), np.asarray(ROUGHLY)[size.argmax(axis=0)], noise, known)
+    seen = known & ~grown(core, MARGIN_PX)
+
+    weighed = scipy.fft.rfft2(inverse_times(np.where(seen, clipped, np.float32(0.0)), seen, power, grid), grid)
+    there, divisors = seen.astype(np.float32), np.ones(len(ALL_RADII_PX))
+    signed, radius_px = np.zeros_like(noise), np.zeros_like(noise)
+    for k, (template, worth) in enumerate(zip(spectra(grid), worth_of, strict=True)):
+        share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
+        score = response(weighed, template, noise.shape) / np.sqrt(worth.energy * np.maximum(share, LEAST_SEEN))
+        score = np.where(share > LEAST_SEEN, score, np.float32(0.0))
+        # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
+        window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW))
+        scatter = np.maximum(local_sigma(np.where(score != 0.0, score, np.nan), window), 1.0)
+        score = score / scatter
+        tail = _tail(score[seen]) if ALL_RADII_PX[k] <= TAIL_PX else 1.0
+        score, divisors[k] = score / tail, tail * np.median(scatter)
+        better = np.abs(score) > np.abs(signed)
+        signed, radius_px = np.where(better, score, signed), np.where(better, np.float32(ALL_RADII_PX[k]), radius_px)
+    _fill_discs(signed, radius_px)
+    signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
+    return signed.astype(np.float64), worth_of[0].energy ** -0.5
 
 
-def _cores(score: np.ndarray, radius_px: np.ndarray, loud: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (r, c) more than 0 on the loud pixels (their size, else 0), and on what lies between them, that peaks of
-    the score stand on, where they fill the template's disc: of what is wide and shallow only the loudest pixels would
-    go. The value is how often the median of the loud pixels exceeds the clipped size, 1 at least."""
-    size = np.abs(score).astype(np.float32)
+def _tail(scores: np.ndarray) -> float:
+    """Return how much farther the tail of scores (n,) reaches than a Gaussian's, on the side where it is shorter,
+    since damage lengthens one; 1 at least."""
+    count = int(TAIL_SHARE * len(scores))
+    if count == 0:
+        return 1.0
+    parted = np.partition(scores, (count - 1, len(scores) - count))
+    return max(1.0, float(min(parted[-count], -parted[count - 1])) / TAIL_SIGMAS)
+
+
+def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
+    """Raise the scores (r, c) inside the disc of each wide template that peaks, so that what it explains is one
+    finding."""
+    size = np.abs(signed)
+    peaks = (size > LOUD_SIGMAS) & (radius_px >= WIDE_PX) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2)))
+    for row, column in np.argwhere(peaks):
+        radius = int(radius_px[row, column])
+        cut = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+        rows, columns = np.indices(size[cut].shape)
+        apart = np.hypot(rows - min(row, radius), columns - min(column, radius))
+        least = SADDLE * 1.01 * signed[row, column]
+        inside = (apart <= radius) & (signed[cut] * np.sign(least) > 0)
+        signed[cut][inside] = np.sign(least) * np.maximum(size[cut][inside], abs(least))
+
+
+def _cores(
+    size: np.ndarray, by: np.ndarray, noise: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (r, c) bool: the loud pixels, and what lies between them, that peaks of the scores' ``size`` stand on,
+    where they fill the disc of the template (r, c) that the peak is ``by``: of what is wide and shallow only the
+    loudest pixels would go. Further their signed scores (r, c), in proportion to the residual over 3 x 3 pixels, so
+    that two holes that touch keep two peaks, and higher where the loud pixels' median exceeds the clipped size; and
+    these templates (r, c)."""
     peaks = (size > STRONG) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
-    joined = cv2.connectedComponents(cv2.dilate((loud > 0).astype(np.uint8), np.ones((3, 3), np.uint8)))[1]
-    parts = np.where(seen, joined, 0)
-    area = np.bincount(parts.ravel())
-    louder = np.zeros(score.shape)
-    for (row, column), radius in zip(np.argwhere(peaks), radius_px[peaks], strict=True):
+    core, signed, found_by = np.zeros(size.shape, bool), np.zeros(size.shape), np.zeros(size.shape, np.int64)
+    if not peaks.any():
+        return core, signed, found_by
+    loud = known & (np.abs(noise) > LOUD_SIGMAS)
+    around = (cv2.blur(each, (3, 3)) for each in (np.where(known, noise, np.float32(0.0)), known.astype(np.float32)))
+    smooth = next(around) / np.maximum(next(around), 0.1)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(
+        cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
+    )
+    score, template = np.zeros(count), np.zeros(count, np.int64)
+    for row, column in np.argwhere(peaks):
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
-            if number > 0 and area[number] > LOUD_SHARE * np.pi * radius**2:
-                part = parts == number
-                louder[part] = max(float(np.median(loud[part & (loud > 0)])) / CLIP_SIGMAS, 1.0)
-    return louder
+            least = LOUD_SHARE * np.pi * ALL_RADII_PX[by[row, column]] ** 2
+            if number > 0 and stats[number, cv2.CC_STAT_AREA] > least and size[row, column] > score[number]:
+                score[number], template[number] = size[row, column], by[row, column]
+    for number in np.flatnonzero(score):
+        left, top, width, height = stats[number, :4]
+        cut = np.s_[top : top + height, left : left + width]
+        part = (parts[cut] == number) & known[cut]
+        sizes, heights = np.abs(noise[cut][part]), smooth[cut][part].astype(np.float64)
+        louder = max(float(np.median(sizes[sizes > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
+        # quiet pixels between loud ones are no finding of the other sign
+        side = np.sign(heights[np.abs(heights).argmax()])
+        heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
+        signed[cut][part] = score[number] * louder * heights / np.abs(heights).max()
+        core[cut] |= part
+        found_by[cut][part] = template[number]
+    return core, signed, found_by
 
 
-def noise_power(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the power spectrum on ``shape``, as `scipy.fft.rfft2` orders it, of the quiet pixels' autocovariance:
-    means of products over pairs of known pixels, faded out by Parzen's window."""
-    products = np.abs(scipy.fft.rfft2(np.where(quiet, noise, 0.0).astype(np.float32), shape)) ** 2
-    pairs = np.abs(scipy.fft.rfft2(quiet.astype(np.float32), shape)) ** 2
-    covariance = scipy.fft.irfft2(products, shape) / np.maximum(scipy.fft.irfft2(pairs, shape), 1.0)
-    rows, columns = (np.minimum(np.arange(side), side - np.arange(side)) for side in shape)
-    lag = np.minimum(np.hypot(rows[:, None], columns[None]) / LONGEST_LAG_PX, 1.0)
-    parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
-    power = scipy.fft.rfft2(covariance * parzen).real
-    return np.asarray(np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32))
+def _depth_px(known: np.ndarray) -> np.ndarray:
+    """Return the distance (r, c) of each pixel to the outline of what is known; single unknown pixels are no part."""
+    closed = cv2.morphologyEx(np.pad(known.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.asarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
 
 
-def inverse_times(values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
-    conjugate gradients that start from the stationary inverse."""
-    h, w = values.shape
-    mask = known.astype(np.float32)
-
-    def filtered(image: np.ndarray, by: np.ndarray) -> np.ndarray:
-        return mask * scipy.fft.irfft2(by * scipy.fft.rfft2(image, shape), shape)[:h, :w]
-
-    inverse = 1.0 / power
-    solution = filtered(values, inverse)
-    rest = values * mask - filtered(solution, power)
-    towards = direction = filtered(rest, inverse)
-    product, enough = float((rest * towards).sum()), CONVERGED**2 * float((values * values * mask).sum())
-    for _ in range(MOST_ITERATIONS):
-        if float((rest * rest).sum()) <= enough or product <= 0:
-            break
-        onward = filtered(direction, power)
-        step = product / float((direction * onward).sum())
-        solution = solution + step * direction
-        rest = rest - step * onward
-        towards = filtered(rest, inverse)
-        before, product = product, float((rest * towards).sum())
-        direction = towards + product / before * direction
-    return np.asarray(solution)
-
-
-def _scores(
-    values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, float]:
-    """Return the score (k, r, c) of each template at each pixel, 0 where too little of it is seen, and the deviation
-    of the first template's height."""
-    h, w = values.shape
-    weighed = scipy.fft.rfft2(inverse_times(values, known, power, shape), shape)
-    there = scipy.fft.rfft2(known.astype(np.float32), shape)
-    scores, narrowest = [], 0.0
-    for template in _spectra(shape):
-        white = scipy.fft.irfft2(template / np.sqrt(power), shape) ** 2
-        energy = float(white.sum())
-        narrowest = narrowest or energy**-0.5
-        share = scipy.fft.irfft2(there * np.conj(scipy.fft.rfft2(white)), shape)[:h, :w] / energy
-        response = scipy.fft.irfft2(weighed * np.conj(template), shape)[:h, :w]
-        judged = share > LEAST_SEEN
-        scores.append(np.where(judged, response / np.sqrt(energy * np.maximum(share, LEAST_SEEN)), 0.0))
-    return np.asarray(scores, dtype=np.float32), narrowest
-
-
-@lru_cache(maxsize=4)
-def _spectra(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra on a grid that holds them, each with its centre at pixel (0, 0) and the height 1 of
-    the undisturbed damage."""
-    spectra = []
-    for template in _templates():
-        half = template.shape[0] // 2
-        if template.shape[0] > min(shape):
-            continue
-        image = np.zeros(shape, np.float32)
-        image[: template.shape[0], : template.shape[1]] = template
-        spectra.append(scipy.fft.rfft2(np.roll(image, (-half, -half), (0, 1))))
-    return tuple(spectra)
-
-
-@lru_cache(maxsize=1)
-def _templates() -> tuple[np.ndarray, ...]:
-    """Return the templates, each on a square of an odd number of pixels."""
-    window = np.outer(WINDOW, WINDOW) / np.sum(WINDOW) ** 2
-    windowed = [cv2.filter2D(_drawn(r, LENS_BLUR_PX), -1, window, borderType=cv2.BORDER_CONSTANT) for r in RADII_PX]
-    sharp = [_drawn(r, LENS_BLUR_PX) for r in SHARP_RADII_PX]
-    return (*windowed, *sharp, *(_drawn(r, DENT_BLUR_PX, dent=True) for r in DENT_RADII_PX))
-
-
-def _drawn(radius_px: float, blur_px: float, *, dent: bool = False) -> np.ndarray:
-    """Return a disc, or a paraboloid, of height 1, averaged over pixels and blurred by a Gaussian."""
-    finer, half = 4, int(radius_px + 5)
-    places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
-    apart = np.hypot(places[:, None], places[None]) / radius_px
-    height = np.maximum(1.0 - apart**2, 0.0) if dent else (apart < 1.0).astype(float)
-    pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
-    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
+def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the residuals (r, c) less what they share, along some 65 pixels, with those as near to the outline."""
+    noise, depth_px = noise.astype(np.float32), _depth_px(known)
+    side = (2 * LEAST_WINDOW + 1,) * 2
+    modest = np.clip(noise, -LEVEL_SIGMAS, LEVEL_SIGMAS)
+    for step in range(1, RIM_PX + 1):
+        layer = known & (depth_px == step)
+        of, total = (
+            cv2.blur(each, side, borderType=cv2.BORDER_CONSTANT)[layer]
+            for each in (layer.astype(np.float32), np.where(layer, modest, np.float32(0.0)))
+        )
+        noise[layer] -= total / np.maximum(of, 1e-6)
+    return noise

@@ -25,6 +25,7 @@ from scipy.optimize import leastsq
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, sigma_of
+from detectors.whitening import correlated_products, whitener
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
@@ -36,6 +37,10 @@ STEP = 1e-3
 """Size of the differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall.
 """
 IMAGES, TOLERANCE = 60, 1e-4  # limits of a descent: the most images drawn, and the relative change below which it ends
+MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
+"""Errors that light between wall and floor leaves, as simulated clouds show beyond their noise: a pixel's share of its
+depth, by which the likelihood trusts it less, and parts of the fitted radius and depth, which their standard errors
+include."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
 
@@ -77,7 +82,7 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 class HolePatch:
     """Residuals around one detection. ``metric_m2`` (2, 2): squared length of a pixel offset (du, dv) is its quadratic
     form. ``noise_m``: deviation beside the hole. ``blur_px`` (along u, along v): sides of the rectangle over which the
-    image is averaged. ``sights`` (s, 8)."""
+    image is averaged. ``sights`` (s, 8). ``correlation`` (odd, odd): of the noise by lag, where it is known."""
 
     residual_m: np.ndarray
     used: np.ndarray
@@ -85,6 +90,7 @@ class HolePatch:
     blur_px: tuple[float, float]
     noise_m: float
     sights: np.ndarray
+    correlation: np.ndarray | None = None
 
     @property
     def prior_weight(self) -> float:
@@ -173,7 +179,8 @@ class HoleFit:
 
 
 def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
-    """Fit by least squares (MINPACK) from a start, with `sandwich_covariance`; of six used pixels and more.
+    """Fit by least squares (MINPACK) from a start, to six used pixels and more: the likelihood's maximum where the
+    patch knows the noise's covariance, else with `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2). The fourth is the hole's
     volume, which the blur keeps, so that a small hole still has one well-determined direction for each parameter but
@@ -184,7 +191,9 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     # keeps a wild trial step finite: no disc is larger than ten patches
     low = np.array([-10.0 * w, -10.0 * h, -20.0])
     high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
-    used, data, weight = patch.used, patch.residual_m[patch.used], patch.prior_weight
+    used, data, error_m = patch.used, patch.residual_m[patch.used], MODEL_ERROR * np.abs(patch.residual_m - offset_m)
+    whitened = whitener(used, patch.correlation, max(patch.noise_m, 1e-9), error_m)
+    weight = patch.prior_weight if whitened is None else 1.0 / WALL_PRIOR[1]
 
     def hole_of(q: np.ndarray) -> np.ndarray:
         u, v, log_radius = np.clip(q[:3], low, high).tolist()
@@ -193,7 +202,8 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
 
     def misfit(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
-        return np.append(pictures(patch, hole[None])[0][used] + q[4] - data, weight * (hole[4] - WALL_PRIOR[0]))
+        left = pictures(patch, hole[None])[0][used] + q[4] - data
+        return np.append(left if whitened is None else whitened(left), weight * (hole[4] - WALL_PRIOR[0]))
 
     def jacobian(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
@@ -203,14 +213,32 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
         rows[:4, :-1] = by[0], by[1], radius * by[2] - 2.0 * depth * by[3], by[3] / radius**2
         rows[4, :-1], rows[5, :-1] = 1.0, slope * by[4]
         rows[5, -1] = weight * slope
+        if whitened is not None:
+            rows[:, :-1] = whitened(rows[:, :-1].T).T
         return rows
 
     stop = {"ftol": TOLERANCE, "xtol": TOLERANCE, "gtol": 1e-9, "maxfev": IMAGES}
     q, _, _, _, outcome = leastsq(misfit, start, Dfun=jacobian, col_deriv=True, full_output=True, **stop)
     hole, offset = hole_of(q), float(q[4])
     u, v, radius, depth, wall = hole.tolist()
-    covariance = sandwich_covariance(patch, hole, offset)
+    if whitened is None:
+        covariance = sandwich_covariance(patch, hole, offset)
+    else:
+        by = derivatives(patch, hole)[1][:, used]
+        rows = whitened(np.stack([*by[:4], np.ones(len(data)), by[4]]).T).T
+        covariance = _likelihood_covariance(patch, hole, rows, misfit(q)[:-1])
     return HoleFit(u, v, radius, depth, offset, wall, covariance, outcome in (1, 2, 3, 4))
+
+
+def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from whitened derivatives (6, n) by them and
+    misfits (n,): the information's inverse times the misfit's variance, and the model's own errors."""
+    information = rows @ rows.T
+    information[5, 5] += WALL_PRIOR[1] ** -2
+    found = np.linalg.pinv(information, hermitian=True) * float(misfit @ misfit) / max(len(misfit) - 6, 1)
+    found[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
+    found[3, 3] += (DEPTH_ERROR * hole[3]) ** 2
+    return np.asarray(found)
 
 
 def sandwich_covariance(patch: HolePatch, hole: np.ndarray, offset_m: float) -> np.ndarray:
@@ -237,14 +265,6 @@ def sandwich_covariance(patch: HolePatch, hole: np.ndarray, offset_m: float) -> 
     variance = float(misfit @ misfit) / freedom
     prior_variance = patch.noise_m**2 * patch.blur_px[0] * patch.blur_px[1]
     return np.asarray(bread @ (variance * meat + prior_variance * prior) @ bread)
-
-
-def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
-    """Return S' S (p, p) with S the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
-    padded = np.pad(np.moveaxis(columns, 0, -1), ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
-    summed = cv2.boxFilter(padded, -1, (across, down), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    flat = summed.reshape(-1, len(columns))
-    return np.asarray(flat.T @ flat)
 
 
 OTHER_DAMAGE_SIGMAS = 5.0
@@ -309,8 +329,15 @@ def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measuremen
     return Measurement(u, v, len(points), detection.score, diameter, centre, model_note=note)
 
 
-def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig) -> Measurement:
-    """Measure one detection both ways; NaN and a note where a measure cannot be made."""
+def measure_detection(
+    cloud: Cloud,
+    evidence: Evidence,
+    detection: Detection,
+    config: HoleModelConfig,
+    correlation: np.ndarray | None = None,
+) -> Measurement:
+    """Measure one detection both ways; NaN and a note where a measure cannot be made. ``correlation`` (odd, odd): of
+    the noise, by lag, where it is known."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around for a model")
@@ -323,6 +350,7 @@ def measure_detection(cloud: Cloud, evidence: Evidence, detection: Detection, co
     # a pixel's area across the optical axis
     volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * float(abs(ax * by - ay * bx))
     placed = replace(placed, volume_m3=volume)
+    around = replace(around, patch=replace(around.patch, correlation=correlation))
     fit, doubt = _modelled(around, config)
     if fit is None:
         return _by_contour(placed, around, doubt)

@@ -14,13 +14,13 @@ from detectors.measure import (
     TOLERANCE,
     WALL_PRIOR,
     HolePatch,
-    correlated_products,
     derivatives,
     fit_hole,
     local_plane,
     pictures,
     sight,
 )
+from detectors.whitening import correlated_products
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])

@@ -12,7 +12,8 @@ import pytest
 
 from detectors.interface import Detection
 from detectors.local import LocalConfig, LocalDetector
-from detectors.matched import MatchedDetector, inverse_times, noise_power
+from detectors.matched import MatchedDetector
+from detectors.whitening import inverse_times, noise_covariance, spectrum
 from harness.testing import LENS, check_detector, plane, with_gaps
 from harness.vocabulary.geometry import Cloud, Region
 
@@ -168,7 +169,7 @@ def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
     noise = sum(np.roll(raw, (i, j), (0, 1)) for i in range(3) for j in range(3)) / 3.0
     known = rng.random(noise.shape) > 0.1
     shape = (128, 128)
-    power = noise_power(noise, known, shape)
+    power = spectrum(noise_covariance(noise, known, shape), shape)
     part = (slice(20, 42), slice(24, 46))
     known_part, noise_part = known[part], noise[part]
     covariance = np.fft.irfft2(power, shape)

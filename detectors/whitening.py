@@ -1,0 +1,177 @@
+"""The bank of matched filters' templates, and the noise that they are whitened by.
+
+Pictures are residuals in deviations of the local noise. Correlations are taken on grids that are wider than the picture
+by the longest lag, so that nothing wraps around.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import scipy.fft
+from scipy.linalg import solve_triangular
+
+RADII_PX = (0.5, 1.5, 2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
+"""Radii of discs seen through a window of 5 x 5 pixels, as continuous-wave cameras filter their phasors."""
+SHARP_RADII_PX = (0.6, 1.2, 2.0)
+"""Radii of discs blurred by `LENS_BLUR_PX` only: cameras without such a window."""
+DENT_RADII_PX = (6.0, 9.0, 13.0, 18.0)
+"""Radii of paraboloids."""
+ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX)
+WINDOW = (0.6, 1.0, 1.0, 1.0, 0.6)
+LENS_BLUR_PX = 0.6
+DENT_BLUR_PX = 1.0
+LONGEST_LAG_PX = 20
+"""Lag at which the covariance has faded (Parzen's window): long enough for the pattern of known cameras, short enough
+that 30,000 pixels tell each of its values to some per cent."""
+LEAST_POWER = 0.3
+"""The spectrum is nowhere below this share of its mean: frequencies that a filter or an interpolation took out hold no
+signal either. 0.02 to 0.3 give the same limits with known cameras, 1.0 gives larger ones."""
+MOST_WHITENED = 2000  # pixels whose dense covariance is factored: 0.2 s and 64 MB
+GRID = 96
+"""Side of the grid that holds the widest template and the reach of its whitened edge."""
+CONVERGED, ROUGHLY_CONVERGED, MOST_ITERATIONS = 0.01, 0.1, 30
+"""Relative residuals at which C^-1 r counts as solved, and as solved well enough to tell what stands out strongly."""
+
+
+def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the grid on which a picture of this shape is transformed; it holds every template."""
+    return tuple(scipy.fft.next_fast_len(max(side, GRID) + 2 * LONGEST_LAG_PX, real=True) for side in shape)
+
+
+def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: means of
+    products over pairs of known pixels, faded out by Parzen's window."""
+    products = np.abs(scipy.fft.rfft2(np.where(quiet, noise, np.float32(0.0)), shape)) ** 2
+    pairs = np.abs(scipy.fft.rfft2(quiet.astype(np.float32), shape)) ** 2
+    lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+    sums, counts = (scipy.fft.irfft2(each, shape)[np.ix_(lags, lags)] for each in (products, pairs))
+    lag = np.minimum(np.hypot(lags[:, None], lags) / LONGEST_LAG_PX, 1.0)
+    parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
+    return np.asarray(parzen * sums / np.maximum(counts, 1.0), np.float32)
+
+
+def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the power spectrum on ``shape``, as `scipy.fft.rfft2` orders it, of an autocovariance."""
+    power = scipy.fft.rfft2(_centred(covariance, shape)).real
+    return np.asarray(np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32))
+
+
+def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an image of odd sides on a larger grid, its middle at pixel (0, 0)."""
+    padded = np.zeros(shape, np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    return np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), (0, 1))
+
+
+def inverse_times(
+    values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...], converged: float = CONVERGED
+) -> np.ndarray:
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
+    conjugate gradients that start from the stationary inverse."""
+    h, w = values.shape
+    mask = known.astype(np.float32)
+
+    def filtered(image: np.ndarray, by: np.ndarray) -> np.ndarray:
+        return mask * scipy.fft.irfft2(by * scipy.fft.rfft2(image, shape), shape)[:h, :w]
+
+    inverse = 1.0 / power
+    solution = filtered(values, inverse)
+    rest = values * mask - filtered(solution, power)
+    towards = direction = filtered(rest, inverse)
+    product, enough = float((rest * towards).sum()), converged**2 * float((values * values * mask).sum())
+    for _ in range(MOST_ITERATIONS):
+        if float((rest * rest).sum()) <= enough or product <= 0:
+            break
+        onward = filtered(direction, power)
+        step = product / float((direction * onward).sum())
+        solution = solution + step * direction
+        rest = rest - step * onward
+        towards = filtered(rest, inverse)
+        before, product = product, float((rest * towards).sum())
+        direction = towards + product / before * direction
+    return np.asarray(solution)
+
+
+def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the correlation (r, c) of a picture, whose spectrum is given, with a template."""
+    size = (spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1))
+    return np.asarray(scipy.fft.irfft2(spectrum_of * template, size)[: shape[0], : shape[1]])
+
+
+class Worth(NamedTuple):
+    """The whitened energy of a template, and the sides (along columns, along rows), in pixels, of the rectangle over
+    which it spreads as widely."""
+
+    energy: float
+    sides: tuple[int, int]
+
+
+def worths(power: np.ndarray) -> tuple[Worth, ...]:
+    """Return what each template is worth under noise with this spectrum on `GRID`."""
+    found, lags = [], np.arange(GRID) - GRID // 2
+    for template in spectra((GRID, GRID)):
+        white = np.roll(scipy.fft.irfft2(template / np.sqrt(power), (GRID, GRID)) ** 2, (GRID // 2,) * 2, (0, 1))
+        energy = float(white.sum())
+        along, down = (math.sqrt(float(lags**2 @ white.sum(axis=axis)) / energy) for axis in (0, 1))
+        found.append(Worth(energy, (2 * round(math.sqrt(3.0) * along) + 1, 2 * round(math.sqrt(3.0) * down) + 1)))
+    return tuple(found)
+
+
+@lru_cache(maxsize=4)
+def spectra(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Return the templates' conjugate spectra on a grid that holds them, each with its centre at pixel (0, 0) and the
+    height 1 of the undisturbed damage."""
+    return tuple(np.conj(scipy.fft.rfft2(_centred(template, shape))) for template in _templates())
+
+
+@lru_cache(maxsize=1)
+def _templates() -> tuple[np.ndarray, ...]:
+    """Return the templates, each on a square of an odd number of pixels."""
+    window = np.outer(WINDOW, WINDOW) / np.sum(WINDOW) ** 2
+    windowed = [cv2.filter2D(_drawn(r, LENS_BLUR_PX), -1, window, borderType=cv2.BORDER_CONSTANT) for r in RADII_PX]
+    sharp = [_drawn(r, LENS_BLUR_PX) for r in SHARP_RADII_PX]
+    return (*windowed, *sharp, *(_drawn(r, DENT_BLUR_PX, dent=True) for r in DENT_RADII_PX))
+
+
+def _drawn(radius_px: float, blur_px: float, *, dent: bool = False) -> np.ndarray:
+    """Return a disc, or a paraboloid, of height 1, averaged over pixels and blurred by a Gaussian."""
+    finer, half = 4, int(radius_px + 5)
+    places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
+    apart = np.hypot(places[:, None], places[None]) / radius_px
+    height = np.maximum(1.0 - apart**2, 0.0) if dent else (apart < 1.0).astype(float)
+    pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
+    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
+
+
+def whitener(
+    used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the function that turns the values (n, ...) of the ``used`` pixels (r, c) into others whose errors are
+    independent, with deviation 1; None where there are too many pixels, or the correlation is not known or none. Errors
+    are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
+    rows, columns = np.nonzero(used)
+    if correlation is None or len(rows) > MOST_WHITENED:
+        return None
+    reach = correlation.shape[0] // 2
+    lags = np.stack([rows[:, None] - rows, columns[:, None] - columns]) + reach
+    inside = ((lags >= 0) & (lags <= 2 * reach)).all(axis=0)
+    alike = np.where(inside, correlation[tuple(np.clip(lags, 0, 2 * reach))], 0.0)
+    try:
+        factor = np.linalg.cholesky(alike * (deviation**2 + np.outer(model_error[used], model_error[used])))
+    except np.linalg.LinAlgError:
+        return None
+    return partial(solve_triangular, factor, lower=True, check_finite=False)
+
+
+def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
+    """Return S' S (p, p) with S the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
+    padded = np.pad(np.moveaxis(columns, 0, -1), ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
+    summed = cv2.boxFilter(padded, -1, (across, down), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    flat = summed.reshape(-1, len(columns))
+    return np.asarray(flat.T @ flat)

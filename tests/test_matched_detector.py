@@ -1,0 +1,157 @@
+"""The matched detector: whitening against dense algebra, learning, heavy tails, holes that leave one finding each, and
+sizes under correlated noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from detectors.interface import Detection
+from detectors.matched import MatchedDetector
+from detectors.measure import HolePatch, fit_hole, pictures, straight_sight
+from detectors.whitening import (
+    GRID,
+    LONGEST_LAG_PX,
+    inverse_times,
+    noise_covariance,
+    spectra,
+    spectrum,
+    whitener,
+    worths,
+)
+from harness.testing import SHAPE, plane
+from harness.vocabulary.geometry import Cloud
+
+DETECTOR = MatchedDetector(MatchedDetector.settings_type.from_data({"crop": {"kind": "none"}}))
+BLUR_PX = 5
+
+
+def blurred(seed: int, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """Noise of deviation 1 that a square of 5 x 5 pixels correlates."""
+    white = np.random.default_rng(seed).standard_normal((shape[0] + BLUR_PX, shape[1] + BLUR_PX))
+    return np.asarray(cv2.blur(white, (BLUR_PX, BLUR_PX))[2:-3, 2:-3] * BLUR_PX)
+
+
+def cloud_of(depth_m: np.ndarray) -> Cloud:
+    """A frontal plane at 0.7 m with a picture of depths added."""
+    flat = plane(seed=1, tilt=0.0)
+    slopes = flat.points_m / flat.points_m[..., 2:]
+    return replace(flat, points_m=slopes * (0.7 + depth_m)[..., None])
+
+
+def hole(u: float, v: float, radius_px: float, depth_m: float) -> np.ndarray:
+    """A hole as a camera sees it that averages over 5 x 5 pixels."""
+    rows, columns = np.indices(SHAPE)
+    disc = (np.hypot(columns - u, rows - v) < radius_px).astype(float)
+    return np.asarray(depth_m * cv2.blur(disc, (BLUR_PX, BLUR_PX)))
+
+
+def found(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
+    return DETECTOR.find(cloud, DETECTOR.analyse(cloud), threshold)
+
+
+def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
+    """Beside the dense covariance of the known pixels alone, for each template that the picture holds."""
+    noise = blurred(1, (26, 30)).astype(np.float32)
+    known = np.random.default_rng(2).random(noise.shape) > 0.1
+    grid = (144, 144)
+    lags = noise_covariance(blurred(3).astype(np.float32), np.ones(SHAPE, bool), grid)
+    power = spectrum(lags, grid)
+    covariance = np.fft.irfft2(power, grid)
+    places = np.argwhere(known)
+    apart = places[:, None] - places
+    dense = covariance[apart[..., 0], apart[..., 1]]
+    solved = inverse_times(np.where(known, noise, np.float32(0.0)), known, power, grid, 0.001)
+    for spectrum_of, worth in zip(spectra(grid)[:4], worths(spectrum(lags, (GRID, GRID))), strict=False):
+        template = np.roll(np.fft.irfft2(np.conj(spectrum_of), grid), (13, 15), (0, 1))[:26, :30]
+        exact = template[known] @ np.linalg.solve(dense, noise[known])
+        energy = template[known] @ np.linalg.solve(dense, template[known])
+        assert (template * solved).sum() == pytest.approx(exact, rel=0.02, abs=0.02 * float(energy) ** 0.5)
+        assert 0.6 * worth.energy < energy < 1.02 * worth.energy
+
+
+def test_whitened_values_have_the_inverse_covariance() -> None:
+    used = np.random.default_rng(4).random((9, 11)) > 0.2
+    lags = np.abs(np.arange(-8, 9))
+    correlation = np.outer(0.6**lags, 0.6**lags)
+    error = np.where(used, 2e-4, 0.0)
+    turn = whitener(used, correlation, 3e-4, error)
+    assert turn is not None
+    places = np.argwhere(used)
+    dense = 0.6 ** np.abs(places[:, None] - places).sum(axis=-1) * (3e-4**2 + 2e-4**2)
+    reach = (np.abs(places[:, None] - places) <= 8).all(axis=-1)
+    white = turn(np.eye(len(places)))
+    inverse = np.linalg.inv(np.where(reach, dense, 0.0))
+    np.testing.assert_allclose(white.T @ white, inverse, atol=1e-9 * np.abs(inverse).max())
+    assert whitener(used, None, 3e-4, error) is None
+
+
+def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
+    """Two dozen blind holes of 10 mm and 6 mm: scatter and stated errors are those of the Cramér-Rao bound, where plain
+    least squares scatter twice as widely."""
+    pitch, shape, noise_m = 1.4e-3, (31, 31), 4e-4
+    per_px = np.array([[pitch, 0.0, 0.0], [0.0, pitch, 0.0]])
+    lags = BLUR_PX - np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
+    correlation = np.outer(np.maximum(lags, 0), np.maximum(lags, 0)) / BLUR_PX**2
+    correlation[LONGEST_LAG_PX, LONGEST_LAG_PX] += 0.1
+    blank = HolePatch(
+        np.zeros(shape), np.ones(shape, bool), per_px @ per_px.T, (5.0, 5.0), noise_m, straight_sight(per_px)[None]
+    )
+    truth = np.array([15.2, 14.7, 5e-3, 6e-3, 0.5])
+    image, fits = pictures(blank, truth[None])[0], {}
+    for name, given in (("likelihood", correlation), ("plain", None)):
+        fits[name] = []
+        for seed in range(24):
+            rough = 0.3 * np.random.default_rng(100 + seed).standard_normal(shape)
+            seen = image + noise_m * (blurred(seed, shape) + rough)
+            patch = replace(blank, residual_m=seen, correlation=given)
+            fits[name].append(fit_hole(patch, 15.0, 15.0, 4e-3, 5e-3, 0.0))
+    scatter = {name: np.std([each.radius_m for each in some]) for name, some in fits.items()}
+    assert scatter["likelihood"] < 0.7 * scatter["plain"]
+    errors = np.sqrt([each.covariance[2, 2] for each in fits["likelihood"]])
+    assert 0.6 < scatter["likelihood"] / np.median(errors) < 1.3
+    assert abs(np.mean([each.radius_m for each in fits["likelihood"]]) - 5e-3) < 1e-4
+
+
+def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
+    deep = hole(40, 45, 3.0, 0.03) + 3e-4 * blurred(5)
+    assert len(found(cloud_of(deep), 5.0)) == 1
+    touching = hole(40, 45, 3.0, 0.03) + hole(50, 45, 3.0, 0.03) + 3e-4 * blurred(6)
+    assert len(found(cloud_of(touching), 5.0)) == 2
+
+
+def test_light_along_the_rim_is_no_finding() -> None:
+    """The outer three rows stand a deviation before the surface, as where a floor's light comes back."""
+    rim = np.where(np.arange(SHAPE[0])[:, None] >= SHAPE[0] - 3, -6e-4, 0.0) + 3e-4 * blurred(7)
+    assert not found(cloud_of(rim), 5.5)
+
+
+def test_the_learned_covariance_is_that_of_the_noise_and_is_used() -> None:
+    """On a cloud too small to measure its own."""
+    clouds = [cloud_of(3e-4 * blurred(seed)) for seed in range(8, 12)]
+    learned = dict(DETECTOR.calibrate(clouds))
+    lags = learned["covariance"][LONGEST_LAG_PX, LONGEST_LAG_PX : LONGEST_LAG_PX + 6] / learned["covariance"].max()
+    np.testing.assert_allclose(lags[1:4], [0.8, 0.6, 0.4], atol=0.08)
+    cloud = cloud_of(3e-4 * blurred(13) + hole(60, 45, 2.0, 0.002))
+    taught = DETECTOR.calibrated(learned)
+    assert (taught.name, taught.version) == (DETECTOR.name, DETECTOR.version)
+    own, by_others = (each.analyse(cloud).score for each in (DETECTOR, taught))
+    assert not np.array_equal(own, by_others)
+    assert abs(np.log(np.nanmax(by_others) / np.nanmax(own))) < 0.2
+    assert not DETECTOR.calibrate([])
+
+
+def test_heavy_tails_raise_single_pixels_no_farther_than_they_reach() -> None:
+    """One pixel in 300 has five times the noise: the narrow templates' scores are scaled by their own tail, so that the
+    highest is no more than some deviations above that of Gaussian noise, and a hole of many pixels is found beside."""
+    rng = np.random.default_rng(14)
+    sizes = np.where(rng.random(SHAPE) < 1 / 300, 5.0, 1.0)
+    noise = 3e-4 * sizes * rng.standard_normal(SHAPE)
+    cloud = cloud_of(noise)
+    quiet = DETECTOR.quiet_threshold(cloud, DETECTOR.analyse(cloud))
+    assert quiet < 5.5
+    places = found(cloud_of(noise + hole(60, 45, 4.0, 0.0015)), quiet + 1.0)
+    assert len(places) == 1
