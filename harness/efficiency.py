@@ -66,6 +66,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(asked, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
+        if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
+            said = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
+            raise UserError(said, fix="name a folder as the sweep left it, or run the study again")
         rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
         first, warnings = _held_for(experiment, rate, rows[0].ideal.units), warnings_of(rows)
         if study.digest != experiment.digest:

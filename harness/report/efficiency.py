@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.evaluation.pod.statement import POD
-from harness.evaluation.study.efficiency import SHARES, Efficiency
+from harness.evaluation.study.efficiency import Efficiency
+from harness.evaluation.study.ideal import SHARES
 from harness.report.blocks import COLOURS, GREY, INK, MARKERS, command_of, figure, heading, note, page, svg
 from harness.report.pod import hits_in_view, plain, plain_numbers
 from harness.tables.efficiency import EFFICIENCY

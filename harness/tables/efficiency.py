@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from harness.evaluation.study.efficiency import Efficiency
+from harness.evaluation.intervals import UNKNOWN
+from harness.evaluation.study.efficiency import Efficiency, Level
 from harness.tables.limits import CALLS, a50_of, a90_of
-from harness.tables.schema import Column, Table
+from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import unbroken
 
 INDEX = "d' of the ideal observer at the damage"
@@ -18,6 +19,12 @@ def _calls() -> Column:
     name, label, _, note, how = (getattr(CALLS[0], each) for each in ("name", "label", "value", "note", "text"))
     paths = ("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")
     return Column(name, label, paths, note, how)
+
+
+def _ideal_size(level: Level) -> Estimate:
+    """Return the ideal observer's size; without its interval where it misses nothing."""
+    ends = UNKNOWN if level.at_most else level.ideal_mm_interval
+    return Estimate(level.ideal_mm, ends.low, ends.high, at_most=level.at_most)
 
 
 EFFICIENCY = Table(
@@ -32,14 +39,14 @@ EFFICIENCY = Table(
         Column(
             "ideal_a50_mm",
             "ideal a50 (mm)",
-            ("half.ideal_mm", "half.ideal_mm_interval"),
+            lambda one: _ideal_size(one.half),
             "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
+            interval=True,
         ),
+        Column("ideal_is_at_most", "", "half.at_most", "it misses nothing: its sizes are at most the smallest"),
         Column("ideal_a50_error_mm", "", "half.ideal_mm_error", FEW_FIELDS),
         Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's", interval=True),
-        Column(
-            "ideal_a90_mm", "ideal a90 (mm)", ("most.ideal_mm", "most.ideal_mm_interval"), "as ideal_a50_mm, for 90 %"
-        ),
+        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), "likewise, 90 %", interval=True),
         Column("ideal_a90_error_mm", "", "most.ideal_mm_error", FEW_FIELDS),
         Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's", interval=True),
         Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} at which it finds 50 %"),

@@ -1,11 +1,11 @@
 """A detector's efficiency: how much of the ideal observer's signal it uses.
 
-Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'; so
-is the ideal observer's own probability of detection. Where a detector needs d'_p to find a share p and the ideal
-observer d'_p,ideal, its efficiency is (d'_p,ideal / d'_p)^2: the share of independent pixels, or of frames without a
-fixed pattern, with which the ideal observer would do as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922).
-Hits by missing returns are left out, as the ideal observer does not see these. Intervals draw boards again, the same
-for both."""
+Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'.
+Where a detector needs d'_p to find a share p and the ideal observer d'_p,ideal, its efficiency is (d'_p,ideal /
+d'_p)^2: the share of independent pixels, or of frames without a fixed pattern, with which the ideal observer would do
+as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922). Where d'_p is none of those inspected there is no
+efficiency. Hits by missing returns are left out, as the ideal observer does not see these. Intervals draw boards again,
+the same for both."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from scipy import special
 from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
 from harness.evaluation.pod.hit_miss import fit_hit_miss
-from harness.evaluation.pod.statement import POD
-from harness.evaluation.study.ideal import IdealDamages
+from harness.evaluation.study.ideal import SHARES, IdealDamages
 from harness.evaluation.study.limit import DRAWS, SetUpLimit, Targets, crossings, refitted_sizes, row_weights
 from harness.vocabulary.errors import UserError
 
 LINK = "probit"
-SHARES = (0.5, POD)
 LEAST_INDEX = 0.05
 """A smaller d' counts as this: nobody finds such damage, and its logarithm must not decide the curve."""
+HARDLY = 0.5
+"""Hits, or misses, to be expected below which there is no curve."""
 HEAVY = 1.0
 """Excess kurtosis of the noise from which on it is no longer taken for Gaussian."""
 MOST_LOST = 0.01
@@ -34,13 +34,14 @@ MOST_LOST = 0.01
 
 @dataclass(frozen=True)
 class Level:
-    """Both observers at one share of damages found. ``size_mm`` and ``index`` of the ideal observer, with the standard
-    error of its size by the finite number of noise fields; ``index`` that the detector needs, NaN where it has no
-    curve; and the efficiency."""
+    """Both observers at one share of damages found. ``ideal_mm``: size for the ideal observer, the smallest inspected
+    where it misses none (``at_most``), and its standard error by the finite number of noise fields; d' that it needs,
+    ``ideal_index``, and that the detector needs, ``index``, NaN where unknown; and the efficiency."""
 
     ideal_mm: float
     ideal_mm_interval: Interval
     ideal_mm_error: float
+    at_most: bool
     ideal_index: float
     index: float
     index_interval: Interval
@@ -79,10 +80,10 @@ def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.nd
     design = np.column_stack([np.ones_like(log), (log - centre) / spread])
     hits, misses = weights * pod, weights * (1.0 - pod)
     found = np.full((2, len(weights)), np.inf)
-    known = (hits.sum(axis=1) > 0.5) & (misses.sum(axis=1) > 0.5)
+    known = (hits.sum(axis=1) > HARDLY) & (misses.sum(axis=1) > HARDLY)
     fitted = maxima(HitsAndMisses(design, hits[known], misses[known], LINK), np.array([0.0, 1.0]))
     found[:, known] = np.exp(centre + spread * crossings(fitted, LINK, SHARES))
-    found[:, misses.sum(axis=1) <= 0.5] = x.min()
+    found[:, misses.sum(axis=1) <= HARDLY] = x.min()
     return found
 
 
@@ -97,7 +98,7 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     index = np.maximum(ideal.index[kept], LEAST_INDEX)
     hits, inspections = np.bincount(which, hit), np.bincount(which).astype(float)
     weights = np.vstack([np.ones(len(kept)), row_weights(ideal.board[kept])])
-    ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), expected_sizes(index, pod, weights)
+    ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), _means(ideal.needed[:, kept], weights)
     # d' without a part of the noise moves the probability along the normal curve
     moved = [special.ndtr(special.ndtri(pod) + other - ideal.index[kept]) for other in without]
     parts = np.array([expected_sizes(size_mm, other, weights[:1])[:, 0] for other in moved])
@@ -110,22 +111,38 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
         targets = Targets(ideal.board[kept], index, hits, inspections)
         needed[:, 0] = [curve.size_at(share) for share in SHARES]
         needed[:, 1:] = refitted_sizes(targets, curve, SHARES)
+        inside = (needed[:, 0] >= index.min()) & (needed[:, 0] <= index.max())
+        needed[~inside] = np.nan
+        if not inside.all():
+            wanted = " and ".join(f"{100 * share:.0f} %" for share in np.array(SHARES)[~inside])
+            why = f"found {wanted} of the time at no d' that was inspected ({index.min():.2g} to {index.max():.3g})"
     except UserError as error:
         why = error.message
-    levels = [_level(*each) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True)]
+    all_found = bool((1.0 - pod).sum() <= HARDLY)
+    levels = [_level(*each, all_found) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True)]
     of_damage = (size_mm, ideal.index[kept], ideal.threshold[kept], pod, hits, inspections)
     return Efficiency(limit, ideal, *levels, ideal.board[kept], ideal.hole[kept], *of_damage, curve, why)
 
 
-def _level(ideal_mm: np.ndarray, error_mm: float, ideal_index: np.ndarray, needed: np.ndarray) -> Level:
-    """One share of damages found; arrays (1 + draws,), the estimate first."""
+def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the means (k, d) of values (k, n), without NaN, under each of the weights (d, n)."""
+    known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(known, values, 0.0) @ weights.T) / (known @ weights.T))
+
+
+def _level(
+    ideal_mm: np.ndarray, error_mm: float, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool
+) -> Level:
+    """One share of damages found; arrays (1 + draws,), the estimate first."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (ideal_index / needed) ** 2
     known = bool(np.isfinite(needed[0]))
     return Level(
         ideal_mm=float(ideal_mm[0]),
         ideal_mm_interval=percentiles(ideal_mm[1:]),
         ideal_mm_error=float(error_mm),
+        at_most=all_found,
         ideal_index=float(ideal_index[0]),
         index=float(needed[0]),
         index_interval=percentiles(needed[1:]) if known else UNKNOWN,
@@ -150,5 +167,5 @@ def warnings_of(rows: list[Efficiency]) -> list[str]:
                 " the ideal observer does not use: with missing returns more can be found"
             )
         if row.why:
-            said.append(f"{name}: no efficiency: {row.why}")
+            said.append(f"{name}: efficiency is not known: {row.why}")
     return said

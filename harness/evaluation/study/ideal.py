@@ -39,6 +39,8 @@ AROUND = 3
 """Half of the lattice of places about a damage at which it may be found, in strides."""
 NEAR_CORRELATION = 0.2
 """Places that are correlated by less with the damage's own do not add to its detection."""
+SHARES = (0.5, 0.9)
+"""Shares of damages found at which observers are compared."""
 FOLDS = 5
 """Parts of the noise fields that are left out in turn."""
 RANGE = (1.0, 12.0)
@@ -199,9 +201,9 @@ def threshold_for(correlated: np.ndarray, maxima: float) -> float:
     )
 
 
-def detection_probability(correlated: np.ndarray, index: float, threshold: float) -> float:
-    """Return the probability that the statistic, of mean ``index`` (d') at the damage and ``index`` times its
-    correlation about it, exceeds the threshold at any place that is near."""
+def needed_indices(correlated: np.ndarray, threshold: float) -> np.ndarray:
+    """Return draws (n,) of d' less one standard normal at which the statistic, of mean d' at the damage and d' times
+    its correlation about it, just exceeds the threshold at the best of the places that are near."""
     middle = len(correlated) // 2
     half = int((correlated[middle, middle:] > 0.5).sum())
     stride = min(max(1, half // AROUND), middle // (2 * AROUND))
@@ -210,8 +212,19 @@ def detection_probability(correlated: np.ndarray, index: float, threshold: float
     rho = correlated[places[:, 0] + middle, places[:, 1] + middle]
     places, rho = places[rho > NEAR_CORRELATION], rho[rho > NEAR_CORRELATION]
     rest = _normals(len(rho)) @ _root(_covariance(correlated, places) - np.outer(rho, rho)).T
-    needed = ((threshold - rest) / rho).min(axis=1) - index
-    return float(special.ndtr(-needed).mean())
+    return np.asarray(((threshold - rest) / rho).min(axis=1))
+
+
+def detection_probability(needed: np.ndarray, index: float) -> float:
+    """Return the probability of detection at d' = ``index``, from `needed_indices`."""
+    return float(special.ndtr(index - needed).mean())
+
+
+def index_for(needed: np.ndarray, share: float) -> float:
+    """Return d' at which a share of damages is found, from `needed_indices`."""
+    return float(
+        optimize.brentq(lambda d: detection_probability(needed, d) - share, needed.min() - 5.0, needed.max() + 5.0)
+    )
 
 
 # ---------------------------------------------------------------- damages of a set-up
@@ -239,15 +252,16 @@ class BoardView:
 @dataclass(frozen=True, eq=False)
 class IdealDamages:
     """The ideal observer on damages, (n,) each: ``board``, ``hole``, ``index`` (d'), ``threshold`` (NaN where d' is 0)
-    and ``pod``. ``without`` (g, n): d' with each of g parts of the noise left out in turn, whose scatter is the error
-    of d'. ``units`` and excess ``kurtosis`` of the noise; ``lost``: greatest share of a board's damage without
-    return."""
+    and ``pod``. ``needed`` (2, n): d' at which shares of `SHARES` are found. ``without`` (g, n): d' with each of g
+    parts of the noise left out in turn, whose scatter is the error of d'. ``units`` and excess ``kurtosis`` of the
+    noise; ``lost``: greatest share of a board's damage without return."""
 
     board: np.ndarray
     hole: np.ndarray
     index: np.ndarray
     threshold: np.ndarray
     pod: np.ndarray
+    needed: np.ndarray
     without: np.ndarray
     units: int
     kurtosis: float
@@ -260,7 +274,7 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
     parts = [reduce(add, (view.sums for view in views[part::FOLDS])) for part in range(min(FOLDS, len(views)))]
     rest = [sums - part for part in parts] if len(parts) > 1 else [sums]
     rows: list[tuple[int, str, float, float, float]] = []
-    without = []
+    at_shares, without = [], []
     for view in views:
         signals, surface = (images / view.deviation_m * view.known for images in (view.signals_m, view.surface))
         seen = signals.any(axis=(1, 2))
@@ -269,14 +283,17 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
         for hole, signal, d in zip(view.holes, signals, index.tolist(), strict=True):
             if d == 0.0:
                 rows.append((view.board, hole, 0.0, np.nan, 0.0))
+                at_shares.append([np.nan] * len(SHARES))
                 without.append([0.0] * len(rest))
                 continue
             field = responses(signal, sums)
             square = field[LONGEST_LAG_PX, LONGEST_LAG_PX]
             threshold = threshold_for(field / square, calls_per_m2 * view.pixel_m2)
-            rows.append((view.board, hole, d, threshold, detection_probability(field / square, d, threshold)))
+            needed = needed_indices(field / square, threshold)
+            rows.append((view.board, hole, d, threshold, detection_probability(needed, d)))
+            at_shares.append([index_for(needed, share) for share in SHARES])
             others = (responses(signal, other)[LONGEST_LAG_PX, LONGEST_LAG_PX] for other in rest)
             without.append([d * float(np.sqrt(other / square)) for other in others])
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     units, lost = sum(view.units for view in views), max(view.lost for view in views)
-    return IdealDamages(*columns, np.array(without).T, units, sums.kurtosis, lost)
+    return IdealDamages(*columns, np.array(at_shares).T, np.array(without).T, units, sums.kurtosis, lost)
