@@ -30,6 +30,8 @@ SMOOTHED_PX = 61
 """Side of the square over which a pixel's variance is averaged."""
 DEGREE = 3
 """Degree of the undamaged surface, as the thesis fits it."""
+FEWEST_PIXELS = 1000
+"""Undamaged pixels without which a board tells too little of the noise."""
 FINE_MM = 1e-4
 """Rounding step of the noise-free camera."""
 REACH_PX = 8
@@ -47,6 +49,8 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
             Job(f"noise of board {one.board}", "trials", board_views, (one, group.points), one.paths) for one in batches
         ]
         ends = {} if lost else {job.name: ended for job, ended in carried_out(jobs, engine)}
+        if bug := next((end.why for end in ends.values() if end.is_bug), None):
+            raise RuntimeError(bug)
         wrong = [failure.in_short for failure in lost] + [end.why for end in ends.values() if end.state != "done"]
         if wrong:
             raise UserError(f"the ideal observer lacks a board: {wrong[0]}", fix="mend that, and run it again")
@@ -65,9 +69,12 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     intact = set_up.intact & np.isfinite(clear_z_m)
     rows, columns = np.nonzero(set_up.on_board)
     cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    surface = np.zeros((10, *set_up.on_board.shape))
+    if intact.sum() < FEWEST_PIXELS:
+        raise UserError(f"only {intact.sum()} pixels of the board are far from damage and rim: its noise is not known")
     places = set_up.board_xy_m[set_up.on_board]
-    surface[:, set_up.on_board] = Chebyshev.over(places, DEGREE).basis(places)
+    basis = Chebyshev.over(places, DEGREE).basis(places)
+    surface = np.zeros((len(basis), *set_up.on_board.shape))
+    surface[:, set_up.on_board] = basis
     signals_m = _signatures_m(set_up, clear_z_m, surface, intact)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
