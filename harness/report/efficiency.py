@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 STYLES = ("-", "--", "-.", ":")
 CLASSES = 8
 """Classes of d' with equally many damages, whose shares of hits are drawn."""
+LEFT = 0.5
+"""Left end of the axis of d': what has less is found by chance alone."""
 READ = (
     "Efficiency: (d' at which the ideal observer finds the share / d' at which the detector does) squared, by depth "
     "alone. d' is the ideal observer's signal at a damage over the deviation of its statistic. The ideal observer "
@@ -83,17 +85,18 @@ def _against_index(axes: Axes, rows: Sequence[Efficiency], look) -> None:  # typ
         colour, style, marker = look(row)
         seen = np.sort(row.index[row.index > 0])
         if row.curve is not None and len(seen):
-            x = np.geomspace(max(seen[0], 0.5), seen[-1], 200)
+            x = np.geomspace(LEFT, max(seen[-1], 2 * LEFT), 200)
             name = plain(fill(f"{row.limit.record.detector}: {name_of(row.limit)}", 100))
             axes.plot(x, row.curve.pod(x), color=colour, ls=style, lw=1.4, label=name)
         for members in np.array_split(np.argsort(row.index), CLASSES):
             if len(members):
                 share = row.hits[members].sum() / row.inspections[members].sum()
-                axes.plot(max(np.median(row.index[members]), 0.5), share, marker, color=colour, ms=4, alpha=0.6)
+                axes.plot(max(np.median(row.index[members]), LEFT), share, marker, color=colour, ms=4, alpha=0.6)
     for share in SHARES:
         axes.axhline(share, color=GREY, lw=0.8, ls=":")
     hits_in_view(axes, 0.03)
     axes.set(xscale="log", xlabel="d' of the ideal observer", ylabel="share found", title="All damages against d'")
+    axes.set_xlim(left=LEFT)
     plain_numbers(axes.xaxis, (1, 2, 5))
 
 

@@ -119,9 +119,10 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     except UserError as error:
         why = error.message
     all_found = bool((1.0 - pod).sum() <= HARDLY)
-    levels = [_level(*each, all_found) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True)]
-    of_damage = (size_mm, ideal.index[kept], ideal.threshold[kept], pod, hits, inspections)
-    return Efficiency(limit, ideal, *levels, ideal.board[kept], ideal.hole[kept], *of_damage, curve, why)
+    half, most = (_level(*each, all_found) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True))
+    board, hole, exact, threshold = (getattr(ideal, name)[kept] for name in ("board", "hole", "index", "threshold"))
+    of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
+    return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
 
 
 def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

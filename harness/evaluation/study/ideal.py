@@ -50,10 +50,10 @@ RANGE = (1.0, 12.0)
 LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
 
 
-def _padded(*sides: int) -> tuple[int, ...]:
+def _padded(height: int, width: int) -> tuple[int, int]:
     """Return the sides of a periodic grid on which nothing within `LONGEST_LAG_PX` meets itself."""
-    least = (max(side + LONGEST_LAG_PX, len(LAGS)) for side in sides)
-    return tuple(scipy.fft.next_fast_len(side, real=True) for side in least)
+    high, wide = (max(side + LONGEST_LAG_PX, len(LAGS)) for side in (height, width))
+    return int(scipy.fft.next_fast_len(high, real=True)), int(scipy.fft.next_fast_len(wide, real=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +294,7 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
             at_shares.append([index_for(needed, share) for share in SHARES])
             others = (responses(signal, other)[LONGEST_LAG_PX, LONGEST_LAG_PX] for other in rest)
             without.append([d * float(np.sqrt(other / square)) for other in others])
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    board, hole, found, threshold, pod = (np.array(column) for column in zip(*rows, strict=True))
     units, lost = sum(view.units for view in views), max(view.lost for view in views)
-    return IdealDamages(*columns, np.array(at_shares).T, np.array(without).T, units, sums.kurtosis, lost)
+    needed_by, left_out = np.array(at_shares).T, np.array(without).T
+    return IdealDamages(board, hole, found, threshold, pod, needed_by, left_out, units, sums.kurtosis, lost)
