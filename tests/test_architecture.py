@@ -45,6 +45,7 @@ PROGRAMS = [
     "prepare",
     "pod",
     "design",
+    "efficiency",
     "compare",
     "check",
     "ls",

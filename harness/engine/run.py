@@ -199,7 +199,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
         for number, group in enumerate(groups)
         if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
     ]
-    ends = {job.name: ended for job, ended in _carried_out(jobs, engine)}
+    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     for job in jobs:
         if ends[job.name].state == "done":
             outcome.examples += ends[job.name].value
@@ -217,7 +217,7 @@ def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure
     """Have views rendered that the cache lacks or holds damaged. Returns a failure for each that could not be."""
     distinct = {job.path: job for job in jobs}
     missing = [_render_job(job) for job in distinct.values() if read_view(job.path) is None]
-    ends = _carried_out(missing, engine)
+    ends = carried_out(missing, engine)
     return [_failure(_lost_view(job.name), ended) for job, ended in ends if ended.state != "done"]
 
 
@@ -225,7 +225,8 @@ def _lost_view(name: str) -> str:
     return f"view {name} for a picture"
 
 
-def _carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
+def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
+    """Have jobs carried out; yields each with its end, in the order in which they end."""
     waiting, under_way = deque(jobs), 0
     while waiting or under_way:
         while waiting and engine.room(waiting[0].stage) > 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from harness.tables.efficiency import EFFICIENCY_TABLES
 from harness.tables.outputs import FILES, JOURNAL, LATEST
 from harness.tables.schema import Table
 from harness.tables.study import STUDY_TABLES
@@ -32,6 +33,7 @@ GROUPS = {
     "views": "An experiment with several views, too",
     "capture": "An experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
     "check": "`harness.check`, too",
+    "efficiency": "`harness.efficiency`, too",
 }
 
 
@@ -50,6 +52,7 @@ def _lines() -> Iterator[str]:
     yield from _tables("Trials", of_trials)
     yield from _tables("Summaries of an experiment that is no study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
+    yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
     yield from _tables("Real captures", (POINTS_OF_CAPTURES, FINDINGS_OF_CAPTURE))
     yield ""

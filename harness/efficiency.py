@@ -1,0 +1,122 @@
+"""``python -m harness.efficiency RESULTS``: every detector of a study beside the ideal observer."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.engine.work import add_engine_options, engine_options
+from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.evaluation.study.record import StudyRecord
+    from harness.experiment.schema import Experiment
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.efficiency " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.efficiency",
+        description="Set the detectors of a simulated study beside the ideal observer, which knows each damage's exact "
+        "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
+        f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
+        "the study's folder.",
+        epilog="Takes some seconds a damaged board. Views that are not in the store of renders are rendered again.",
+    )
+    help = "a result folder of a sweep with a `study`, such as results/detection_limit/latest"
+    parser.add_argument("results", type=Path, metavar="RESULTS", help=help)
+    add_engine_options(parser)
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.engine.ideal import ideal_of_set_ups
+    from harness.engine.plan import plan_of
+    from harness.engine.tables import write_tables
+    from harness.engine.work import engine_of, locked
+    from harness.evaluation.study.efficiency import efficiency_of, warnings_of
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record
+    from harness.report.efficiency import efficiency_html, efficiency_parts
+    from harness.tables.efficiency import DAMAGES, EFFICIENCY, damage_rows
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+    from scenes.render.cache import in_use
+
+    asked = engine_options(options)
+    if not asked.shard.is_whole:
+        raise UserError("--shard: efficiency needs the whole study", fix="leave it out")
+    folder = options.results.resolve()
+    study = read_record(folder)
+    experiment = _experiment(folder)
+    rate = _rate(study, experiment)
+    cache = folder.parents[1] / ".cache" / "renders"
+    plan = plan_of(experiment, cache)
+    detectors = {point.config.detector.name for point in experiment.points}
+    with in_use(cache), locked(folder), engine_of(asked, detectors) as engine:
+        ideal = ideal_of_set_ups(plan, engine, rate)
+        if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
+            said = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
+            raise UserError(said, fix="name a folder as the sweep left it, or run the study again")
+        rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
+        first, warnings = _held_for(experiment, rate, rows[0].ideal.units), warnings_of(rows)
+        if study.digest != experiment.digest:
+            changed = "hits are those of another version of the camera or of a detector than the one installed now"
+            warnings.insert(0, f"{changed}: run the study again")
+        provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": study.name}
+        provenance |= {"digest": study.digest, "seed": experiment.config.seed}
+        tables = {EFFICIENCY: EFFICIENCY.frame(rows), DAMAGES: DAMAGES.frame(damage_rows(rows))}
+        write_tables(folder, tables, provenance)
+        write_text(folder / EFFICIENCY_PAGE.name, efficiency_html(rows, first, warnings, study.name, command))
+    show(efficiency_parts(rows, first, warnings))
+    print(f"page: {folder / EFFICIENCY_PAGE.name}")
+    return 0
+
+
+def _experiment(folder: Path) -> Experiment:
+    from harness.experiment.load import load_experiment
+
+    if not (folder / EXPERIMENT.name).is_file():
+        fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
+        raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
+    return load_experiment(folder / EXPERIMENT.name)
+
+
+def _rate(study: StudyRecord, experiment: Experiment) -> float:
+    """The wanted false calls per square metre. Raises UserError for studies that the ideal observer cannot judge."""
+    if any(
+        point.config.mapping is not None or getattr(point.config.source, "views", None) for point in experiment.points
+    ):
+        fix = "name a study of single views"
+        raise UserError(f"{study.name}: judges maps of several views, for which there is no ideal observer", fix=fix)
+    if study.false_calls_per_m2 is None:
+        fix = "run the study with threshold.calibrate"
+        raise UserError(f"{study.name}: its threshold was given, so there is no wanted rate of false calls", fix=fix)
+    return study.false_calls_per_m2
+
+
+def _held_for(experiment: Experiment, rate: float, units: int) -> str:
+    """The first line: for what the ideal observer's figures hold, and what is not in them."""
+    cameras = [getattr(point.config.source, "camera", None) for point in experiment.points]
+    names = ", ".join(dict.fromkeys(one.name for one in cameras if one is not None))
+    seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras if one is not None))
+    return (
+        f"The ideal observer is for a new unit of {names}, by the noise of {units} units, at {rate:g} false call"
+        f"{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on unit {seeds}. Not in it: "
+        "missing returns, tails that are not Gaussian, noise that differs within damage."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""What the ideal observer needs of a study's set-up: noise of units drawn at random, and each damage's signature.
+
+Noise is what a unit's average shows on a damaged board beyond what a camera without noise, unit errors and rounding
+shows of the same view, away from damage and rim; a cubic of each field is taken out. The signature is what that
+noise-free camera shows near the damage beyond a cubic through the undamaged pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from detectors.surface import Chebyshev
+from harness.engine.plan import Batch, SweepPlan
+from harness.engine.run import carried_out, render_missing
+from harness.engine.setup import SetUp, load_set_up
+from harness.engine.trial import averages_of
+from harness.engine.work import Job, JobEngine
+from harness.evaluation.study.ideal import BoardView, IdealDamages, ideal_damages, noise_sums
+from harness.experiment.schema import Point
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.seeds import random_stream
+from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.source import SimulatedUnit
+
+UNITS_A_BOARD = 10
+"""Units, drawn anew for every board, whose noise is taken there."""
+SMOOTHED_PX = 61
+"""Side of the square over which a pixel's variance is averaged."""
+DEGREE = 3
+"""Degree of the undamaged surface, as the thesis fits it."""
+FEWEST_PIXELS = 1000
+"""Undamaged pixels without which a board tells too little of the noise."""
+FINE_MM = 1e-4
+"""Rounding step of the noise-free camera."""
+REACH_PX = 8
+"""Pixels beyond a damage's outline to which its signature reaches: what the camera's window and rims smear out."""
+
+
+def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) -> dict[tuple[str, int], IdealDamages]:
+    """Return the ideal observer on every set-up of a study, by its variant and frames, at a rate of false calls. Views
+    that are not in the store are rendered. Raises UserError where a view or a board's noise cannot be had."""
+    found = {}
+    for group in plan.groups:
+        batches = [batch for batch in group.then if batch.role == "damaged"]
+        lost = render_missing((job for batch in batches for job in batch.renders), engine)
+        jobs = [
+            Job(f"noise of board {one.board}", "trials", board_views, (one, group.points), one.paths) for one in batches
+        ]
+        ends = {} if lost else {job.name: ended for job, ended in carried_out(jobs, engine)}
+        if bug := next((end.why for end in ends.values() if end.is_bug), None):
+            raise RuntimeError(bug)
+        wrong = [failure.in_short for failure in lost] + [end.why for end in ends.values() if end.state != "done"]
+        if wrong:
+            raise UserError(f"the ideal observer lacks a board: {wrong[0]}", fix="mend that, and run it again")
+        views = [ends[job.name].value for job in jobs]
+        by_frames = {frames: ideal_damages([view[frames] for view in views], calls_per_m2) for frames in views[0]}
+        for point in group.points:
+            frames = point.config.capture.frames
+            found[point.variant, frames] = by_frames[frames]
+    return found
+
+
+def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
+    """Return a damaged board as the ideal observer sees it, by the numbers of frames that the points ask for."""
+    set_up = load_set_up(batch.set_ups[0])
+    clear_z_m = _noise_free_z_m(set_up)
+    intact = set_up.intact & np.isfinite(clear_z_m)
+    rows, columns = np.nonzero(set_up.on_board)
+    cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    if intact.sum() < FEWEST_PIXELS:
+        raise UserError(f"only {intact.sum()} pixels of the board are far from damage and rim: its noise is not known")
+    places = set_up.board_xy_m[set_up.on_board]
+    basis = Chebyshev.over(places, DEGREE).basis(places)
+    surface = np.zeros((len(basis), *set_up.on_board.shape))
+    surface[:, set_up.on_board] = basis
+    signals_m = _signatures_m(set_up, clear_z_m, surface, intact)
+    seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
+    inside = np.concatenate(list(set_up.outlines.values()))
+    views = {}
+    for point in {point.config.capture.frames: point for point in points}.values():
+        noise_m, known = _noise_m(set_up, clear_z_m, batch.board or 0, point, surface, intact)
+        deviation_m = _deviation_m(noise_m, known)
+        sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], known[:, *cut])
+        views[point.config.capture.frames] = BoardView(
+            batch.board or 0,
+            tuple(str(damage.id) for damage in set_up.truth),
+            seen[cut],
+            deviation_m[cut],
+            np.nan_to_num(signals_m[:, *cut]),
+            surface[:, *cut],
+            sums,
+            UNITS_A_BOARD,
+            float(np.prod(set_up.pitch_mm)) * MM**2,
+            float((~np.isfinite(clear_z_m.ravel()[inside])).mean()),
+        )
+    return views
+
+
+def _noise_free_z_m(set_up: SetUp) -> np.ndarray:
+    """(h, w): what the camera shows without noise, unit errors and rounding; NaN where it shows nothing."""
+    config = set_up.unit.config
+    kept = {name: getattr(config.effects, name) for name in ("multipath", "wiggling", "ambient", "saturation")}
+    clear = dict.fromkeys(EffectsConfig.model_fields, False) | kept
+    numbers = {**config.numbers, "engine.output_step_mm": FINE_MM}
+    capture = _unit(set_up, effects=EffectsConfig(**clear), numbers=numbers).capture(1, 0)
+    return np.asarray(next(iter(capture.frames())).z_m, dtype=np.float64)
+
+
+def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
+    """The unit of a set-up with another declaration, before the same view."""
+    config = CameraConfig.model_validate(set_up.unit.config.model_dump() | changes)
+    return SimulatedUnit(camera_of(config), config, set_up.unit.view)
+
+
+def _noise_m(
+    set_up: SetUp, clear_z_m: np.ndarray, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise fields (k, h, w) of `UNITS_A_BOARD` units, and where they are known; a cubic of each is taken out."""
+    capture, fields = point.config.capture, []
+    for number in range(UNITS_A_BOARD):
+        labels = ("units of the ideal observer", board, number)
+        seed = int(random_stream(point.config.seed, *labels).integers(2**31))
+        frames = _unit(set_up, unit_seed=seed).capture(capture.frames, point.config.seed, *labels)
+        cloud = averages_of(frames, [capture.frames], capture.average, exact=capture.exact)[capture.frames]
+        noise = cloud.points_m[..., 2] - clear_z_m
+        known = intact & np.isfinite(noise)
+        basis = surface[:, known].T
+        noise[known] -= basis @ np.linalg.lstsq(basis, noise[known], rcond=None)[0]
+        fields.append(np.where(known, noise, np.nan))
+    noise_m = np.array(fields)
+    return np.nan_to_num(noise_m), np.isfinite(noise_m)
+
+
+def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(h, w): root mean square of the noise over units and a square about each pixel; where nothing is known about a
+    pixel, that of the nearest one."""
+    square, count = (ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX) for image in (noise_m**2, known * 1.0))
+    there = count > 0.5 * len(noise_m) / SMOOTHED_PX
+    nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)
+    return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))
+
+
+def _signatures_m(set_up: SetUp, clear_z_m: np.ndarray, surface: np.ndarray, intact: np.ndarray) -> np.ndarray:
+    """(n, h, w): each damage's residual to the surface, 0 away from it."""
+    basis = surface[:, intact].T
+    fitted = np.tensordot(np.linalg.lstsq(basis, clear_z_m[intact], rcond=None)[0], surface, 1)
+    residual_m, pitch_m = clear_z_m - fitted, max(set_up.pitch_mm) * MM
+    signals = []
+    for damage in set_up.truth:
+        apart_m = np.linalg.norm(set_up.board_xy_m - damage.centre_board_m[:2], axis=-1)
+        near = apart_m < damage.diameter_m / 2 + REACH_PX * pitch_m
+        signals.append(np.where(near, residual_m, 0.0))
+    return np.array(signals)

@@ -1,0 +1,172 @@
+"""A detector's efficiency: how much of the ideal observer's signal it uses.
+
+Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'.
+Where a detector needs d'_p to find a share p and the ideal observer d'_p,ideal, its efficiency is (d'_p,ideal /
+d'_p)^2: the share of independent pixels, or of frames without a fixed pattern, with which the ideal observer would do
+as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922). Where d'_p is none of those inspected there is no
+efficiency. Hits by missing returns are left out, as the ideal observer does not see these. Intervals draw boards again,
+the same for both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
+from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
+from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.study.ideal import SHARES, IdealDamages
+from harness.evaluation.study.limit import DRAWS, SetUpLimit, Targets, crossings, refitted_sizes, row_weights
+from harness.vocabulary.errors import UserError
+
+LINK = "probit"
+LEAST_INDEX = 0.05
+"""A smaller d' counts as this: nobody finds such damage, and its logarithm must not decide the curve."""
+HARDLY = 0.5
+"""Hits, or misses, to be expected below which there is no curve."""
+HEAVY = 1.0
+"""Excess kurtosis of the noise from which on it is no longer taken for Gaussian."""
+MOST_LOST = 0.01
+"""Share of a board's pixels within damage that may return nothing without a word."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Both observers at one share of damages found. ``ideal_mm``: size for the ideal observer, the smallest inspected
+    where it misses none (``at_most``), and its standard error by the finite number of noise fields; d' that it needs,
+    ``ideal_index``, and that the detector needs, ``index``, NaN where unknown; and the efficiency."""
+
+    ideal_mm: float
+    ideal_mm_interval: Interval
+    ideal_mm_error: float
+    at_most: bool
+    ideal_index: float
+    index: float
+    index_interval: Interval
+    efficiency: float
+    interval: Interval
+
+
+@dataclass(frozen=True, eq=False)
+class Efficiency:
+    """A set-up's detector beside the ideal observer, at shares of 50 % and 90 %. ``size_mm``, ``index``, ``pod``
+    (ideal observer's), ``hits``, ``inspections`` (n,) of each damage; ``curve``: the detector's POD against d', None
+    where there is none, and ``why``."""
+
+    limit: SetUpLimit
+    ideal: IdealDamages
+    half: Level
+    most: Level
+    board: np.ndarray
+    hole: np.ndarray
+    size_mm: np.ndarray
+    index: np.ndarray
+    threshold: np.ndarray
+    pod: np.ndarray
+    hits: np.ndarray
+    inspections: np.ndarray
+    curve: PodCurve | None
+    why: str
+
+
+def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return (2, d) the values of x (n,) with POD of 50 and 90 % on probit curves of ln x through probabilities ``pod``
+    (n,), under each of the weights (d, n); infinite where hardly one is found, the smallest x where hardly one is
+    missed."""
+    log = np.log(x)
+    centre, spread = float(log.mean()), float(log.std()) or 1.0
+    design = np.column_stack([np.ones_like(log), (log - centre) / spread])
+    hits, misses = weights * pod, weights * (1.0 - pod)
+    found = np.full((2, len(weights)), np.inf)
+    known = (hits.sum(axis=1) > HARDLY) & (misses.sum(axis=1) > HARDLY)
+    fitted = maxima(HitsAndMisses(design, hits[known], misses[known], LINK), np.array([0.0, 1.0]))
+    found[:, known] = np.exp(centre + spread * crossings(fitted, LINK, SHARES))
+    found[:, misses.sum(axis=1) <= HARDLY] = x.min()
+    return found
+
+
+def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
+    """Set a detector's hits beside the ideal observer on the damages that both judged."""
+    seen = limit.record.inspected
+    hit = seen.hit if seen.by_depth is None else seen.by_depth
+    place = {key: number for number, key in enumerate(zip(ideal.board.tolist(), ideal.hole.tolist(), strict=True))}
+    rows = np.array([place[key] for key in zip(seen.board.tolist(), seen.hole.tolist(), strict=True)])
+    kept, first, which = np.unique(rows, return_index=True, return_inverse=True)
+    size_mm, pod, without = seen.diameter_mm[first], ideal.pod[kept], ideal.without[:, kept]
+    index = np.maximum(ideal.index[kept], LEAST_INDEX)
+    hits, inspections = np.bincount(which, hit), np.bincount(which).astype(float)
+    weights = np.vstack([np.ones(len(kept)), row_weights(ideal.board[kept])])
+    ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), _means(ideal.needed[:, kept], weights)
+    # d' without a part of the noise moves the probability along the normal curve
+    moved = [special.ndtr(special.ndtri(pod) + other - ideal.index[kept]) for other in without]
+    parts = np.array([expected_sizes(size_mm, other, weights[:1])[:, 0] for other in moved])
+    with np.errstate(invalid="ignore"):
+        error_mm = np.sqrt((len(parts) - 1) * parts.var(axis=0))
+    curve, why, needed = None, "", np.full((2, 1 + DRAWS), np.nan)
+    try:
+        fit = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which)
+        curve = fit.curve
+        targets = Targets(ideal.board[kept], index, hits, inspections)
+        needed[:, 0] = [curve.size_at(share) for share in SHARES]
+        needed[:, 1:] = refitted_sizes(targets, curve, SHARES)
+        inside = (needed[:, 0] >= index.min()) & (needed[:, 0] <= index.max())
+        needed[~inside] = np.nan
+        if not inside.all():
+            wanted = " and ".join(f"{100 * share:.0f} %" for share in np.array(SHARES)[~inside])
+            why = f"found {wanted} of the time at no d' that was inspected ({index.min():.2g} to {index.max():.3g})"
+    except UserError as error:
+        why = error.message
+    all_found = bool((1.0 - pod).sum() <= HARDLY)
+    half, most = (_level(*each, all_found) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True))
+    board, hole, exact, threshold = (getattr(ideal, name)[kept] for name in ("board", "hole", "index", "threshold"))
+    of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
+    return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
+
+
+def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the means (k, d) of values (k, n), without NaN, under each of the weights (d, n)."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(known, values, 0.0) @ weights.T) / (known @ weights.T))
+
+
+def _level(
+    ideal_mm: np.ndarray, error_mm: float, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool
+) -> Level:
+    """One share of damages found; arrays (1 + draws,), the estimate first."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        share = (ideal_index / needed) ** 2
+    known = bool(np.isfinite(needed[0]))
+    return Level(
+        ideal_mm=float(ideal_mm[0]),
+        ideal_mm_interval=percentiles(ideal_mm[1:]),
+        ideal_mm_error=float(error_mm),
+        at_most=all_found,
+        ideal_index=float(ideal_index[0]),
+        index=float(needed[0]),
+        index_interval=percentiles(needed[1:]) if known else UNKNOWN,
+        efficiency=float(share[0]),
+        interval=percentiles(share[1:]) if known else UNKNOWN,
+    )
+
+
+def warnings_of(rows: list[Efficiency]) -> list[str]:
+    """Return a sentence for everything that makes the ideal observer's figures unreliable."""
+    said = []
+    for row in rows:
+        name, ideal = row.limit.record.label, row.ideal
+        if ideal.kurtosis > HEAVY:
+            said.append(
+                f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
+                " observer for Gaussian noise is not the best detector there, nor does it keep to the rate"
+            )
+        if ideal.lost > MOST_LOST:
+            said.append(
+                f"{name}: up to {100 * ideal.lost:.2g} % of the pixels within a board's damage return nothing, which"
+                " the ideal observer does not use: with missing returns more can be found"
+            )
+        if row.why:
+            said.append(f"{name}: efficiency is not known: {row.why}")
+    return said

@@ -1,0 +1,111 @@
+"""Tables of efficiency: every detector beside the ideal observer, and the ideal observer on every damage."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from harness.evaluation.intervals import UNKNOWN
+from harness.evaluation.study.efficiency import Efficiency, Level
+from harness.tables.limits import CALLS, a50_of, a90_of
+from harness.tables.schema import Column, Estimate, Table
+from harness.tables.text import unbroken
+
+INDEX = "d' of the ideal observer at the damage"
+FEW_FIELDS = "standard error of the size before, by the finite number of noise fields"
+
+
+def _calls() -> Column:
+    name, label, _, note, how = (getattr(CALLS[0], each) for each in ("name", "label", "value", "note", "text"))
+    paths = ("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")
+    return Column(name, label, paths, note, how)
+
+
+def _ideal_size(level: Level) -> Estimate:
+    """Return the ideal observer's size; without its interval where it misses nothing."""
+    ends = UNKNOWN if level.at_most else level.ideal_mm_interval
+    return Estimate(level.ideal_mm, ends.low, ends.high, at_most=level.at_most)
+
+
+EFFICIENCY = Table(
+    "efficiency",
+    "one row per set-up and number of frames of a study: its detector beside the ideal observer",
+    (
+        Column("set_up", "set-up", "limit.record.label", "name of the set-up, with its frames", unbroken),
+        Column("variant", "", "limit.record.variant", "name of the set-up"),
+        Column("frames", "", "limit.record.frames", "frames averaged"),
+        Column("detector", "detector", "limit.record.detector", "name of the detector"),
+        Column("detector_version", "", "limit.record.detector_version", "its version"),
+        Column(
+            "ideal_a50_mm",
+            "ideal a50 (mm)",
+            lambda one: _ideal_size(one.half),
+            "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
+            interval=True,
+        ),
+        Column("ideal_is_at_most", "", "half.at_most", "it misses nothing: its sizes are at most the smallest"),
+        Column("ideal_a50_error_mm", "", "half.ideal_mm_error", FEW_FIELDS),
+        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's", interval=True),
+        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), "likewise, 90 %", interval=True),
+        Column("ideal_a90_error_mm", "", "most.ideal_mm_error", FEW_FIELDS),
+        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's", interval=True),
+        Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} at which it finds 50 %"),
+        Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), "at which the detector finds 50 %"),
+        Column(
+            "efficiency_50_share",
+            "efficiency at 50 %",
+            ("half.efficiency", "half.interval"),
+            "(ideal_index_50 / index_50) squared, interval over boards",
+        ),
+        Column("ideal_index_90", "", "most.ideal_index", f"{INDEX} at which it finds 90 %"),
+        Column("index_90", "d' at 90 %", ("most.index", "most.index_interval"), "at which the detector finds 90 %"),
+        Column(
+            "efficiency_90_share",
+            "efficiency at 90 %",
+            ("most.efficiency", "most.interval"),
+            "(ideal_index_90 / index_90) squared, interval over boards",
+        ),
+        _calls(),
+        Column("units", "", "ideal.units", "units whose noise the ideal observer knows"),
+        Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0: Gaussian"),
+        Column("notes", "", "why", "why there is no efficiency"),
+    ),
+    title="efficiency: detectors beside the ideal observer",
+    left=2,
+)
+
+
+@dataclass(frozen=True)
+class DamageRow:
+    """One damage of a set-up, by its place in the arrays of ``of``."""
+
+    of: Efficiency
+    number: int
+
+    def __getattr__(self, name: str) -> object:
+        """Return the damage's entry of an array of ``of``."""
+        return getattr(self.of, name)[self.number].item()
+
+
+DAMAGES = Table(
+    "ideal",
+    "one row per damage of a set-up at a number of frames: the ideal observer on it, and the detector's hits",
+    (
+        Column("set_up", "", "of.limit.record.label", "name of the set-up, with its frames"),
+        Column("board", "", "board", "number of the damaged board"),
+        Column("hole", "", "hole", "its damage"),
+        Column("diameter_mm", "", "size_mm", "true diameter"),
+        Column("index", "", "index", INDEX),
+        Column("threshold", "", "threshold", "of the ideal observer's statistic, deviations; empty where d' is 0"),
+        Column("pod", "", "pod", "the ideal observer's probability of detection"),
+        Column("hits", "", "hits", "hits of the detector by depth"),
+        Column("inspections", "", "inspections", "draws of the noise in which the damage was inspected"),
+    ),
+)
+EFFICIENCY_TABLES = (EFFICIENCY, DAMAGES)
+
+
+def damage_rows(rows: Sequence[Efficiency]) -> Iterator[DamageRow]:
+    """Yield every damage of all set-ups."""
+    for row in rows:
+        yield from (DamageRow(row, number) for number in range(len(row.index)))
