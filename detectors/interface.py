@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -149,4 +150,17 @@ class Detector(Protocol):
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
         """Measure size and place of one detection."""
+        ...
+
+
+@runtime_checkable
+class Calibratable(Protocol):
+    """A detector that learns from undamaged targets before it judges."""
+
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return what was learned as plain arrays. Raises UserError where the clouds do not suffice."""
+        ...
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
+        """Return the detector that uses it."""
         ...

@@ -252,7 +252,9 @@ class SetUpLimit:
     one order for all set-ups of as many boards. ``over_boards``: a90/95 were damages of one board as alike as the data
     say. Where everything is found the estimates are the smallest size inspected, which they do not exceed; where
     nothing is, or POD does not grow with size, they are NaN and their draws infinite. ``signals``: a second opinion,
-    the signal's regression with the threshold as decision, or ``signals_why`` not."""
+    the signal's regression with the threshold as decision, or ``signals_why`` not. ``size_error_mm``: median size of
+    the error of the diameter of those ``sized``, hits whose diameter a model gives. ``seconds_detect``: median a
+    cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -276,6 +278,10 @@ class SetUpLimit:
     signals: PodStatement | None
     signals_why: str
     largest_mm: float
+    size_error_mm: float = np.nan
+    size_error_interval_mm: Interval = UNKNOWN
+    sized: int = 0
+    seconds_detect: float = np.nan
 
     @property
     def is_at_most(self) -> bool:
@@ -357,6 +363,16 @@ def limit_of(
     return SetUpLimit(
         record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
     )
+
+
+def median_over_boards(board: np.ndarray, values: np.ndarray, draws: int = DRAWS) -> tuple[float, Interval]:
+    """Return the median of values (n,) and its 95 % percentiles over boards drawn again; NaN of none."""
+    if not len(values):
+        return np.nan, UNKNOWN
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(row_weights(board, draws)[:, order], axis=1)
+    drawn = values[order][(2.0 * below >= below[:, -1:]).argmax(axis=1)]
+    return float(np.median(values)), percentiles(drawn) if len(np.unique(board)) > 1 else UNKNOWN
 
 
 def fit_of(record: SetUpRecord, statement: PodStatement) -> HitMissFit:
