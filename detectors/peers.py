@@ -22,6 +22,7 @@ from pydantic import Field
 
 from detectors.average import AverageConfig, average
 from detectors.background import background
+from detectors.clusters import euclidean_clusters
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detector, Evidence
 from detectors.noise import median_of, rounding_floor, sigma_of
@@ -165,6 +166,11 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
             behind=signed > 0,
         )
 
+    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+        # across the view: a score belongs to the surface, so that a rim and what lies deep behind it are one finding
+        flat = cloud.points_m.reshape(-1, 3)[pixels] * [1.0, 1.0, 0.0]
+        return euclidean_clusters(flat, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+
     @cached_property
     def _reference_m(self) -> np.ndarray:
         """Points (n, 3) of the reference scan."""
@@ -238,8 +244,9 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009), averaged over a
     window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the score is the Euclidean distance to its
     nearest feature, in units of the median distance of one more undamaged target. Only the shape of some 100 neighbours
-    counts: what is as flat as the target, such as a wide hole's floor, is no damage but at its rim. Not done: the
-    paper's smoothing of scores. A score is no length; ``scale_m`` is the deviation of the residuals."""
+    counts: a wide hole shows by its rim alone, and a step that is sharp and deeper than their sphere is wide is not
+    seen, as both its sides are flat. Not done: the paper's smoothing of scores. A score is no length; ``scale_m`` is
+    the deviation of the residuals."""
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
