@@ -126,6 +126,22 @@ class ToldTheTruth(Protocol):
         ...
 
 
+@runtime_checkable
+class Calibratable(Protocol):
+    """A detector that learns from hole-free clouds before it judges: the noise's spectrum, its tails, a memory of the
+    undamaged face. What it learns is plain arrays, so that it can be stored and sent; names are identifiers."""
+
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return what the clouds teach, as arrays without objects; empty where there is nothing to learn. The clouds
+        were taken as those that will be judged (camera, frames, average), of targets without damage. Changes neither
+        the detector nor the clouds. Raises UserError where they cannot be judged or are too few."""
+        ...
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
+        """Return the detector, of the same name and version, that uses what `calibrate` has returned."""
+        ...
+
+
 class Detector(Protocol):
     """A detector sees a cloud and never the truth. Its settings are a `harness.vocabulary.config.Config`."""
 
@@ -150,17 +166,4 @@ class Detector(Protocol):
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
         """Measure size and place of one detection."""
-        ...
-
-
-@runtime_checkable
-class Calibratable(Protocol):
-    """A detector that learns from undamaged targets before it judges."""
-
-    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return what was learned as plain arrays. Raises UserError where the clouds do not suffice."""
-        ...
-
-    def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
-        """Return the detector that uses it."""
         ...

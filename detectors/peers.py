@@ -268,7 +268,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
             # windows that hardly overlap
             of_clouds.append(features[(rows % self.settings.pool_px == 0) & (columns % self.settings.pool_px == 0)])
         memory = coreset(np.concatenate(of_clouds[:-1]), self.settings.memory)
-        return {"memory": memory, "unit": np.median(nearest(of_clouds[-1], memory))}
+        return {"memory": memory, "unit": np.array(np.median(nearest(of_clouds[-1], memory)))}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
         """Return the detector with this memory."""
