@@ -39,6 +39,8 @@ LOD_SIGMAS = 1.96
 """Standard deviations in py4dgeo's level of detection, which holds 95 % of differences by chance."""
 LEAST_SAMPLES = 4
 """Points that a cylinder holds at least in both clouds: the scatter of fewer says too little."""
+MOST_ALONE = 0.01
+"""Share of the target without a counterpart from which on it is told."""
 CHUNK = 4096
 """Features whose distances to the whole memory are held at once."""
 
@@ -96,10 +98,10 @@ class M3c2Config(ScoreMapConfig):
     """``reference``: a capture of the same target without damage, any that ``harness.detect`` reads, in the frame of
     the clouds; without it the distance is to ``surface``, fitted to the cloud itself. ``registration_error_mm``: how
     well the two agree where nothing has changed; without it the scatter of the distances is taken, as most of the
-    target is unchanged. ``cylinder_radius_mm``: half of the scale over which
-    points are averaged: 4 mm hold some 20 of the pixels of 1.4 mm that an Azure Kinect has at 0.7 m, as Lague et al.
-    ask for. ``normal_radius_mm``: of the neighbourhood that a normal is fitted to, 20 times a noise of 1 mm and more.
-    ``reach_mm``: half of a cylinder's length; deeper points have no counterpart."""
+    target is unchanged. ``cylinder_radius_mm``: half of the scale over which points are averaged: 4 mm hold some 20 of
+    the pixels of 1.4 mm that an Azure Kinect has at 0.7 m, as Lague et al. ask for. ``normal_radius_mm``: of the
+    neighbourhood that a normal is fitted to, 20 times a noise of 1 mm. ``reach_mm``: half of a cylinder's length;
+    deeper points have no counterpart."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -135,12 +137,15 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         known = np.isfinite(feet[:, 2])
         before = feet[known] if settings.reference is None else self._reference_m
         distance_m, deviation_m = np.full((2, len(points)), np.nan)
-        distance_m[known], deviation_m[known] = self._distances(feet[known], before, points)
+        if known.any():
+            distance_m[known], deviation_m[known] = self._distances(feet[known], before, points)
         judged = np.isfinite(distance_m)
+        alone = 1.0 - float(judged.mean())
         if not judged.any():
-            what = "its reference" if settings.reference else "its surface"
             fix = "check that both are in one frame, or enlarge cylinder_radius_mm or reach_mm"
-            raise UserError(f"no point of the target has {LEAST_SAMPLES} neighbours there and in {what}", fix=fix)
+            raise UserError(
+                f"no point of the target has {LEAST_SAMPLES} neighbours there and in {notes['surface']}", fix=fix
+            )
         if settings.registration_error_mm is None:
             scatter_m = sigma_of(distance_m[judged] - median_of(distance_m[judged]))
             error_m = float(np.sqrt(max(scatter_m**2 - median_of(deviation_m[judged]) ** 2, 0.0)))
@@ -150,12 +155,14 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         signed = on_grid(distance_m / deviation_m, mask)
         if settings.reference is not None and np.nanmedian(np.abs(signed)) > LOD_SIGMAS:
             off_mm = median_of(np.abs(distance_m[judged])) / MM
-            warnings = [f"the target lies {off_mm:.2g} mm off its reference scan: it moved, or is not registered to it"]
-        notes |= {
-            "points": len(points),
-            "registration_error_m": error_m,
-            "without_counterpart": 1.0 - float(judged.mean()),
-        }
+            warnings.append(
+                f"the target lies {off_mm:.2g} mm off its reference scan: it moved, or is not registered to it"
+            )
+        if alone > MOST_ALONE:
+            warnings.append(
+                f"{100 * alone:.0f} % of the target has no counterpart in {notes['surface']} and is not judged"
+            )
+        notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
         return Evidence(
             score=np.abs(signed),
             residual_m=on_grid(points[:, 2] - feet[:, 2], mask),

@@ -153,6 +153,12 @@ def test_a_reference_scan_of_any_shape(tmp_path: Path) -> None:
         assert np.nanmedian(one.residual_m[13:19, 11:17]) == pytest.approx(2e-3, abs=2e-4)
     moved = detector.analyse(replace(cloud, points_m=again + np.array([0.0, 0.0, 3e-3])))
     assert "3 mm off its reference scan" in moved.warnings[0]
+    np.save(path, stepped[:, :45])
+    partly = load_detector("m3c2", {**WHOLE, "reference": str(path)}).analyse(cloud)
+    assert "of the target has no counterpart in reference scan" in partly.warnings[0]
+    np.save(path, stepped + np.array([1.0, 0.0, 0.0]))
+    with pytest.raises(UserError, match="no point of the target has 4 neighbours"):
+        load_detector("m3c2", {**WHOLE, "reference": str(path)}).analyse(cloud)
     with pytest.raises(UserError, match="no such file"):
         load_detector("m3c2", {**WHOLE, "reference": str(tmp_path / "gone.npy")}).analyse(cloud)
 
