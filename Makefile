@@ -37,7 +37,7 @@ strangers: .venv/.ready
 
 # Five minutes; needed after a change of pyproject.toml's dependencies only.
 lock: .venv/.ready
-	$(BIN)/pip-compile --quiet --extra dev --extra cluster --generate-hashes --strip-extras --allow-unsafe \
+	$(BIN)/pip-compile --quiet --extra dev --extra cluster --extra peers --generate-hashes --strip-extras --allow-unsafe \
 	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links -o requirements.lock pyproject.toml
 
 .venv/.ready: requirements.lock pyproject.toml

@@ -5,8 +5,10 @@ Detectors are found by name: the built-in ones below, others through the entry p
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, cast
 
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.plug_ins import PlugIns
 
 if TYPE_CHECKING:
@@ -18,11 +20,17 @@ GROUP = "tofpod.detectors"
 
 BUILT_IN = {
     "blind": "detectors.controls:BlindDetector",
+    "fpfh_memory": "detectors.peers:FpfhMemoryDetector",
     "local": "detectors.local:LocalDetector",
+    "m3c2": "detectors.peers:M3c2Detector",
     "matched": "detectors.matched:MatchedDetector",
     "oracle": "detectors.controls:Oracle",
+    "plane_ransac": "detectors.peers:PlaneRansacDetector",
     "thesis": "detectors.thesis:ThesisDetector",
 }
+
+NEEDED = {"m3c2": "py4dgeo"}
+"""Packages of the extra `peers`, by detector."""
 
 DETECTORS = PlugIns(GROUP, "detector", lambda: BUILT_IN)
 
@@ -35,11 +43,16 @@ def detector_names() -> tuple[str, ...]:
 def detector_type(name: str) -> Any:
     """Return the class behind a name; its ``settings_type`` is the Config that validates its settings.
 
-    Raises UserError on an unknown name, a name taken twice, and a plug-in that is no detector or is called otherwise.
+    Raises UserError on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is no
+    detector or is called otherwise.
     """
     from harness.vocabulary.config import Config
 
     offer = DETECTORS.offer(name)
+    package = NEEDED.get(name) if offer.built_in else None
+    if package is not None and find_spec(package) is None:
+        fix = "pip install 'tofpod[peers]'"
+        raise UserError(f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix)
     kind = DETECTORS.load(offer)
     settings_type = getattr(kind, "settings_type", None)
     if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):

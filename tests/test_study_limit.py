@@ -18,6 +18,7 @@ from harness.evaluation.study.limit import (
     board_weights,
     design_effect,
     limit_of,
+    median_over_boards,
     refitted_sizes,
     row_weights,
     targets_of,
@@ -219,6 +220,15 @@ class TestBoardsDrawnAgain:
         assert not np.array_equal(board_weights(7, 20), board_weights(7, 20, "hole-free"))
         rows = row_weights(np.array([9, 4, 9]), 20)
         assert np.array_equal(rows[:, 0], rows[:, 2]) and np.array_equal(rows[:, 1], board_weights(2, 20)[:, 0])
+
+    def test_a_median_over_boards_is_that_of_each_draws_values(self):
+        rng = np.random.default_rng(5)
+        board, values = rng.integers(0, 9, 61), rng.exponential(size=61)
+        typical, ends = median_over_boards(board, values, 40)
+        drawn = [np.sort(np.repeat(values, w.astype(int))) for w in row_weights(board, 40)]
+        assert typical == np.median(values)
+        assert ends == percentiles(np.array([one[(len(one) - 1) // 2] for one in drawn]))
+        assert np.isnan(median_over_boards(board[:0], values[:0])[0])
 
     @pytest.mark.parametrize("link", LINKS)
     @pytest.mark.parametrize("log_size", [False, True])

@@ -73,6 +73,11 @@ class TestStudy:
             holes = tables.holes[tables.holes["frames"] == frames]
             assert one.limit.hits == holes["detected"].sum()
             assert one.free_response.at[1] == pytest.approx(one.limit.rate)
+            sized = holes[holes["detected"] & holes["model_diameter_mm"].notna()]
+            assert one.limit.sized == len(sized) < one.limit.hits
+            error_mm, ends_mm = one.limit.size_error_mm, one.limit.size_error_interval_mm
+            assert error_mm == pytest.approx(np.median(np.abs(sized["model_diameter_mm"] - sized["true_diameter_mm"])))
+            assert 0.1 <= ends_mm.low <= error_mm <= ends_mm.high < 0.45 and one.limit.seconds_detect == 0.05
             runs = tables.runs[(tables.runs["frames"] == frames) & (tables.runs["role"] == "hole_free")]
             assert one.limit.false_calls.calls == runs["false_calls"].sum()
 

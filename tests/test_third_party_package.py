@@ -12,6 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from detectors import BUILT_IN
 from tests.third_party import write_package
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,7 +74,7 @@ def test_it_is_listed_with_its_package_and_what_is_broken_is_said_to_be(python: 
     assert done.returncode == 0, done.stderr
     listed = json.loads(done.stdout)
     detectors = {row["name"]: row for row in listed["detectors"]}
-    assert set(detectors) == {"acme_broken", "acme_median", "blind", "local", "matched", "oracle", "thesis"}
+    assert set(detectors) == {"acme_broken", "acme_median", *BUILT_IN}
     assert detectors["acme_median"] == {
         "name": "acme_median",
         "package": "acme-inspection",

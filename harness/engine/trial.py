@@ -423,7 +423,6 @@ def _point_rows(
         of_map = {"views_used": used, "views_left_out": maps.count(mapping) - used}
         of_map["seconds_map"] = maps.seconds(mapping, point.frames)
         source = maps.key(mapping, point.frames)
-    began = time.perf_counter()
     asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
     key = canonical_json([source, *asked, point.learned])
     if key not in done:
@@ -434,14 +433,15 @@ def _point_rows(
             if task.hole_free and task.board is None:
                 errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
                 probes = [{"error_tenth_um": _tenth_um(errors_m)}]
+        began = time.perf_counter()
         judged = judge(known, *asked, hole_free=task.hole_free, learned=point.learned)
+        judged.run["seconds_detect"] = time.perf_counter() - began
         if task.board is None:
             done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}
         else:
             done[key] = study_rows(known, judged, point.radius_m, hole_free=task.hole_free)
-    seconds = {**of_map, **seconds, "seconds_detect": time.perf_counter() - began}
     before = {"runs": named | role, "holes": named, "probes": common}
-    after = {"runs": seconds}
+    after = {"runs": of_map | seconds}
     rows = {
         name: [{**before.get(name, common | role), **row, **after.get(name, {})} for row in found]
         for name, found in done[key].items()

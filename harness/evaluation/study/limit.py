@@ -260,7 +260,8 @@ class SetUpLimit:
     nothing is, or POD does not grow with size, they are NaN and their draws infinite. ``signals``: a second opinion,
     the signal's regression with the threshold as decision, or ``signals_why`` not. ``over_units``: limits of the units
     of a study with several and of a new one; draws are then over boards and units. ``beside``: findings on damaged
-    boards that count for no damage."""
+    boards that count for no damage. ``size_error_mm``: median size of the error of the diameter of those ``sized``,
+    hits whose diameter a model gives. ``seconds_detect``: median a cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -286,6 +287,10 @@ class SetUpLimit:
     largest_mm: float
     over_units: OverUnits | None
     beside: FalseCallRate | None
+    size_error_mm: float = np.nan
+    size_error_interval_mm: Interval = UNKNOWN
+    sized: int = 0
+    seconds_detect: float = np.nan
 
     @property
     def is_at_most(self) -> bool:
@@ -372,6 +377,16 @@ def limit_of(
     return SetUpLimit(
         record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
     )
+
+
+def median_over_boards(board: np.ndarray, values: np.ndarray, draws: int = DRAWS) -> tuple[float, Interval]:
+    """Return the median of values (n,) and its 95 % percentiles over boards drawn again; NaN of none."""
+    if not len(values):
+        return np.nan, UNKNOWN
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(row_weights(board, draws)[:, order], axis=1)
+    drawn = values[order][(2.0 * below >= below[:, -1:]).argmax(axis=1)]
+    return float(np.median(values)), percentiles(drawn) if len(np.unique(board)) > 1 else UNKNOWN
 
 
 def fit_of(record: SetUpRecord, statement: PodStatement) -> HitMissFit:

@@ -6,7 +6,7 @@ that are none 8 to 9 % are called beyond chance with 60 and 20 boards of eight d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ from harness.evaluation.study.limit import (
     SizeRow,
     depth_varies,
     limit_of,
+    median_over_boards,
     pod_at,
     surface_of,
 )
@@ -312,6 +313,14 @@ def _set_up(
     signal = sites["signal"].dropna().to_numpy(float) if len(sites) else np.zeros(0)
     floor = float(np.quantile(signal, NOISE_SHARE)) if len(signal) else np.nan
     limit = limit_of(record, draws=draws, noise_floor=floor, tested=True)
+    if not holes.empty and not runs.empty:
+        sized = holes[holes["detected"].astype(bool) & holes["model_diameter_mm"].notna()]
+        error_mm = (sized["model_diameter_mm"] - sized["true_diameter_mm"]).abs().to_numpy()
+        typical_mm, ends_mm = median_over_boards(sized["board"].to_numpy(), error_mm, draws)
+        seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
+        limit = replace(
+            limit, size_error_mm=typical_mm, size_error_interval_mm=ends_mm, sized=len(sized), seconds_detect=seconds
+        )
     a50, a90 = (limit.a50_mm, limit.a90_mm) if limit.statement else (np.nan, np.nan)
     chance = None
     if not holes.empty and not runs.empty:

@@ -1,0 +1,352 @@
+"""Methods of other fields and libraries behind the same interface, to be compared on the same clouds.
+
+`m3c2` asks the library py4dgeo for the distance to a surface and its level of detection, as geomorphologists measure
+change; `plane_ransac` takes Open3D's plane, as most tutorials do; `fpfh_memory` compares features of shape with those
+of undamaged targets, which found more than deep networks did on the data set MVTec 3D-AD. Each has the settings and the
+formula of its source; none knows the camera's noise.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import threadpoolctl
+from pydantic import Field
+
+from detectors.average import AverageConfig, average
+from detectors.background import background
+from detectors.clusters import euclidean_clusters
+from detectors.crop import AutoCrop, CropConfig, crop
+from detectors.interface import Detector, Evidence
+from detectors.noise import median_of, rounding_floor, sigma_of
+from detectors.open3d_library import open3d_on_one_thread
+from detectors.recordings import open_capture
+from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
+from detectors.smooth_surfaces import raster
+from detectors.surface import SurfaceConfig
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.seeds import random_stream
+
+LOD_SIGMAS = 1.96
+"""Standard deviations in py4dgeo's level of detection, which holds 95 % of differences by chance."""
+LEAST_SAMPLES = 4
+"""Points that a cylinder holds at least in both clouds: the scatter of fewer says too little."""
+MOST_ALONE = 0.01
+"""Share of the target without a counterpart from which on it is told."""
+CHUNK = 4096
+"""Features whose distances to the whole memory are held at once."""
+
+
+class PlaneRansacConfig(ScoreMapConfig):
+    """``inlier_mm``: distance from the plane up to which a point supports it, some three deviations of one frame of a
+    continuous-wave camera. ``iterations``: most triples of points that are tried; ``seed`` draws them."""
+
+    crop: CropConfig = Field(default_factory=AutoCrop)
+    inlier_mm: float = Field(default=2.0, gt=0)
+    iterations: int = Field(default=1000, ge=1, le=1_000_000)
+    seed: int = Field(default=0, ge=0)
+
+
+class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
+    """Open3D's plane by random sampling; the score is the residual over its median absolute deviation.
+
+    Not modelled: any other shape (all of a curved target scores), and noise that differs from place to place."""
+
+    settings_type: ClassVar[type[PlaneRansacConfig]] = PlaneRansacConfig
+    name = "plane_ransac"
+    version = 1
+
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score |residual| / deviation in the crop. Raises UserError where its points determine no plane."""
+        mask = crop(cloud, self.settings.crop)
+        points = cloud.points_m[mask]
+        # in the order of z, so that the triples do not depend on how the grid lies
+        ordered = np.ascontiguousarray(points[np.argsort(points[:, 2], kind="stable")])
+        a, b, c, d = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
+        if abs(c) < 1e-3:
+            fix = "widen the crop, or choose another detector"
+            raise UserError(f"{len(points)} points determine no plane that is seen from the front", fix=fix)
+        fitted = -(a * points[:, 0] + b * points[:, 1] + d) / c
+        residual = points[:, 2] - fitted
+        scale = max(sigma_of(residual), rounding_floor(cloud, mask))
+        supported = float(np.mean(np.abs(residual * c) <= self.settings.inlier_mm * MM))
+        notes = {"surface": "plane", "points": len(points), "supporting_share": supported}
+        score, residual_m, z_m = (on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted))
+        return Evidence(score, residual_m, z_m, scale, notes)
+
+    def _plane(self, points: np.ndarray) -> tuple[float, ...]:
+        """Return (a, b, c, d) of the plane a x + b y + c z + d = 0, of least squares over its supporting points."""
+        with open3d_on_one_thread() as o3d:
+            o3d.utility.random.seed(int(random_stream(self.settings.seed, self.name).integers(2**31)))
+            listed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+            plane, _ = listed.segment_plane(self.settings.inlier_mm * MM, 3, self.settings.iterations)
+        return tuple(plane.tolist())
+
+
+# ---------------------------------------------------------------- M3C2
+
+
+class M3c2Config(ScoreMapConfig):
+    """``reference``: a capture of the same target without damage, any that ``harness.detect`` reads, in the frame of
+    the clouds; without it the distance is to ``surface``, fitted to the cloud itself. ``registration_error_mm``: how
+    well the two agree where nothing has changed; without it the scatter of the distances is taken, as most of the
+    target is unchanged. ``cylinder_radius_mm``: half of the scale over which points are averaged: 4 mm hold some 20 of
+    the pixels of 1.4 mm that an Azure Kinect has at 0.7 m, as Lague et al. ask for. ``normal_radius_mm``: of the
+    neighbourhood that a normal is fitted to, 20 times a noise of 1 mm. ``reach_mm``: half of a cylinder's length;
+    deeper points have no counterpart."""
+
+    crop: CropConfig = Field(default_factory=AutoCrop)
+    surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
+    reference: str | None = None
+    registration_error_mm: float | None = Field(default=None, ge=0)
+    cylinder_radius_mm: float = Field(default=4.0, gt=0)
+    normal_radius_mm: float = Field(default=20.0, gt=0)
+    reach_mm: float = Field(default=500.0, gt=0)
+
+
+class M3c2Detector(ScoreMapDetector[M3c2Config]):
+    """Distance to a surface or a reference scan by M3C2 (py4dgeo), over the deviation in its level of detection.
+
+    Means over cylinders along the normal (Lague, Brodu and Leroux, ISPRS J. 82 (2013), 10). A score of 1.96 is the
+    level of detection: LoD / 1.96 = sqrt(s1^2 / n1 + s2^2 / n2) + registration error. Not modelled: noise that
+    neighbours share, for which the level is too low, and a rim inside a cylinder, which counts as its scatter."""
+
+    settings_type: ClassVar[type[M3c2Config]] = M3c2Config
+    name = "m3c2"
+    version = 1
+
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score |distance| / deviation in the crop. Raises UserError where nothing has a counterpart."""
+        mask, settings = crop(cloud, self.settings.crop), self.settings
+        points = cloud.points_m[mask]
+        if settings.reference is None:
+            ground = background(cloud, mask, settings.surface)
+            notes, warnings = {**ground.notes, "surface": ground.description}, [ground.warning]
+            feet = np.column_stack([points[:, :2], ground.surface_z_m[mask]])
+        else:
+            notes, warnings = {"surface": f"reference scan {settings.reference}"}, []
+            feet = self._below(points, cloud.projection == "central")
+        known = np.isfinite(feet[:, 2])
+        before = feet[known] if settings.reference is None else self._reference_m
+        distance_m, deviation_m = np.full((2, len(points)), np.nan)
+        if known.any():
+            distance_m[known], deviation_m[known] = self._distances(feet[known], before, points)
+        judged = np.isfinite(distance_m)
+        alone = 1.0 - float(judged.mean())
+        if not judged.any():
+            fix = "check that both are in one frame, or enlarge cylinder_radius_mm or reach_mm"
+            raise UserError(
+                f"no point of the target has {LEAST_SAMPLES} neighbours there and in {notes['surface']}", fix=fix
+            )
+        if settings.registration_error_mm is None:
+            scatter_m = sigma_of(distance_m[judged] - median_of(distance_m[judged]))
+            error_m = float(np.sqrt(max(scatter_m**2 - median_of(deviation_m[judged]) ** 2, 0.0)))
+        else:
+            error_m = settings.registration_error_mm * MM
+        deviation_m = np.maximum(deviation_m + error_m, rounding_floor(cloud, mask))
+        signed = on_grid(distance_m / deviation_m, mask)
+        if settings.reference is not None and np.nanmedian(np.abs(signed)) > LOD_SIGMAS:
+            off_mm = median_of(np.abs(distance_m[judged])) / MM
+            warnings.append(
+                f"the target lies {off_mm:.2g} mm off its reference scan: it moved, or is not registered to it"
+            )
+        if alone > MOST_ALONE:
+            warnings.append(
+                f"{100 * alone:.0f} % of the target has no counterpart in {notes['surface']} and is not judged"
+            )
+        notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
+        return Evidence(
+            score=np.abs(signed),
+            residual_m=on_grid(points[:, 2] - feet[:, 2], mask),
+            surface_z_m=on_grid(feet[:, 2], mask),
+            scale_m=median_of(deviation_m[judged]),
+            notes=notes,
+            warnings=tuple(filter(None, warnings)),
+            behind=signed > 0,
+        )
+
+    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+        # across the view: a score belongs to the surface, so that a rim and what lies deep behind it are one finding
+        flat = cloud.points_m.reshape(-1, 3)[pixels] * [1.0, 1.0, 0.0]
+        return euclidean_clusters(flat, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+
+    @cached_property
+    def _reference_m(self) -> np.ndarray:
+        """Points (n, 3) of the reference scan."""
+        assert self.settings.reference is not None
+        cloud = average(open_capture([Path(self.settings.reference)]), AverageConfig())
+        return cloud.points_m[cloud.valid]
+
+    def _below(self, points: np.ndarray, central: bool) -> np.ndarray:
+        """Return where the rays through points (n, 3) meet the reference (n, 3), by linear interpolation."""
+        from scipy.interpolate import LinearNDInterpolator
+
+        (plan, reference), z = (each[:, :2] for each in (points, self._reference_m)), self._reference_m[:, 2]
+        if central:
+            plan, reference = plan / points[:, 2:], reference / z[:, None]
+        feet_z = LinearNDInterpolator(reference, z)(plan)
+        return np.column_stack([plan * feet_z[:, None] if central else plan, feet_z])
+
+    def _distances(self, feet: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance (n,) of points ``after`` (m, 3) behind those ``before`` (k, 3) at each foot (n, 3), and
+        its deviation; NaN where a cylinder holds too few."""
+        py4dgeo = _py4dgeo()
+        with threadpoolctl.threadpool_limits(1, user_api="openmp"):
+            epochs = tuple(py4dgeo.Epoch(np.ascontiguousarray(points)) for points in (before, after))
+            measured = py4dgeo.M3C2(
+                epochs=epochs,
+                corepoints=np.ascontiguousarray(feet),
+                normal_radii=(self.settings.normal_radius_mm * MM,),
+                cyl_radius=self.settings.cylinder_radius_mm * MM,
+                max_distance=self.settings.reach_mm * MM,
+                registration_error=0.0,
+            )
+            distance, uncertainty = measured.run()
+        few = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
+        return np.where(few, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
+
+
+def _py4dgeo() -> Any:
+    """Return the module, without its log, which it prints and writes into the working folder, and without the number of
+    threads that it sets for all programs started from here."""
+    threads = os.environ.get("OMP_NUM_THREADS")
+    import py4dgeo
+
+    if threads is None:
+        os.environ.pop("OMP_NUM_THREADS", None)
+    log = logging.getLogger("py4dgeo")
+    log.handlers.clear()
+    log.setLevel(logging.WARNING)
+    return py4dgeo
+
+
+# ---------------------------------------------------------------- features in a memory
+
+
+class FpfhMemoryConfig(ScoreMapConfig):
+    """``normal_neighbours``, ``feature_neighbours``: points in the sphere of a normal and of a feature, at a typical
+    place, and ``pool_px``: side of the square of pixels over which features are averaged (30, 100 and 8 in the
+    paper's program). ``memory``: features of undamaged targets that are kept. ``surface``: what sizes are measured
+    from."""
+
+    crop: CropConfig = Field(default_factory=AutoCrop)
+    surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
+    normal_neighbours: int = Field(default=30, ge=3)
+    feature_neighbours: int = Field(default=100, ge=3)
+    pool_px: int = Field(default=7, ge=1)
+    memory: int = Field(default=1000, ge=1)
+
+
+class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
+    """Fast point feature histograms (Open3D) against the nearest in a memory of undamaged targets.
+
+    Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009), averaged over a
+    window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the score is the Euclidean distance to its
+    nearest feature, in units of the median distance of one more undamaged target. Only the shape of some 100 neighbours
+    counts: a wide hole shows by its rim alone, and a step that is sharp and deeper than their sphere is wide is not
+    seen, as both its sides are flat. Not done: the paper's smoothing of scores. A score is no length; ``scale_m`` is
+    the deviation of the residuals."""
+
+    settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
+    name = "fpfh_memory"
+    version = 1
+
+    def __init__(self, settings: FpfhMemoryConfig, learned: Mapping[str, np.ndarray] | None = None) -> None:
+        super().__init__(settings)
+        self._learned = learned
+
+    def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
+        """Return ``memory`` (m, 33) and ``unit`` (): the median distance of the last cloud's features from it. Raises
+        UserError for fewer than two clouds."""
+        if len(hole_free) < 2:
+            raise UserError(f"the detector {self.name!r} learns from two hole-free clouds at least")
+        of_clouds = []
+        for cloud in hole_free:
+            mask = crop(cloud, self.settings.crop)
+            features, rows, columns = self._features(cloud, mask)
+            # windows that hardly overlap
+            of_clouds.append(features[(rows % self.settings.pool_px == 0) & (columns % self.settings.pool_px == 0)])
+        memory = coreset(np.concatenate(of_clouds[:-1]), self.settings.memory)
+        return {"memory": memory, "unit": np.array(np.median(nearest(of_clouds[-1], memory)))}
+
+    def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
+        """Return the detector with this memory."""
+        return FpfhMemoryDetector(self.settings, learned)
+
+    def analyse(self, cloud: Cloud) -> Evidence:
+        """Score the distance from the memory in the crop. Raises UserError without a memory, and for few points."""
+        if self._learned is None:
+            raise UserError(
+                f"the detector {self.name!r} has no memory of hole-free targets to compare this cloud with",
+                fix="use it in a study, which has hole-free boards, or call its `calibrate` with clouds of your own",
+            )
+        mask = crop(cloud, self.settings.crop)
+        features, _, _ = self._features(cloud, mask)
+        score = nearest(features, self._learned["memory"]) / max(float(self._learned["unit"]), 1e-9)
+        ground = background(cloud, mask, self.settings.surface)
+        scale_m = sigma_of(ground.residual_m[np.isfinite(ground.residual_m)])
+        return Evidence(
+            score=on_grid(score, mask),
+            residual_m=ground.residual_m,
+            surface_z_m=ground.surface_z_m,
+            scale_m=max(scale_m, rounding_floor(cloud, mask)),
+            notes={"surface": ground.description, "points": len(score), "memory": len(self._learned["memory"])},
+            unit="the median distance of an undamaged target's features from the memory, which is no length",
+        )
+
+    def _features(self, cloud: Cloud, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the averaged features (n, 33) of the masked points, and their rows and columns (n,)."""
+        from scipy.spatial import cKDTree
+
+        settings, points = self.settings, np.ascontiguousarray(cloud.points_m[mask])
+        if len(points) <= settings.feature_neighbours:
+            raise UserError(f"{len(points)} points are too few for features of {settings.feature_neighbours}")
+        # one radius everywhere: at a rim two points may have the same nearest ones, and so normals that only rounding
+        # tells apart
+        wanted = [settings.normal_neighbours, settings.feature_neighbours]
+        radii_m = np.median(cKDTree(points).query(points, k=wanted)[0], axis=0)
+        with open3d_on_one_thread() as o3d:
+            listed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+            of_normals, of_features = map(o3d.geometry.KDTreeSearchParamRadius, radii_m.tolist())
+            listed.estimate_normals(of_normals)
+            listed.orient_normals_to_align_with_direction([0.0, 0.0, -1.0])
+            features = np.asarray(o3d.pipelines.registration.compute_fpfh_feature(listed, of_features).data).T
+        rows, columns = np.nonzero(mask) if cloud.organised else raster(points, cloud)[1:3]
+        rows, columns = rows - rows.min(), columns - columns.min()
+        # the last channel counts points
+        image = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1, features.shape[1] + 1))
+        np.add.at(image, (rows, columns), np.column_stack([features, np.ones(len(features))]))
+        side = (settings.pool_px, settings.pool_px)
+        pooled = cv2.blur(image, side, borderType=cv2.BORDER_CONSTANT)[rows, columns]
+        return pooled[:, :-1] / pooled[:, -1:], rows, columns
+
+
+def coreset(features: np.ndarray, size: int) -> np.ndarray:
+    """Return at most ``size`` of the features (n, k): the most central, then ever the one farthest from those taken."""
+    apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
+    taken, apart = [int(apart.argmin())], np.full(len(features), np.inf)
+    while len(taken) < size:
+        apart = np.minimum(apart, ((features - features[taken[-1]]) ** 2).sum(axis=1))
+        if apart.max() == 0.0:
+            break
+        taken.append(int(apart.argmax()))
+    return features[taken]
+
+
+def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of each feature (n, k) from the nearest in the memory (m, k)."""
+    found = np.empty(len(features))
+    sizes = (memory**2).sum(axis=1)
+    with threadpoolctl.threadpool_limits(1, user_api="blas"):
+        for start in range(0, len(features), CHUNK):
+            some = features[start : start + CHUNK]
+            found[start : start + CHUNK] = (some**2).sum(axis=1) + (sizes - 2.0 * some @ memory.T).min(axis=1)
+    return np.sqrt(np.maximum(found, 0.0))
