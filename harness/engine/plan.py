@@ -145,10 +145,9 @@ class Group:
 
 def _point_task(point: Point, threshold: float | None) -> PointTask:
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
-    asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
-    return PointTask(
-        point.digest, point.variant, capture.frames, *asked, mapping=point.config.mapping, exact=capture.exact
-    )
+    settings, radius_m = canonical_json(detector.settings), matching.radius_mm * MM
+    asked = (detector.name, settings, capture.average, radius_m, threshold, point.config.mapping)
+    return PointTask(point.digest, point.variant, capture.frames, *asked, capture.exact, capture.flat_field)
 
 
 @dataclass(frozen=True)

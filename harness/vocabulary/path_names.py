@@ -27,7 +27,9 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number."""
+    """A value on one line, short, with its unit where it is a number; of a mapping each key and value."""
+    if isinstance(value, dict) and value:
+        return on_one_line(", ".join(f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items()))
     text = on_one_line(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return f"{value:g} {unit_of(path)}" if number and unit_of(path) else text
