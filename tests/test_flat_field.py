@@ -311,6 +311,26 @@ def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.slow
+def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path, capsys):
+    """22 frames of a real Azure Kinect from one place: the pattern of the first half is that of the second, within the
+    noise, so that their correlation is what pattern and noise make it."""
+    walls = tmp_path / "walls"
+    walls.mkdir()
+    for path in sorted((shared_data / "azure_nfov_walls").glob("[0-9]*.png")):
+        (walls / path.name).symlink_to(path)
+    unit = tmp_path / "unit.npz"
+    assert flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
+    assert "the surface is taken to be flat" in capsys.readouterr().out.splitlines()[0]
+    told = json.loads(unit.with_suffix(".json").read_text())
+    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    assert figures["pattern"] > 2 * figures["noise of the map"]
+    assert figures["change, first and last captures"] < 0.1
+    noise_mm = told["captures"][0]["noise_mm"]
+    expected = figures["pattern"] ** 2 / (figures["pattern"] ** 2 + noise_mm**2)
+    assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
+
+
 # ---- experiments -----------------------------------------------------------------------------------------------------
 
 FLAT = "capture.flat_field={frames: 20, distance_m: 1.0}"

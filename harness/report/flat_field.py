@@ -46,7 +46,11 @@ def save_flat_field_png(path: Path, error_m: np.ndarray, curves: dict[str, Any],
         axes = figure.subplot_mosaic("aab;aac")
         limit = SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
         shown = axes["a"].imshow(error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-        axes["a"].set(xlabel="u, px", ylabel="v, px")
+        rows, columns = np.nonzero(np.isfinite(error_m))
+        axes["a"].set(
+            xlim=(columns.min(), columns.max()), ylim=(rows.max(), rows.min()), xlabel="u, px", ylabel="v, px"
+        )
+        axes["a"].grid(visible=False)
         figure.colorbar(shown, ax=axes["a"], extend="both", shrink=0.8).set_label("error of range, mm")
         figure.suptitle(title, fontsize=10, parse_math=False)
         counts = curves["histogram"]
@@ -54,7 +58,7 @@ def save_flat_field_png(path: Path, error_m: np.ndarray, curves: dict[str, Any],
         axes["b"].set(xlabel="error of range, mm", ylabel="pixels")
         for name, label in (("spectrum", "pattern and noise"), ("noise_spectrum", "noise: first less last captures")):
             if curves[name] is not None:
-                axes["c"].loglog(curves[name]["cycles_per_px"], curves[name]["density_mm2_px2"], label=label)
+                axes["c"].semilogy(curves[name]["cycles_per_px"], curves[name]["density_mm2_px2"], label=label)
         axes["c"].set(xlabel="cycles per pixel", ylabel="density, mm² px²")
         axes["c"].legend(fontsize=7)
 
