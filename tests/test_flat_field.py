@@ -340,7 +340,7 @@ def test_an_experiment_with_a_flat_field_is_repeatable_and_quieter(study_out, tm
     records = {}
     for name, changes in (("first", [FLAT]), ("again", [FLAT]), ("without", [])):
         changes = [*changes, "sweep={}", "capture.frames=20", "threshold={k: 5.0}"]
-        experiment = load_experiment(study_out.parent / "tiny.yaml", [*changes, "study.boards=1"])
+        experiment = load_experiment(study_out.parent / "tiny.yaml", [*changes, "study={boards: 1, hole_free_boards: 1}"])
         plan = plan_of(experiment, study_out / ".cache" / "renders")
         flat_field_of.cache_clear()
         outcome = run_serially(plan, tmp_path / name)
@@ -349,7 +349,7 @@ def test_an_experiment_with_a_flat_field_is_repeatable_and_quieter(study_out, tm
         for row in records[name]:
             del row["seconds_frames"], row["seconds_detect"]
     assert records["first"] == records["again"]
-    quieter = [a["scale_m"] / b["scale_m"] for a, b in zip(records["first"], records["without"], strict=True)]
+    quieter = [a["scale_mm"] / b["scale_mm"] for a, b in zip(records["first"], records["without"], strict=True)]
     # 20 frames of 0.5 mm noise leave 0.12 mm, and the map's own 0.2 mm, of a pattern of 0.55 mm
     assert max(quieter) < 0.6
 
