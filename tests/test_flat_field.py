@@ -340,7 +340,8 @@ def test_an_experiment_with_a_flat_field_is_repeatable_and_quieter(study_out, tm
     records = {}
     for name, changes in (("first", [FLAT]), ("again", [FLAT]), ("without", [])):
         changes = [*changes, "sweep={}", "capture.frames=20", "threshold={k: 5.0}"]
-        experiment = load_experiment(study_out.parent / "tiny.yaml", [*changes, "study={boards: 1, hole_free_boards: 1}"])
+        changes.append("study={boards: 1, hole_free_boards: 1}")
+        experiment = load_experiment(study_out.parent / "tiny.yaml", changes)
         plan = plan_of(experiment, study_out / ".cache" / "renders")
         flat_field_of.cache_clear()
         outcome = run_serially(plan, tmp_path / name)
