@@ -80,7 +80,7 @@ class FlatCapture:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PatternChange:
     """The pattern from one part of the captures beside that from another: correlation over pixels, rms of their
     difference, and the rms that noise alone would make. ``half_m`` (h, w): half of the difference, which is as noisy as
     the whole map."""
@@ -111,8 +111,8 @@ class Separated:
     captures: tuple[FlatCapture, ...]
     surface_m: float
     separated: bool
-    in_time: Agreement | None
-    in_range: Agreement | None
+    in_time: PatternChange | None
+    in_range: PatternChange | None
 
     @property
     def noise_m(self) -> float:
@@ -167,8 +167,8 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     groups = list(_groups(distances))
     firsts = [number for group in groups for number in group[: len(group) // 2]]
     lasts = [number for group in groups if len(group) > 1 for number in group[len(group) // 2 :]]
-    in_time = _agreement(rests, variances, firsts, lasts)
-    in_range = _agreement(rests, variances, groups[0], groups[-1]) if len(groups) > 1 else None
+    in_time = _change(rests, variances, firsts, lasts)
+    in_range = _change(rests, variances, groups[0], groups[-1]) if len(groups) > 1 else None
     found = Separated(
         field, tuple(captures), float(np.sqrt(shape_m2)) if len(captures) > 1 else np.nan, is_solved, in_time, in_range
     )
@@ -257,7 +257,7 @@ def _groups(distances: Sequence[float]) -> Iterator[list[int]]:
         yield sorted(near)
 
 
-def _agreement(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other: Sequence[int]) -> Agreement | None:
+def _change(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other: Sequence[int]) -> PatternChange | None:
     if not one or not other:
         return None
     (a, of_a), (b, of_b) = (_averaged(rests[list(part)], variances[list(part)]) for part in (one, other))
@@ -265,7 +265,7 @@ def _agreement(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], oth
     if both.sum() < 2:
         return None
     correlation = float(np.corrcoef(a[both], b[both])[0, 1])
-    return Agreement(correlation, _rms((a - b)[both]), float(np.sqrt((of_a + of_b)[both].mean())), (a - b) / 2)
+    return PatternChange(correlation, _rms((a - b)[both]), float(np.sqrt((of_a + of_b)[both].mean())), (a - b) / 2)
 
 
 def _with_doubts(found: Separated) -> Separated:
