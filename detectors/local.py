@@ -26,7 +26,7 @@ from detectors.clusters import PLAIN
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, measure_detection
-from detectors.noise import median_of, rounding_variances, sigma_of
+from detectors.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import above, on_grid
 from detectors.smooth_surfaces import raster
 from detectors.surface import SurfaceConfig
@@ -56,8 +56,6 @@ tell nothing new; and fewest finite samples of a local median."""
 SADDLE, PROMINENCE = 0.75, 1.5
 """Two peaks are one finding where the saddle between them is higher than this share of the lower, or fewer units of
 score below it than that."""
-LEAST_FRAMES, SCATTER_PX = 4, 7
-"""Frames from which on their scatter weighs pixels, averaged over a square: known to 12 % from 49 x 3 differences."""
 CORE = 0.5
 """A finding's size is taken of the pixels with this share of its score or more."""
 
@@ -186,16 +184,11 @@ def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndar
     if cloud.mean_variance_m2 is not None:
         variances = cloud.mean_variance_m2[judged]
     else:
-        seen = judged & np.isfinite(cloud.variance_m2)
-        if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * judged.sum():
+        noise_m2 = average_variance_m2(cloud, judged)
+        if noise_m2 is None:
             return np.ones(int(judged.sum()))
-        side = (SCATTER_PX, SCATTER_PX)
-        known = cv2.blur(seen.astype(np.float64), side, borderType=cv2.BORDER_CONSTANT)
-        scatter = cv2.blur(np.where(seen, cloud.variance_m2, 0.0), side, borderType=cv2.BORDER_CONSTANT)
-        random = np.where(known > 0, scatter / np.maximum(known, 1e-9), np.nan)[judged] / cloud.n_frames
-        typical = median_of(random[np.isfinite(random)])
-        variances = np.where(np.isfinite(random), random, typical)
-        variances = variances + max(sigma_of(residual_m[judged]) ** 2 - typical, 0.0)
+        random = noise_m2[judged]
+        variances = random + max(sigma_of(residual_m[judged]) ** 2 - median_of(random), 0.0)
     variances = np.maximum(variances, 1e-18)
     return np.minimum(median_of(variances) / variances, 4.0)
 

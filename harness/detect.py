@@ -66,6 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
+    flat = "take this unit's fixed pattern, as harness.flatfield measured it, off each capture"
+    add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")

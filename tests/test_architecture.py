@@ -40,6 +40,7 @@ PROGRAMS = [
     "sweep",
     "detect",
     "export",
+    "flatfield",
     "target",
     "validate",
     "prepare",

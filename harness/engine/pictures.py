@@ -70,9 +70,9 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
     examples = []
     for point in chosen:
         asked, settings = point.config.capture, point.config.detector
-        name = canonical_json(asked.average.to_data())
+        name = canonical_json([asked.average.to_data(), asked.flat_field and asked.flat_field.to_data()])
         if name not in averages:
-            averages[name] = averages_of(capture, counts, asked.average, exact=asked.exact)
+            averages[name] = averages_of(capture, counts, asked.average, asked.exact, asked.flat_field)
         cloud = averages[name][asked.frames]
         known = known_view(set_up, cloud, hole_free=False)
         named, learned = (settings.name, canonical_json(settings.settings)), group.learned.get(point.digest)
@@ -125,7 +125,7 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
     _, task = next(group.trials(batch, thresholds))
     asked = next(iter(last.values())).config.capture
     captures = [capture_of(set_up, number, task, most) for number, set_up in enumerate(set_ups)]
-    clouds = [averages_of(capture, [most], asked.average, exact=asked.exact) for capture in captures]
+    clouds = [averages_of(capture, [most], asked.average, asked.exact, asked.flat_field) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0))
     chosen = [point for (count, _), point in last.items() if count in ends]
     return [_map_example(maps, point, thresholds[point.digest], group.learned.get(point.digest)) for point in chosen]
@@ -227,7 +227,7 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     asked = next(found for found in task.points if found.digest == point.digest)
     set_up = load_set_up(task.set_ups[0])
     capture = capture_of(set_up, 0, task, asked.frames)
-    cloud = averages_of(capture, [asked.frames], asked.average, exact=asked.exact)[asked.frames]
+    cloud = averages_of(capture, [asked.frames], asked.average, asked.exact, asked.flat_field)[asked.frames]
     known = known_view(set_up, cloud, hole_free=False)
     given = (asked.detector, asked.settings_json, asked.threshold, asked.radius_m)
     judged = judge(known, *given, hole_free=False, learned=asked.learned)

@@ -193,7 +193,7 @@ def _name(path: str | None) -> str | None:
 def _point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
     asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
-    further = (point.config.mapping, capture.exact, learned)
+    further = (point.config.mapping, capture.exact, learned, capture.flat_field)
     return PointTask(point.digest, point.variant, capture.frames, *asked, *further)
 
 

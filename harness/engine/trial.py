@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import islice
 from operator import add
 from typing import Any, Literal, TypeVar, cast
@@ -21,6 +21,8 @@ import numpy as np
 from scipy import special
 
 from detectors.average import CORRELATED_PIXELS, REFERENCE_FRAMES, SAMPLED_PIXELS, AverageConfig, prefix_averages
+from detectors.flat_captures import flattened, separated
+from detectors.flat_field import FlatField, FlatFieldConfig, corrected
 from detectors.mapping.merge import Merged, merge, prepare
 from detectors.mapping.settings import MappingConfig
 from detectors.registration.register import register
@@ -31,9 +33,11 @@ from harness.engine.judge import STUDY_TABLES, Rows, judge, study_rows
 from harness.engine.setup import KnownCloud, SetUp, SetUpRef, face_errors_m, known_map, known_view, load_set_up
 from harness.vocabulary.geometry import MM, Cloud, LeftOut, invert, transform_points
 from harness.vocabulary.seeds import canonical_json
+from scenes.closed_form import plane_view
 from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
 from scenes.sensor.amcw.at_once import AtOnce
-from scenes.sensor.source import SimulatedCapture
+from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 20
@@ -42,21 +46,43 @@ and 25 of one with holes before a far wall. By number only, so that no result ha
 SURE = 5.0
 """Standard errors by which a frame's displacement keeps from a limit of the judge, so that noise cannot decide; fewer
 than `AverageConfig.jump_sigmas`, or no frame of a noisy camera would."""
+FLAT_ALBEDO = 0.6  # of a flat field's plane: painted wood or paper, as the boards of the experiments
 MOST_DISTURBED = 0.5
 """Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb. A frame's own share scatters about
 the mean by a thousandth, and the judge allows 1.5 times what it finds usual on top."""
 
 
 def averages_of(
-    capture: SimulatedCapture, counts: Sequence[int], config: AverageConfig, exact: bool
+    capture: SimulatedCapture,
+    counts: Sequence[int],
+    config: AverageConfig,
+    exact: bool,
+    flat_field: FlatFieldConfig | None = None,
 ) -> dict[int, Cloud]:
     """Return averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
     `detectors.average.prefix_averages`, which is used (and raises) where ``exact`` or nothing else will do. Averages
-    drawn at once nest, and so do those drawn frame by frame; the two kinds have noise of their own."""
+    drawn at once nest, and so do those drawn frame by frame; the two kinds have noise of their own. With a
+    ``flat_field`` they are corrected by it."""
     many = sorted({n for n in counts if n >= FEWEST_FRAMES})
     clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
     rest = [n for n in counts if n not in clouds]
-    return clouds | (prefix_averages(capture, rest, config) if rest or not counts else {})
+    clouds |= prefix_averages(capture, rest, config) if rest or not counts else {}
+    if flat_field is not None:
+        field = flat_field_of(capture.unit.config, flat_field, capture.seed)
+        clouds = {n: corrected(cloud, field) for n, cloud in clouds.items()}
+    return clouds
+
+
+@lru_cache(maxsize=4)
+def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
+    """Return what a unit's whole sensor makes of a plane across its axis, with noise of its own, kept for the worker's
+    next trials. The plane is known to be flat, so one capture is enough. Raises UserError where no pixel has a
+    range."""
+    facts = camera_of(camera)
+    view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
+    capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
+    cloud = averages_of(capture, [config.frames], AverageConfig(), exact=False)[config.frames]
+    return separated([flattened(cloud, cloud.valid, "flat field")], facts.nominal_lens).field
 
 
 def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
@@ -327,6 +353,7 @@ class PointTask:
     mapping: MappingConfig | None = None
     exact: bool = False
     learned: str | None = None
+    flat_field: FlatFieldConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -359,7 +386,8 @@ def run_trial(task: TrialTask) -> Rows:
     record: Rows = {name: [] for name in TABLES}
     by_average: dict[str, list[PointTask]] = {}
     for point in task.points:
-        by_average.setdefault(canonical_json([point.average.to_data(), point.exact]), []).append(point)
+        asked = [point.average.to_data(), point.exact, point.flat_field and point.flat_field.to_data()]
+        by_average.setdefault(canonical_json(asked), []).append(point)
     for points in by_average.values():
         began = time.perf_counter()
         clouds = [_clouds(set_up, number, task, points) for number, set_up in enumerate(set_ups)]
@@ -390,7 +418,8 @@ def _clouds(set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointT
     counts = sorted({point.frames for point, n in zip(points, views, strict=True) if n is None or number < n})
     if not counts:
         return {}
-    return averages_of(capture_of(set_up, number, task, counts[-1]), counts, points[0].average, exact=points[0].exact)
+    first, capture = points[0], capture_of(set_up, number, task, counts[-1])
+    return averages_of(capture, counts, first.average, first.exact, first.flat_field)
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:

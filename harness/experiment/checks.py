@@ -56,6 +56,7 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
         if isinstance(config.source, SimulatedSource):
             problems += [*_target_problems(config, config.source, source)]
             problems += [*_mapping_problems(config, config.source, source)]
+            problems += [*_flat_field_problems(config, config.source, source)]
         else:
             problems += _capture_problems(config, config.source, source)
         problems += _study_problems(config, source)
@@ -176,6 +177,18 @@ def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, sour
             yield Problem(f"{config.mapping.views} views, but source.views has {there}", place, legal=f"1 to {there}")
 
 
+def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+    """Find a flat field's plane that lies outside of the camera's range."""
+    try:
+        flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
+    except UserError:
+        return  # told with the target's pose
+    if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
+        place = source.place_of(("capture", "flat_field"))
+        legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
+        yield Problem(f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal)
+
+
 @lru_cache(maxsize=10_000)
 def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
     path: KeyPath = CAMERA_NUMBERS if config.numbers else CAMERA_NAME
@@ -209,6 +222,9 @@ def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: 
         except UserError as error:
             place = source.place_of(("source", "paths"))
             problems.append(Problem(error.message, place, legal=error.legal, fix=error.fix))
+    if config.capture.flat_field is not None:
+        place, fix = source.place_of(("capture", "flat_field")), "use harness.flatfield and harness.detect --flat-field"
+        problems.append(Problem("a flat field needs a simulated unit", place, fix=fix))
     if config.mapping is not None:
         place, fix = source.place_of(("mapping",)), "use harness.detect --register"
         problems.append(Problem("a mapping needs the views of a simulated source", place, fix=fix))

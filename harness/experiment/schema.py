@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from detectors import DETECTORS, detector_names, detector_type
 from detectors.average import AverageConfig
+from detectors.flat_field import FlatFieldConfig
 from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
@@ -77,6 +78,10 @@ class CaptureConfig(Config):
 
     frames: Frames
     average: AverageConfig = AverageConfig()
+    flat_field: FlatFieldConfig | None = Field(
+        None,
+        description="a plane that the unit is shown first: the pattern found there is taken off",
+    )
     exact: bool = Field(
         False,
         description="draw each simulated frame; false: a mean is drawn at once where that is equal in distribution",

@@ -32,6 +32,7 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 
 if TYPE_CHECKING:
     from detectors.crop import Choice
+    from detectors.flat_field import FlatField
     from detectors.interface import Detection, Detector, Evidence, Measurement
     from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
@@ -194,6 +195,7 @@ def inspect(arguments: argparse.Namespace) -> int:
 
     Raises UserError for faults of the files, where a view cannot be registered, and where nothing can be judged.
     """
+    from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
 
     config = mapping_of(arguments) if arguments.register is not None else None
@@ -202,6 +204,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     refuse_thresholds(arguments)
     own_settings = [each for each in arguments.set if config is None or not each.startswith(PREFIX)]
     detector, settings = detector_of(arguments, "none" if config else arguments.crop, own_settings)
+    field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
     guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
@@ -214,7 +217,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     for name, recording, guess in zip(names, recordings, guesses, strict=False):
         if arguments.frames_report:
             told.print_frames(recording)
-        views.append(View(name, _averaged(arguments, recording), guess))
+        views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):
             choices.append(told.choice_by(config or getattr(detector, "settings", None), view.cloud))
@@ -224,12 +227,18 @@ def inspect(arguments: argparse.Namespace) -> int:
     cloud = mapped.merged.cloud if mapped else views[0].cloud
 
     def silent_threshold() -> tuple[float, str]:
-        undamaged = _averaged(arguments, quiet[0])
+        undamaged = _averaged(arguments, quiet[0], field)
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
         return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
 
-    threshold, origin, evidence = threshold_of(arguments, detector, cloud, analysed(detector, cloud), silent_threshold)
+    evidence = analysed(detector, cloud)
+    if field is not None:
+        told_of_field = dict.fromkeys(
+            each for view in views for each in doubts(view.cloud, field, arguments.flat_field)
+        )
+        evidence = replace(evidence, warnings=(*told_of_field, *evidence.warnings))
+    threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = result if mapped else with_faint_told(result, threshold)
     run = Inspection(
@@ -247,13 +256,15 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
     return opened(paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names})
 
 
-def _averaged(arguments: argparse.Namespace, recording: Recording) -> Cloud:
+def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
     from detectors.average import AverageConfig, average
+    from detectors.flat_field import corrected
     from detectors.noise import REACH_FRAMES, noise_reach_px
 
     cloud = average(recording, AverageConfig(method=arguments.average))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
-    return replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
+    cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
+    return cloud if field is None else corrected(cloud, field)
 
 
 @contextmanager
@@ -433,7 +444,7 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     settings["detector"] = {"name": run.detector.name, "version": run.detector.version, "settings": run.settings}
     paths = [path for recording in recordings for path in recording.files]
     files = []
-    for path in (*paths, *filter(None, [arguments.poses])):
+    for path in (*paths, *filter(None, [arguments.poses, arguments.flat_field])):
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
     scale_mm = evidence.scale_m / MM

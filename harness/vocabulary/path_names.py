@@ -28,7 +28,10 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number; of a camera's file, its name."""
+    """A value on one line, short, with its unit where it is a number; of a mapping each key and value; of a camera's
+    file, its name."""
+    if isinstance(value, dict) and value:
+        return on_one_line(", ".join(f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items()))
     text = on_one_line(Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return f"{value:g} {unit_of(path)}" if number and unit_of(path) else text

@@ -1,0 +1,307 @@
+"""A unit's fixed pattern from captures of a flat surface: what moves with the pixels, what moves with the surface.
+
+Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise:
+
+    range - fit = P(pixel) + S(place on the surface) + noise
+
+Where the captures' poses are known, P and S are solved for together by least squares, with the noise's variances and
+the variance of S, which the captures' disagreement tells. Without poses each capture sees an S of its own, which counts
+as noise and averages out; a camera that did not move sees the same S each time, and nothing can part it from P.
+
+The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it takes up what of P, of S and
+of the lens' and the modulation's errors is wider than some sixth of the image. Not modelled: errors of the stated
+poses, and noise that neighbouring pixels share (its variance counts, its correlation does not).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from detectors.flat_field import NEAR_ENOUGH, FlatField
+from detectors.noise import LEAST_FRAMES, average_variance_m2, sigma_of
+from detectors.surface import SurfaceConfig, fit_surface
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud, Lens, transform_points
+
+SMOOTH = SurfaceConfig(degree=5, method="bisquare")
+OUTLIER_SIGMAS = 6.0
+"""Residuals beyond it are no flat surface's: marks, dirt, flying pixels."""
+STABLE_SHARE = 0.2
+"""Part of the pattern's rms by which two parts of the captures may differ beyond their noise: 4 % of its variance are
+then left. Where the surface's shape is solved for, it takes up to half of such a change."""
+SURE = 1.1
+"""Ratio of a difference to its noise from which on it is one: noise that 25 pixels share, over 30,000 pixels, makes 3 %
+of it."""
+SAME_PLACE_M, SAME_TURN = 2 * MM, 0.003
+"""Change of distance and of the plane's normal (rad) below which nothing shows that a camera was moved by hand: ten
+times the wander of a static Azure Kinect, and what that wander makes over an image."""
+LEAST_SHIFT_M = 30 * MM
+MOST_STEPS, SOLVED = 200, 1e-5  # of the least squares
+BELIEF_STEPS = 5
+
+
+@dataclass(frozen=True)
+class FlatCapture:
+    """One capture of a flat surface. ``residual_m`` (h, w): range along the ray less the smooth fit, NaN where it does
+    not count; ``variance_m2`` (h, w): of it, by the frames' noise. ``normal`` (3,): of the plane through it, towards
+    the camera. ``places_m`` (h, w, 2): where each pixel sees the surface, in co-ordinates of the surface that all
+    captures share; None where poses are unknown."""
+
+    name: str
+    frames: int
+    distance_m: float
+    normal: np.ndarray
+    residual_m: np.ndarray
+    variance_m2: np.ndarray
+    places_m: np.ndarray | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that count."""
+        return int(np.isfinite(self.residual_m).sum())
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the optical axis and the plane's normal."""
+        return float(np.degrees(np.arccos(min(-self.normal[2], 1.0))))
+
+    @property
+    def noise_m(self) -> float:
+        """Root mean square of the frames' noise in the average."""
+        return _rms(np.sqrt(self.variance_m2[np.isfinite(self.residual_m)]))
+
+    @property
+    def residual_rms_m(self) -> float:
+        """Root mean square of pattern, shape and noise."""
+        return _rms(self.residual_m[np.isfinite(self.residual_m)])
+
+
+@dataclass(frozen=True)
+class PatternChange:
+    """The pattern from one part of the captures beside that from another: correlation over pixels, rms of their
+    difference, and the rms that noise alone would make. ``half_m`` (h, w): half of the difference, which is as noisy as
+    the whole map."""
+
+    correlation: float
+    difference_m: float
+    noise_m: float
+    half_m: np.ndarray
+
+    @property
+    def excess_m(self) -> float:
+        """The rms by which they differ beyond their noise."""
+        return float(np.sqrt(max(self.difference_m**2 - self.noise_m**2, 0.0)))
+
+    def is_change_of(self, rms_m: float) -> bool:
+        """Return whether a pattern of this rms changed from one part to the other."""
+        return self.difference_m > SURE * self.noise_m and self.excess_m > STABLE_SHARE * rms_m
+
+
+@dataclass(frozen=True)
+class Separated:
+    """A flat field and what was found on the way. ``surface_m``: standard deviation of what captures do not share
+    beyond their noise (the surface's shape, and what of the pattern is not stable), NaN for one capture; ``separated``:
+    whether it was solved for. ``in_time``: first captures beside last ones, at equal distances; ``in_range``: near
+    beside far ones; None where there are not enough."""
+
+    field: FlatField
+    captures: tuple[FlatCapture, ...]
+    surface_m: float
+    separated: bool
+    in_time: PatternChange | None
+    in_range: PatternChange | None
+
+    @property
+    def noise_m(self) -> float:
+        """Root mean square of the map's standard deviation."""
+        return float(np.sqrt(np.nanmean(self.field.variance_m2)))
+
+
+def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndarray | None = None) -> FlatCapture:
+    """Return an averaged cloud of a flat surface, of the pixels in ``mask`` (h, w), less its smooth fit. With a pose
+    the places are x and y in the first capture's camera frame, until `on_surface` turns them. Raises UserError without
+    a pixel grid, and where the frames are too few to tell their noise or the pixels to fit a surface."""
+    noise_m2 = average_variance_m2(cloud, mask)
+    if not cloud.organised or noise_m2 is None:
+        what = f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)}, whose noise cannot be told"
+        raise UserError(what, legal=f"depth images, {LEAST_FRAMES} frames or more", fix="record 50 frames or more")
+    points = cloud.points_m[mask]
+    slopes = points[:, :2] / points[:, 2:]
+    length = np.sqrt(1 + (slopes**2).sum(axis=1))
+    fit = fit_surface(slopes[:, 0], slopes[:, 1], 1 / points[:, 2], SMOOTH)
+    off_m = (points[:, 2] - 1 / fit.evaluate(slopes[:, 0], slopes[:, 1])) * length
+    off_m = np.where(np.abs(off_m) < OUTLIER_SIGMAS * sigma_of(off_m), off_m, np.nan)
+    off_m -= np.nanmean(off_m)
+    residual_m, variance_m2 = np.full((2, *mask.shape), np.nan)
+    residual_m[mask], variance_m2[mask] = off_m, noise_m2[mask] * length**2
+    plane = np.linalg.lstsq(np.column_stack([slopes, np.ones(len(slopes))]), 1 / points[:, 2], rcond=None)[0]
+    distance_m, places_m = float(np.median(points[:, 2])), None
+    if T_first_camera is not None:
+        places_m = transform_points(T_first_camera, cloud.points_m)
+    return FlatCapture(
+        name, cloud.n_frames, distance_m, -plane / np.linalg.norm(plane), residual_m, variance_m2, places_m
+    )
+
+
+def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
+    """Return the pattern of one unit from captures with one lens, in the order in which they were taken; with the
+    surface's shape solved for where all captures have places on it. Raises UserError where no pixel counts in any."""
+    captures = _on_one_plane(captures)
+    residuals, variances = (np.stack([getattr(c, name) for c in captures]) for name in ("residual_m", "variance_m2"))
+    counts = np.isfinite(residuals).sum(axis=0)
+    if not counts.any():
+        raise UserError("no pixel of any capture shows the flat surface", fix="check --crop")
+    shape_m2 = _disagreement_m2(residuals, variances, counts)
+    is_solved = captures[0].places_m is not None and len(captures) > 1 and shape_m2 > 0
+    if is_solved:
+        error_m, variance_m2, shapes_m = _solved(captures, residuals, variances, shape_m2)
+        rests = residuals - shapes_m
+    else:
+        error_m, variance_m2 = _averaged(residuals, variances + shape_m2)
+        rests = residuals
+    distances = [capture.distance_m for capture in captures]
+    field = FlatField(error_m, variance_m2, lens, (min(distances), max(distances)))
+    groups = list(_groups(distances))
+    firsts = [number for group in groups for number in group[: len(group) // 2]]
+    lasts = [number for group in groups if len(group) > 1 for number in group[len(group) // 2 :]]
+    in_time = _change(rests, variances, firsts, lasts)
+    in_range = _change(rests, variances, groups[0], groups[-1]) if len(groups) > 1 else None
+    found = Separated(
+        field, tuple(captures), float(np.sqrt(shape_m2)) if len(captures) > 1 else np.nan, is_solved, in_time, in_range
+    )
+    return _with_doubts(found)
+
+
+# ---------------------------------------------------------------- the sum of pattern and shape
+
+
+def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted mean (h, w) over captures and its variance; NaN where no capture counts."""
+    weights = np.where(np.isfinite(residuals), 1 / variances, 0.0)
+    total = weights.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nansum(weights * residuals, axis=0) / total, np.where(total > 0, 1 / total, np.nan)
+
+
+def _disagreement_m2(residuals: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> float:
+    """Return the variance between captures at a pixel beyond their noise, by the moments of a random effect."""
+    several = counts > 1
+    if not several.any():
+        return 0.0
+    held, noise = residuals[:, several], np.where(np.isfinite(residuals), variances, np.nan)[:, several]
+    return max(float((np.nanvar(held, axis=0, ddof=1) - np.nanmean(noise, axis=0)).mean()), 0.0)
+
+
+def _solved(
+    captures: Sequence[FlatCapture], residuals: np.ndarray, variances: np.ndarray, shape_m2: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pattern (h, w), its variance, and the surface's shape as each capture sees it (c, h, w), by the least sum
+    of squares of noise, pattern and shape, each over its own variance. The variance follows from beliefs passed between
+    pixels and cells, which is exact but for loops and for what each capture's smooth fit takes of the shape. For an
+    Azure Kinect before a wall rough by a fifth of the pattern the true deviation is the one that follows, before one
+    rough by half of it 1.3 times that."""
+    from scipy import sparse
+    from scipy.sparse.linalg import lsqr
+
+    there = np.isfinite(residuals)
+    pixel = np.flatnonzero(there) % there[0].size
+    value, noise_m2 = residuals[there], variances[there]
+    # cells as wide as the pixels of the nearest capture
+    side = min(float(np.nanmedian(np.abs(np.diff(c.places_m[..., 0], axis=1)))) for c in captures)  # type: ignore[index]
+    place = np.concatenate([capture.places_m[there[n]] for n, capture in enumerate(captures)])  # type: ignore[index]
+    at = np.floor((place - place.min(axis=0)) / side).astype(np.int64)
+    _, cell = np.unique(at[:, 0] * (at[:, 1].max() + 1) + at[:, 1], return_inverse=True)
+    pixels, cells = there[0].size, int(cell.max()) + 1
+    pattern_m2 = max(float((value**2).mean() - noise_m2.mean() - shape_m2), float(noise_m2.mean()))
+    rows, loud = np.arange(len(value)), 1 / np.sqrt(noise_m2)
+    places = (np.tile(rows, 2), np.concatenate([pixel, pixels + cell]))
+    parts = np.concatenate([loud * np.sqrt(pattern_m2), loud * np.sqrt(shape_m2)])
+    system = sparse.csr_array((parts, places), shape=(len(value), pixels + cells))
+    found = lsqr(system, loud * value, damp=1.0, atol=SOLVED, btol=SOLVED, iter_lim=MOST_STEPS)[0]
+    error_m = found[:pixels] * np.sqrt(pattern_m2)
+    shapes_m = np.full(there.shape, np.nan)
+    shapes_m[there] = (found[pixels:] * np.sqrt(shape_m2))[cell]
+    variance_m2 = np.full(pixels, pattern_m2)
+    for _ in range(BELIEF_STEPS):
+        told = 1 / (noise_m2 + variance_m2[pixel])
+        left_m2 = 1 / (1 / shape_m2 + np.bincount(cell, told, cells)[cell] - told)
+        variance_m2 = 1 / (1 / pattern_m2 + np.bincount(pixel, 1 / (noise_m2 + left_m2), pixels))
+    unseen = ~there.any(axis=0)
+    error_m, variance_m2 = (np.where(unseen, np.nan, each.reshape(unseen.shape)) for each in (error_m, variance_m2))
+    return error_m, variance_m2, shapes_m
+
+
+def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
+    """Return the captures with places (h, w, 2) along the first one's plane, where all have a pose; without, else."""
+    if any(capture.places_m is None for capture in captures):
+        return tuple(replace(capture, places_m=None) for capture in captures)
+    normal = captures[0].normal
+    across = np.cross([0.0, 1.0, 0.0], normal)
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(normal, across)], axis=-1)
+    return tuple(replace(capture, places_m=capture.places_m @ axes) for capture in captures)
+
+
+# ---------------------------------------------------------------- whether it can be trusted
+
+
+def _groups(distances: Sequence[float]) -> Iterator[list[int]]:
+    """Yield the numbers of captures at like distances, nearest first, each in their own order."""
+    waiting = sorted(range(len(distances)), key=lambda number: distances[number])
+    while waiting:
+        near = [number for number in waiting if distances[number] <= NEAR_ENOUGH * distances[waiting[0]]]
+        waiting = [number for number in waiting if number not in near]
+        yield sorted(near)
+
+
+def _change(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other: Sequence[int]) -> PatternChange | None:
+    if not one or not other:
+        return None
+    (a, of_a), (b, of_b) = (_averaged(rests[list(part)], variances[list(part)]) for part in (one, other))
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < 2:
+        return None
+    correlation = float(np.corrcoef(a[both], b[both])[0, 1])
+    return PatternChange(correlation, _rms((a - b)[both]), float(np.sqrt((of_a + of_b)[both].mean())), (a - b) / 2)
+
+
+def _with_doubts(found: Separated) -> Separated:
+    """Return the same with warnings, and a variance that holds for a pattern that is not stable."""
+    said, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
+    if len(captures) == 1 or not _moved(captures):
+        told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
+        said.append(
+            f"{told}: the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
+            f" (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more, and state --poses where only along the surface)"
+        )
+    parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
+    changes = [(part, apart) for part, apart in parts if part is not None and part.is_change_of(rms_m)]
+    # of two parts that scatter by t each, the mean is off a third one by 3/2 t^2, and their difference is 2 t^2
+    variance_m2 = field.variance_m2 + 0.75 * max((part.excess_m for part, _ in changes), default=0.0) ** 2
+    if changes:
+        told = " and ".join(f"{apart} by {part.excess_m / MM:.2g} mm" for part, apart in changes)
+        also = "" if found.separated else ", or the surface is not flat (state --poses to part the two)"
+        said.append(f"the pattern, {rms_m / MM:.2g} mm, is not stable: it changes {told} beyond its noise{also}")
+    return replace(found, field=replace(field, variance_m2=variance_m2, warnings=tuple(said)))
+
+
+def _moved(captures: Sequence[FlatCapture]) -> bool:
+    """Return whether any capture was taken from another place than the first: by its pose, or by its plane."""
+    first = captures[0]
+    for other in captures[1:]:
+        if first.places_m is not None and other.places_m is not None:
+            shift_m = np.nanmedian(other.places_m - first.places_m, axis=(0, 1))
+            if float(np.hypot(*shift_m)) >= LEAST_SHIFT_M:
+                return True
+            continue
+        apart_m, turn = abs(other.distance_m - first.distance_m), float(np.linalg.norm(other.normal - first.normal))
+        if apart_m > SAME_PLACE_M or turn > SAME_TURN:
+            return True
+    return False
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean())) if values.size else float("nan")

@@ -1,0 +1,156 @@
+"""A unit's fixed pattern as a map over its sensor: its file, and the correction of a cloud by it.
+
+The pattern is taken for an error of range along each pixel's ray that is the same at every distance and in every
+capture. Not modelled: a pattern that changes with distance, temperature or brightness; `detectors.flat_captures` tests
+the first two between captures. What a depth engine's filter mixes at the edge of a hole differs from what it mixes on a
+flat surface, so the correction is less exact there.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from detectors.noise import LEAST_FRAMES, average_variance_m2
+from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import atomic_path, refuse_pixels
+from harness.vocabulary.geometry import Cloud, Lens
+from harness.vocabulary.provenance import check_version
+
+FLAT_FIELD_VERSION = 1
+SAME_LENS = 0.02
+"""Relative difference of focal lengths, and of centres to the width, up to which two lenses may belong to one camera
+and mode: calibrations of one unit differ by less, modes of one camera by more."""
+WELL_COVERED = 0.9
+NEAR_ENOUGH = 1.2
+"""Ratio of distances up to which a pattern counts as measured there."""
+AGAIN = "run python -m harness.flatfield on captures of this camera in this mode"
+
+
+class FlatFieldConfig(Config):
+    """A flat field to take: ``frames`` of a plane across the axis, ``distance_m`` away."""
+
+    frames: int = Field(ge=LEAST_FRAMES, le=10_000)
+    distance_m: float = Field(gt=0, le=100)
+
+
+@dataclass(frozen=True)
+class FlatField:
+    """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the whole sensor sees a
+    surface, NaN where unknown; smooth parts, which a fitted surface takes up, are not in it. ``variance_m2`` (h, w) of
+    that error. ``distances_m``: the nearest and the farthest at which it was measured. ``warnings``: full sentences on
+    what makes it doubtful."""
+
+    error_m: np.ndarray
+    variance_m2: np.ndarray
+    lens: Lens
+    distances_m: tuple[float, float]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the pattern, the map's own noise taken off."""
+        return float(np.sqrt(max(np.nanmean(self.error_m.astype(float) ** 2 - self.variance_m2), 0.0)))
+
+
+def corrected(cloud: Cloud, field: FlatField) -> Cloud:
+    """Return the cloud with its points moved along their rays to where they would be without the pattern; where the
+    pattern is unknown they stay. ``mean_variance_m2`` is then the frames' noise (of a single frame unknown, and it
+    stays None) and the map's variance, of pixels that stay the pattern's mean square. Raises UserError where the cloud
+    has no pixel grid or is of another camera, size or lens."""
+    _refuse_other(cloud, field)
+    at = cloud.region.within(field.lens.whole)
+    error_m, variance_m2 = field.error_m[at].astype(float), field.variance_m2[at].astype(float)
+    known = np.isfinite(error_m)
+    range_m = np.linalg.norm(cloud.points_m, axis=-1)
+    moved = cloud.points_m * (1 - np.where(known, error_m, 0.0) / range_m)[..., None]
+    noise_m2 = average_variance_m2(cloud, cloud.valid)
+    if noise_m2 is not None:
+        axial = (cloud.points_m[..., 2] / range_m) ** 2
+        noise_m2 = noise_m2 + axial * np.where(known, variance_m2, field.rms_m**2)
+    return replace(cloud, points_m=moved, mean_variance_m2=noise_m2)
+
+
+def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
+    """Return full sentences on what makes the correction of a cloud doubtful; ``name``: the flat field's."""
+    said = [f"the flat field {name}: {warning}" for warning in field.warnings]
+    known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
+    share = float(known[cloud.valid].mean()) if cloud.valid.any() else 1.0
+    if share < WELL_COVERED:
+        said.append(f"the flat field {name} knows {100 * share:.0f} % of the valid pixels; the others stay as they are")
+    distance_m = float(np.median(cloud.points_m[cloud.valid][:, 2])) if cloud.valid.any() else np.nan
+    near, far = field.distances_m
+    if distance_m * NEAR_ENOUGH < near or distance_m > far * NEAR_ENOUGH:
+        measured = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
+        said.append(f"the flat field {name} was measured at {measured}, this capture is at {distance_m:.2f} m")
+    return tuple(said)
+
+
+def _refuse_other(cloud: Cloud, field: FlatField) -> None:
+    """Raise UserError where the cloud cannot be of the camera and mode of the flat field."""
+    if not cloud.organised or cloud.projection != "central":
+        what = "a flat field corrects a camera's own pixels, and this cloud has no grid of them"
+        raise UserError(what, fix="leave out the flat field, or name the capture's depth images")
+    lens, (height, width) = field.lens, cloud.valid.shape
+    own = (width, height) if cloud.lens is None else (cloud.lens.width, cloud.lens.height)
+    if own != (lens.width, lens.height):
+        what = f"the flat field is of {lens.width} x {lens.height} pixels, the capture of {own[0]} x {own[1]}"
+        raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
+    if cloud.lens is not None:
+        pairs = [(getattr(cloud.lens, name), getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")]
+        if any(abs(one - other) > SAME_LENS * max(lens.fx, lens.width) for one, other in pairs):
+            ours, theirs = (f"fx {a.fx:.1f}, fy {a.fy:.1f}, centre {a.cx:.1f}, {a.cy:.1f}" for a in (cloud.lens, lens))
+            what = f"the capture's lens ({ours}) is not that of the flat field ({theirs})"
+            raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
+
+
+# ---------------------------------------------------------------- the file
+
+
+def save_flat_field(path: Path, field: FlatField) -> None:
+    """Write the file, whole or not at all. Raises UserError where it cannot be written."""
+    lens = field.lens
+    numbers = [lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            version=np.array(FLAT_FIELD_VERSION),
+            error_m=field.error_m.astype(np.float32),
+            variance_m2=field.variance_m2.astype(np.float32),
+            lens=np.array(numbers, float),
+            distances_m=np.array(field.distances_m),
+            warnings=np.array(json.dumps(field.warnings)),
+        )
+
+
+def load_flat_field(path: Path) -> FlatField:
+    """Read a file of `save_flat_field`. Raises UserError where it is none, is broken, too large or of a newer
+    version."""
+    from detectors.recordings.arrays import load_npz
+
+    held = load_npz(path)
+    version = held.get("version")
+    check_version(version.item() if version is not None and version.shape == () else None, 1, path, "a flat field")
+    try:
+        width, height, fx, fy, cx, cy, *rest = held["lens"].astype(float).tolist()
+        lens = Lens(int(width), int(height), fx, fy, cx, cy, tuple(rest))
+        refuse_pixels(str(path), lens.width, lens.height)
+        maps: list[Any] = [held[name].astype(np.float32) for name in ("error_m", "variance_m2")]
+        near, far = held["distances_m"].astype(float).tolist()
+        told = json.loads(str(held["warnings"]))
+        error_m, variance_m2 = maps
+        known = np.isfinite(error_m)
+        sound = error_m.shape == variance_m2.shape == (lens.height, lens.width) and len(lens.distortion) == 8
+        sound = sound and known.any() and bool((variance_m2[known] >= 0).all()) and 0 < near <= far < np.inf
+        if not (sound and all(isinstance(each, str) for each in told)):
+            raise ValueError("its arrays do not belong together")
+    except (KeyError, ValueError, TypeError) as error:
+        why = f"it has no {error}" if isinstance(error, KeyError) else str(error)[:200]
+        raise UserError(f"{path}: is no flat field ({why})", legal="a file of harness.flatfield", fix=AGAIN) from error
+    return FlatField(error_m, variance_m2, lens, (near, far), tuple(told))

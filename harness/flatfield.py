@@ -1,0 +1,131 @@
+"""``python -m harness.flatfield``: a unit's fixed pattern from captures of a flat surface."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from detectors.flat_captures import FlatCapture, Separated
+    from detectors.recordings import Recording
+    from harness.vocabulary.geometry import Lens
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.flatfield " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.flatfield",
+        description="Measure the fixed pattern of one unit of a camera: what its range is off at each pixel, in every "
+        "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
+        "camera, moved by 30 mm or more between captures, at two distances, some captures at each. The captures' "
+        "order is that of time.",
+        epilog="example: python -m harness.flatfield near1 near2 far1 far2 --out unit.npz, then "
+        "python -m harness.detect captures/board --flat-field unit.npz",
+    )
+    add = parser.add_argument
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
+    written = "the flat field; a .json and a .csv of its figures and a .png of the map are written beside it"
+    add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as harness.detect has it")
+    poses = (
+        "where the camera stood (as harness.detect has it): the surface's own shape is then parted from the pattern"
+        " by least squares; without, it counts as noise"
+    )
+    add("--poses", type=Path, metavar="FILE", help=poses)
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from detectors.flat_captures import separated
+    from detectors.flat_field import save_flat_field
+    from harness.inspection.told import print_warnings
+    from harness.report.findings import plain_json
+    from harness.report.flat_field import histogram, save_flat_field_png, spectrum
+    from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+
+    if options.out.suffix.lower() != ".npz":
+        raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
+    lens, captures = _captures(options)
+    found = separated(captures, lens)
+    figures = list(figures_of(found))
+    noise = None if found.in_time is None else spectrum(found.in_time.half_m)
+    error_m = found.field.error_m
+    curves = {"histogram": histogram(error_m), "spectrum": spectrum(error_m), "noise_spectrum": noise}
+    print_warnings(found.field.warnings)
+    print(_answer(found))
+    show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
+    data, table, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".csv", ".png"))
+    save_flat_field(options.out, found.field)
+    told = {"results_version": RESULTS_VERSION, "answer": _answer(found), "warnings": found.field.warnings}
+    told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures), **curves}
+    write_text(data, plain_json({**told, "provenance": record(command)}))
+    write_text(table, FLAT_FIGURES.frame(figures).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    save_flat_field_png(picture, error_m, curves, _answer(found))
+    print(f"wrote {options.out}, {data.name}, {table.name}, {picture.name}")
+    return 0
+
+
+def _answer(found: Separated) -> str:
+    from harness.inspection.told import mm
+
+    near, far = found.field.distances_m
+    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
+    return f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
+
+
+def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
+    """Return the lens and the captures, less their smooth fits; a lone capture as its two halves, which show whether
+    the pattern is stable. Raises UserError for faults of the files, and for captures of different cameras."""
+    from detectors.average import AverageConfig, average
+    from detectors.crop import crop
+    from detectors.flat_captures import flattened
+    from detectors.local import LocalConfig
+    from harness.inspection.arguments import crop_from_text, opened, read_poses
+    from harness.vocabulary.declaration.diagnose import settings_of
+
+    config = settings_of(LocalConfig, {"crop": crop_from_text(options.crop)}, f"--crop {options.crop}").crop
+    poses = read_poses(options.poses, len(options.paths)) if options.poses else (None,) * len(options.paths)
+    recordings = [opened([path], options.intrinsics, unit=options.unit) for path in options.paths]
+    first = recordings[0]
+    for path, recording in zip(options.paths, recordings, strict=True):
+        if recording.lens is None:
+            raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
+        if recording.lens != first.lens:
+            raise UserError(
+                f"{path}: is of another lens than {options.paths[0]}", legal="captures of one unit and mode"
+            )
+    found = []
+    for recording, pose in zip(recordings, poses, strict=True):
+        for part in _halves(recording) if len(recordings) == 1 else (recording,):
+            cloud = average(part, AverageConfig())
+            found.append(flattened(cloud, crop(cloud, config), part.name, pose))
+    assert first.lens is not None
+    return first.lens, found
+
+
+def _halves(recording: Recording) -> Iterator[Recording]:
+    count = sum(1 for _ in recording.selected())
+    for name, part in (("first half", slice(count // 2)), ("second half", slice(count // 2, None))):
+        yield replace(recording, name=f"{recording.name}, {name}", selection=part)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""Tables of a unit's flat field: its captures, and the figures that say how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from harness.tables.schema import Column, Table
+from harness.vocabulary.geometry import MM
+
+FLAT_CAPTURES = Table(
+    "flat_captures",
+    "one row per capture of the flat surface",
+    (
+        Column("capture", "capture", "name", "name of the capture"),
+        Column("frames", "frames", "frames", "frames that were averaged"),
+        Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
+        Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
+        Column("pixels", "pixels", "pixels", "pixels that count"),
+        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by the frames' noise"),
+        Column(
+            "residual_mm",
+            "residual (mm)",
+            lambda one: one.residual_rms_m / MM,
+            "root mean square of range less the smooth fit: pattern, shape and noise",
+        ),
+    ),
+    formats=("csv",),
+)
+
+FLAT_FIGURES = Table(
+    "flat_field",
+    "one row per figure of the flat field",
+    (
+        Column("figure", "figure", note="name of the figure"),
+        Column("unit", "unit", note="mm, or 1 for shares and correlations"),
+        Column("value", "value", note="its value, empty where the captures do not tell"),
+        Column("meaning", "meaning", note="what it says", brief=False),
+    ),
+    formats=("csv",),
+    left=2,
+)
+
+
+def figures_of(found: Any) -> Iterator[dict[str, Any]]:
+    """Yield the rows of `FLAT_FIGURES` of a `detectors.flat_captures.Separated`."""
+
+    def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
+        return {"figure": figure, "value": value, "unit": unit, "meaning": meaning}
+
+    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, the map's noise taken off")
+    yield row("noise of the map", found.noise_m / MM, "rms of its stated standard deviation")
+    shape = "the surface's shape" if found.separated else "the surface's shape, or what of the pattern is not stable"
+    yield row("between captures", found.surface_m / MM, f"deviation beyond noise between captures: {shape}")
+    for part, what in ((found.in_time, "first and last captures"), (found.in_range, "near and far captures")):
+        excess, correlation = (None, None) if part is None else (part.excess_m / MM, part.correlation)
+        yield row(f"change, {what}", excess, f"rms of the difference of the maps of {what} beyond their noise")
+        yield row(f"correlation, {what}", correlation, f"correlation of the maps of {what}", "1")
