@@ -59,7 +59,7 @@ CLIP_SIGMAS = 5.0
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
-ROUGHLY = (0, 2, 4, 6, 8, 9, 11, 13, 15)
+ROUGHLY = (0, 2, 4, 6, 9, 13)
 """Templates that tell what stands out strongly."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
@@ -91,7 +91,7 @@ class MatchedDetector(LocalDetector):
     name = "matched"
     version = 2
 
-    def __init__(self, settings: MatchedConfig, covariance: np.ndarray | None = None) -> None:
+    def __init__(self, settings: LocalConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
         super().__init__(settings)
         self._covariance = covariance
@@ -133,7 +133,7 @@ class MatchedDetector(LocalDetector):
 class _Learner(MatchedDetector):
     """Keeps the covariance of each cloud that it analyses."""
 
-    def __init__(self, settings: MatchedConfig) -> None:
+    def __init__(self, settings: LocalConfig) -> None:
         super().__init__(settings)
         self.seen: list[np.ndarray] = []
 

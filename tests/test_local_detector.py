@@ -206,10 +206,12 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
     evidence = detector.analyse(cloud)
     holes = [
         detector.measure(cloud, evidence, one)
-        for one in detector.find(cloud, evidence, 4.0 if isinstance(detector, MatchedDetector) else 5.0)
+        for one in detector.find(cloud, evidence, 4.5 if isinstance(detector, MatchedDetector) else 5.0)
         if np.median(evidence.residual_m.reshape(-1)[one.pixels]) > 0
     ]
     places = np.array([(one.u_px, one.v_px) for one in holes])
     apart = np.linalg.norm(MOUTHS_PX[:, None] - places[None], axis=-1)
     hit = apart.min(axis=1) < 12
     assert hit.sum() >= len(MOUTHS_PX) - 1
+    # the plate has some 60 holes behind its face
+    assert len(holes) <= 75

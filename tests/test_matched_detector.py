@@ -11,7 +11,7 @@ import pytest
 
 from detectors.interface import Detection
 from detectors.matched import MatchedDetector
-from detectors.measure import HolePatch, fit_hole, pictures, straight_sight
+from detectors.measure import HoleFit, HolePatch, fit_hole, pictures, straight_sight
 from detectors.whitening import (
     GRID,
     LONGEST_LAG_PX,
@@ -101,7 +101,8 @@ def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
         np.zeros(shape), np.ones(shape, bool), per_px @ per_px.T, (5.0, 5.0), noise_m, straight_sight(per_px)[None]
     )
     truth = np.array([15.2, 14.7, 5e-3, 6e-3, 0.5])
-    image, fits = pictures(blank, truth[None])[0], {}
+    image = pictures(blank, truth[None])[0]
+    fits: dict[str, list[HoleFit]] = {}
     for name, given in (("likelihood", correlation), ("plain", None)):
         fits[name] = []
         for seed in range(24):
