@@ -326,7 +326,7 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
     require(_same(learned, again), "the second time the same clouds taught something else")
     file = io.BytesIO()
     with no_crash("storing what was learned as an .npz without pickling"):
-        np.savez(file, **learned)
+        np.savez(file, **learned)  # type: ignore[arg-type]
         file.seek(0)
         with np.load(file, allow_pickle=False) as stored:
             restored = dict(stored)
