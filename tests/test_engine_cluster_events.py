@@ -73,7 +73,6 @@ class FakeClient:
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeClient]:
     monkeypatch.setattr(cluster_engine, "LOOKS_S", 0.02)
-    monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
@@ -115,12 +114,13 @@ def handed_out(engine: ClusterEngine, client: FakeClient, count: int = 1) -> Non
     stepped(engine, lambda: len(client.sent) == count)
 
 
-def test_renders_do_not_wait_for_ever_when_the_last_node_that_renders_dies(tmp_path, client, capsys):
+def test_renders_do_not_wait_for_ever_when_the_last_node_that_renders_dies(tmp_path, client, monkeypatch, capsys):
     engine = engine_with(client, first=facts(), second=facts(can_render=False))
     engine.submit(render(tmp_path, "a.npz"))
     engine.submit(render(tmp_path, "b.npz"))
     handed_out(engine, client)
     del client.nodes[FIRST]
+    monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
     with pytest.raises(UserError, match="no worker that can render"):
         engine.ended()
     assert capsys.readouterr().err.count("waiting for a worker that can render") == 1
@@ -165,8 +165,9 @@ def test_renders_wait_for_a_node_that_joins_after_one_that_cannot_render(tmp_pat
     assert [job.name for job, _ in engine.ended()] == ["a.npz"]
 
 
-def test_trials_go_on_where_no_node_can_render(client):
+def test_trials_go_on_where_no_node_can_render(client, monkeypatch):
     engine = engine_with(client, first=facts(can_render=False))
+    monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
     engine.submit(trial("one"))
     handed_out(engine, client)
     end = time.monotonic() + 0.3  # beyond the limit, which holds only where renders wait
@@ -232,8 +233,9 @@ def test_views_that_a_node_lacks_are_sent(tmp_path, client):
     engine.__exit__()
 
 
-def test_a_batch_system_is_waited_for_as_long_as_it_takes(client, capsys):
+def test_a_batch_system_is_waited_for_as_long_as_it_takes(client, monkeypatch, capsys):
     engine = engine_with(client, scheduler="jobqueue:slurm")
+    monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
     end = time.monotonic() + 0.5  # beyond the limit for workers that are started by hand
     while time.monotonic() < end:
         engine._step()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,16 @@ def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
     assert sum(one.done for one in counts) == study.trial_count
     whole = run_serially(study, tmp_path)
     assert (whole.trials.done, whole.trials.found) == (0, study.trial_count)
+
+
+def test_a_shard_takes_the_calibration_that_is_merged_into_its_folder(home, tmp_path):
+    """The second shard of two without a common folder runs no calibrating trial, and judges by the same thresholds."""
+    study = plan(home)
+    first = run_serially(study, tmp_path / "part1", shard=Shard(1, 2))
+    merge.merge_into(Journal(tmp_path / "part2"), Journal(tmp_path / "part1"), Counter())
+    second = run_serially(study, tmp_path / "part2", shard=Shard(2, 2))
+    assert second.thresholds == first.thresholds
+    assert first.trials.done + second.trials.done == study.trial_count and second.trials.found > 0
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +81,12 @@ def _frame(rows: list[Mapping[str, Any]]) -> pd.DataFrame:
     None hold numbers with NaN."""
     if isinstance(rows[0].get("threshold"), list):
         lists = [name for name, value in rows[0].items() if isinstance(value, list)]
-        rows = [{**row, **{name: row[name][k] for name in lists}} for row in rows for k in range(len(row["threshold"]))]
-    frame = pd.DataFrame(rows)
+        single = pd.DataFrame([{name: value for name, value in row.items() if name not in lists} for row in rows])
+        frame = single.loc[np.repeat(single.index, [len(row["threshold"]) for row in rows])].reset_index(drop=True)
+        frame = frame.assign(**{name: list(chain.from_iterable(row[name] for row in rows)) for name in lists})
+        frame = frame[list(rows[0])]
+    else:
+        frame = pd.DataFrame(rows)
     for column in [name for name in frame if frame[name].dtype == object]:
         if frame[column].map(lambda value: isinstance(value, str)).any():
             # each word once: every record brings its own copy

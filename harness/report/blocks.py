@@ -21,6 +21,7 @@ from harness.vocabulary.provenance import GENERATOR
 
 if TYPE_CHECKING:
     from jinja2 import Template
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
@@ -136,7 +137,7 @@ def plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key}: {plain(part)}" for key, part in value.items())
+        return ", ".join(f"{key}: {plain(part)}" for key, part in value.items()) or "none"
     if isinstance(value, list | tuple):
         return ", ".join(plain(part) for part in value) or "none"
     if value is None:
@@ -182,6 +183,12 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
     for size in ("width", "height"):
         body = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", body, count=1)
     return body.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
+
+
+def plain_decades(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, at 1, 2 and 5 of every decade."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
 
 
 def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:

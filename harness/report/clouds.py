@@ -204,7 +204,7 @@ def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
             if cut is None:
                 axes.set_visible(False)
                 continue
-            picture = _image(axes, cut.residual_mm, cut.detected, norm)
+            picture = _image(axes, cut.residual_mm, cut.detected, norm, dot=60 / max(cut.residual_mm.shape))
             axes.plot(*np.vstack([cut.rim_px, cut.rim_px[:1]]).T, color=INK, lw=1.3)
             height, width = cut.residual_mm.shape
             axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), yticks=[])
@@ -225,13 +225,13 @@ def _norm(residual_mm: np.ndarray) -> SymLogNorm:
     return SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
 
 
-def _image(axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymLogNorm) -> AxesImage:
-    """Draw residuals (h, w) with dots on the pixels of findings."""
+def _image(axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymLogNorm, dot: float = 1.1) -> AxesImage:
+    """Draw residuals (h, w) with a dot of ``dot`` points on each pixel of a finding."""
     axes.set_facecolor(NOTHING)
     axes.grid(visible=False)
     picture = axes.imshow(residual_mm, norm=norm, cmap="RdBu_r", aspect="equal")
     v, u = np.nonzero(detected)
-    axes.plot(u, v, ".", color=DAMAGE, ms=2.2, mew=0)
+    axes.plot(u, v, "o", color=DAMAGE, ms=dot, mew=0)
     return picture
 
 

@@ -120,4 +120,6 @@ def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[s
         figure({"against-d": efficiency_figure(rows)}, "against-d", caption),
         *command_of(command),
     ]
-    return page(f"Efficiency: {name}", answer(rows), body, [note(first)], warnings)
+    return page(
+        f"Efficiency: {name}", answer(rows), body, [*(paragraph(f"Warning: {text}") for text in warnings), note(first)]
+    )

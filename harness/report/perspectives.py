@@ -212,7 +212,7 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
                     if predicted > 0:
                         axes.plot([x], [predicted], marker="D", ms=6, mfc="white", mec=blocks.INK, mew=1.2, ls="none")
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter("{x:g}")
+            blocks.plain_decades(axes.yaxis)
             axes.set_xticks(range(len(methods)), [method_text(method) for method in methods])
             axes.set_xlim(-0.6, len(methods) - 0.4)
             axes.grid(axis="x", visible=False)

@@ -56,6 +56,13 @@ class Varied(NamedTuple):
         return len({(*row["found"], "", *row["undecided"]) for row in pair if row is not None}) > 1
 
 
+def _why(varied: Varied) -> str:
+    """Return the reason for a variation, and its settings where its name does not say them."""
+    variant = varied.variant
+    said = variant["settings"].strip("{}").replace('"', "").replace(": ", "=")
+    return "\n".join(filter(None, (variant["reason"], "" if said == variant["variant"] else variant["settings"])))
+
+
 def _side(label: str, side: str) -> Column:
     """Return the column of `SET_UPS` called ``label``, of one side of a variation."""
     (column,) = (one for one in SET_UPS.columns if one.label == label)
@@ -72,7 +79,7 @@ VARIED = Table(
     "one row per variation and number of frames, beside the set-up that it changes",
     (
         Column("", "variation", lambda one: one.variant["variant"]),
-        Column("", "why", lambda one: "\n".join(filter(None, (one.variant["reason"], one.variant["settings"])))),
+        Column("", "why", _why),
         Column("", "changes", lambda one: one.variant["reference"] or "–"),
         Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
         Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
@@ -84,6 +91,7 @@ VARIED = Table(
     ),
     formats=(),
     left=4,
+    kind="limits varied",
 )
 
 

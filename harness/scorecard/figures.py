@@ -364,7 +364,7 @@ def _reading(name: str, low: str, high: str, note: str, label: str = "") -> tupl
 
 
 def _tone(score: Score) -> Tone:
-    return "good" if score.passes else "bad" if score.regressed else "open"
+    return "good" if score.passes else "bad"
 
 
 SIMULATED = _reading("simulated", "low", "high", "simulated value", "simulated")

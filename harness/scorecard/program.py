@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from harness.report.blocks import COLOURS, MARKERS, plain, svg, template
+from harness.report.blocks import COLOURS, MARKERS, plain, plain_decades, svg, template
 from harness.scorecard import figures as scoring
 from harness.scorecard.bench import FULL, QUICK
 from harness.scorecard.quantities import QUANTITIES
@@ -103,8 +103,13 @@ def all_figures(
                     _draw_published(axis, panel, score, styles)
                 axis.set(title=panel.title, xlabel=panel.label, ylabel=picture.label)
                 axis.set(xscale=panel.scales[0], yscale=panel.scales[1])
+                for scale, ticks in zip(panel.scales, (axis.xaxis, axis.yaxis), strict=True):
+                    if scale == "log":
+                        plain_decades(ticks)
+                if not (of_panel["curve"].isin([curve for curve, _ in panel.lines.values()])).any():
+                    axis.text(0.5, 0.5, "not measured", transform=axis.transAxes, ha="center")
             handles, labels = axes[-1].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper left", ncols=3, columnspacing=1.4)
+            figure.legend(handles, labels, loc="outside upper left", ncols=3, columnspacing=1.2, fontsize=8)
 
         return svg(name, (10.5, 4.2 if len(panels) < 4 else 7.6), picture.title, draw)
 
@@ -150,7 +155,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         **record(command),
         "cameras": {name: camera_digest(load_camera(name)) for name in titles},
         "figures": str(options.figures or scoring.FIGURES_FILE),
-        "baseline": str(baseline_file),
+        "baseline": str(baseline_file or "none"),
         "effort": "quick" if options.quick else "full",
         "seconds": round(time.perf_counter() - began, 1),
     }

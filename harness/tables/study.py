@@ -202,15 +202,16 @@ SIGNALS = Table(
     "one row per set-up and number of frames whose signals can be regressed on size",
     (
         SET_UP,
-        Column("signals", "signals", lambda one: len(one.signals.size), "signals in the regression"),
         Column("model", "model", "signals.model", "the regression chosen"),
+        Column("", "tests speak against", _against),
+        Column("signals", "signals", lambda one: len(one.signals.size), "signals in the regression"),
         Column("a50_mm", "a50 (mm)", lambda one: Estimate(one.signals.a50, most=one.largest_mm), FOUND_50),
         Column("a90_mm", "a90 (mm)", lambda one: Estimate(one.signals.a90, most=one.largest_mm), FOUND_90),
         Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one, one.signals.bound), BOUND, bound_text),
         Column("hits_a90_95_mm", "from hits (mm)", lambda one: bound_estimate(one, one.a90_95), "same", bound_text),
         Column("p: <test>", "", _tests, "p-value of a test of what the regression takes for granted", spread=True),
-        Column("", "tests speak against", _against),
     ),
+    left=3,
 )
 
 

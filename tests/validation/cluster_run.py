@@ -2,7 +2,7 @@
 
 A `dask scheduler` and `dask worker` processes are started separately; the plan is real and cheap: one frame of a board
 at 2.3 m, rendered once, and the blind detector. Printed: rate, shares of the workers' time, processor time of driver
-and scheduler, bytes over the network, and what the journal and the tables cost. `docs/scale.md` is made from it.
+and scheduler, bytes over the network, and what the journal and the tables cost.
 """
 
 from __future__ import annotations

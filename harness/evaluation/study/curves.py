@@ -175,7 +175,8 @@ def roc_curves(
         interval = UNKNOWN
         if min(len(np.unique(table["board"])) for table in (damages, sites)) > 1:
             of_damaged = row_weights(damages["board"].to_numpy(), draws)
-            interval = percentiles(_rank_area(positive, negative, of_damaged, of_free))
+            parts = zip(*(np.array_split(of, 1 + draws // 50) for of in (of_damaged, of_free)), strict=True)
+            interval = percentiles(np.concatenate([_rank_area(positive, negative, *part) for part in parts]))
         at = (float((negative > threshold).mean()), float((positive > threshold).mean()))
         found.append(Roc(name, false, true, at, float(area[0]), interval, len(positive), len(negative)))
     return tuple(found)
