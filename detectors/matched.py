@@ -59,7 +59,7 @@ CLIP_SIGMAS = 5.0
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
-ROUGHLY = (0, 2, 4, 6, 9, 13)
+ROUGHLY = (0, 2, 4, 6, 9, 11, 13)
 """Templates that tell what stands out strongly."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""

@@ -121,4 +121,5 @@ def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[s
         figure({"against-d": efficiency_figure(rows)}, "against-d", caption),
         *command_of(command),
     ]
+    under = [*(blocks.paragraph(f"Warning: {text}") for text in warnings), note(first)]
     return page(f"Efficiency: {name}", answer(rows), body, under)
