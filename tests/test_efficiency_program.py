@@ -19,10 +19,9 @@ from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY, is_output
 @pytest.fixture
 def results(study_out: Path, tmp_path: Path) -> Path:
     """A copy of a study's results beside its renders."""
-    (run,) = (path.parent for path in study_out.glob(f"tiny/*/{STUDY.name}"))
+    run = (study_out / "tiny" / "latest").resolve()
     (tmp_path / ".cache").symlink_to(study_out / ".cache")
-    (tmp_path / "tiny" / run.name).mkdir(parents=True)
-    return Path(shutil.copytree(run, tmp_path / "tiny" / run.name, dirs_exist_ok=True))
+    return Path(shutil.copytree(run, tmp_path / "tiny" / run.name, dirs_exist_ok=True, ignore=lambda *_: [".lock"]))
 
 
 def test_detectors_stand_beside_the_ideal_observer(
