@@ -43,7 +43,7 @@ def test_detectors_stand_beside_the_ideal_observer(
     assert one["threshold"].between(3.5, 5.0).all() and one["pod"].between(0, 1).all()
     # the ideal observer needs smaller damage than the detector, and none is better than it
     known = efficiency.dropna(subset="efficiency_50_share")
-    assert (known["ideal_a50_mm"] < known["a50_mm"]).all() and (known["efficiency_50_low_share"] < 1).all()
+    assert (known["ideal_a50_mm"] < known["a50_mm"]).all() and (known["efficiency_50_share_low"] < 1).all()
     assert EFFICIENCY_PAGE.name in told and "d' of the ideal observer" not in told
     assert "Efficiency: tiny" in (results / EFFICIENCY_PAGE.name).read_text()
     assert all(
