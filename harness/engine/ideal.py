@@ -1,4 +1,4 @@
-"""What the ideal observer needs of a study's set-up: noise of units drawn at random, and each damage's signature.
+"""Noise of units drawn at random, and each damage's signature: the input of the ideal observer on a study's set-ups.
 
 Noise is what a unit's average shows on a damaged board beyond what a camera without noise, unit errors and rounding
 shows of the same view, away from damage and rim; a cubic of each field is taken out. The signature is what that

@@ -294,7 +294,7 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
             at_shares.append([index_for(needed, share) for share in SHARES])
             others = (responses(signal, other)[LONGEST_LAG_PX, LONGEST_LAG_PX] for other in rest)
             without.append([d * float(np.sqrt(other / square)) for other in others])
-    boards, holes, found, thresholds, pods = (np.array(column) for column in zip(*rows, strict=True))
+    boards, holes, indices, thresholds, pods = (np.array(column) for column in zip(*rows, strict=True))
     units, lost = sum(view.units for view in views), max(view.lost for view in views)
-    needed_by, left_out = np.array(at_shares).T, np.array(without).T
-    return IdealDamages(boards, holes, found, thresholds, pods, needed_by, left_out, units, sums.kurtosis, lost)
+    of_damages = (boards, holes, indices, thresholds, pods, np.array(at_shares).T, np.array(without).T)
+    return IdealDamages(*of_damages, units, sums.kurtosis, lost)
