@@ -51,8 +51,9 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 
 
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
-FOUND_50, FOUND_90 = (f"diameter found {share} % of the time" for share in (50, 90))
+FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
+OF = "what these sizes are: the diameter, or the depth where all damage has one diameter"
 EFFECT = "variance of a90 with boards as units over that with damages as units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (
@@ -116,9 +117,10 @@ LIMITS = Table(
         Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), "likewise"),
         Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
         Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, likewise", **BRIEF),
+        Column("limit_of", "", "record.inspected.limit_of", OF),
         Column("is_at_most", "", "is_at_most", "everything was found: a50 and a90 are at most this"),
-        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest diameter inspected"),
-        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest diameter inspected"),
+        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest size inspected"),
+        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest size inspected"),
         *CALLS,
         Column("", "found", _found, brief=False),
         Column("hits", "", "hits", "damages found"),
@@ -142,7 +144,7 @@ LIMITS = Table(
 
 
 def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
-    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
 
 
@@ -172,7 +174,7 @@ def limit_sentence(limit: SetUpLimit) -> str:
     if not limit.a90_95.demonstrated:
         reason = _reason(limit)
         if reason.startswith("a chance that does not grow with size"):
-            reason = "the hits do not grow clearly with diameter"
+            reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
         # without its statistics, which stand in the notes
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
     elif not is_within_sizes(limit):
@@ -180,7 +182,8 @@ def limit_sentence(limit: SetUpLimit) -> str:
     else:
         confidence = f"{100 * limit.a90_95.confidence:.0f} %"
         size = text.size(limit.a90_95.value)
-        found = f"damage of {size} mm is found 90 % of the time with {confidence} confidence (a90/95)"
+        size = f"{size} mm deep" if limit.record.inspected.limit_of == "depth" else f"of {size} mm"
+        found = f"damage {size} is found 90 % of the time with {confidence} confidence (a90/95)"
     calls, rate = limit.false_calls, ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
@@ -231,6 +234,6 @@ def _reason(limit: SetUpLimit) -> str:
 
 
 def _sizes(*limits: SetUpLimit) -> str:
-    """`` (4.3 to 15.9 mm)``: the diameters inspected; empty without any."""
+    """`` (4.3 to 15.9 mm)``: the sizes inspected; empty without any."""
     low, high = _ends_mm(*limits)
     return "" if np.isnan(low) else f" ({low:.3g} to {high:.3g} mm)"

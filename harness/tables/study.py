@@ -390,6 +390,37 @@ SURFACES = Table(
 )
 
 
+class DepthAt(NamedTuple):
+    """The depth that one set-up finds 90 % of the time at one diameter."""
+
+    limit: SetUpLimit
+    diameter_mm: float
+    depth: Estimate
+
+
+def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
+    """Return the contours of all surfaces; depths beyond the deepest inspected have no number."""
+    return [
+        DepthAt(one.limit, float(diameter), Estimate(*map(float, depth), most=one.surface.depth_range_mm[1]))
+        for one in results
+        if (surface := one.surface) is not None
+        for diameter, *depth in zip(
+            surface.diameter_mm, surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm, strict=True
+        )
+    ]
+
+
+DEPTH_LIMITS = Table(
+    "depth_limits",
+    "one row per set-up and number of frames with a surface, and diameter: the depth found 90 % of the time",
+    (
+        SET_UP_OF,
+        Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),
+        Column("depth_mm", "depth (mm)", "depth", "found 90 % of the time; inf: none is", interval=True),
+    ),
+)
+
+
 class KnownSize(NamedTuple):
     """POD of one set-up at a known hole: its number, its row, the bounds of its POD."""
 
@@ -418,7 +449,7 @@ SIZES = Table(
         Column("near_rate", "found", ("row.near_rate", "row.near_interval"), "share of them found", _pod_text),
     ),
 )
-STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, SIZES)
+STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, DEPTH_LIMITS, SIZES)
 
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
@@ -437,6 +468,7 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
         ],
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         SURFACES: [one for one in set_ups if one.surface is not None],
+        DEPTH_LIMITS: depths_at(set_ups),
         SIZES: [
             KnownSize(one.limit, number, row, Interval(row.lower, row.upper))
             for one in set_ups

@@ -180,7 +180,7 @@ def exchange(first: Inspected, second: Inspected) -> Exchange | None:
     if not len(one):
         return None
     before, now = (
-        targets_of(first.board[one], first.hole[one], first.diameter_mm[one], hit)
+        targets_of(first.board[one], first.hole[one], first.size_mm[one], hit)
         for hit in (first.hit[one], second.hit[two])
     )
     centre, spread = float(before.size_mm.mean()), float(before.size_mm.std()) or 1.0
