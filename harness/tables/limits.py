@@ -159,11 +159,14 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
         return (
             f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected{_sizes(*limits)}."
         )
-    best, worst = shown[0], shown[-1]
-    span = (
-        f"Of {len(limits)} set-ups, the smallest limit (a90/95) is {text.size(best.a90_95.value)} mm "
-        f"({best.record.label}), the largest {text.size(worst.a90_95.value)} mm ({worst.record.label})"
-    )
+    kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
+    spans = []
+    for kind in kinds:  # a depth is not compared with a diameter
+        some = [one for one in shown if one.record.inspected.limit_of == kind]
+        best, worst = ((text.size(one.a90_95.value), one.record.label) for one in (some[0], some[-1]))
+        of = f" of {kind}" if len(kinds) > 1 else ""
+        spans.append("the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(of, *best, *worst))
+    span = f"Of {len(limits)} set-ups, {'; '.join(spans)}"
     without = len(limits) - len(shown)
     few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
     return f"{span}{few} no limit within the sizes inspected." if without else f"{span}."

@@ -399,15 +399,13 @@ class DepthAt(NamedTuple):
 
 
 def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
-    """Return the contours of all surfaces; depths beyond the deepest inspected have no number."""
-    return [
-        DepthAt(one.limit, float(diameter), Estimate(*map(float, depth), most=one.surface.depth_range_mm[1]))
-        for one in results
-        if (surface := one.surface) is not None
-        for diameter, *depth in zip(
-            surface.diameter_mm, surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm, strict=True
-        )
-    ]
+    """Return the contours of all surfaces."""
+    rows = []
+    for limit, surface in ((one.limit, one.surface) for one in results if one.surface is not None):
+        depths = np.stack([surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1).tolist()
+        for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
+            rows.append(DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1])))
+    return rows
 
 
 DEPTH_LIMITS = Table(

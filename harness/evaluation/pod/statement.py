@@ -361,14 +361,17 @@ def _statement(
         return f"{one.curve.link}, {size}{bounded}"
 
     rows = [
-        ModelRow(name(one), one.deviance, *map(one.curve.size_at, (0.5, POD)), limit, one is fit, one in fits)
+        ModelRow(
+            name(one), one.deviance, one.curve.size_at(0.5), one.curve.size_at(POD), limit, one is fit, one in fits
+        )
         for one, limit in models
     ]
     a50, a90, signal = fit.curve.size_at(0.5), fit.curve.size_at(POD), fit if isinstance(fit, AhatFit) else None
     columns = (read.size_column, read.response_column, read.size, read.response, read.targets)
     what = (fit.curve, a50, a90, name(fit), tuple(rows))
-    told = (numbers, tuple(notes), signal, tuple(tests), fits if signal is None else ())
-    return PodStatement(read.path, kind, unit, *columns, *what, *bounds, *drawn, *told)
+    of_hits = fits if signal is None else ()
+    first = (read.path, kind, unit, *columns, *what)
+    return PodStatement(*first, *bounds, *drawn, numbers, tuple(notes), signal, tuple(tests), of_hits)
 
 
 def finite(value: float) -> float | None:

@@ -136,6 +136,10 @@ STEPS = 25
 """Depths at which a90 is drawn, and diameters at which the depth found is, in equal ratios over those inspected."""
 
 
+Contour = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Sizes (k,), the other size with a POD of 90 % there (k,), and the ends of its interval (k,)."""
+
+
 @dataclass(frozen=True, eq=False)
 class PodSurface:
     """``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm, the last 0 unless ``interaction_p``, its
@@ -216,7 +220,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     b0, b1, b2, b3 = np.vstack([b, np.pad(again, ((0, 0), (0, 4 - terms)))]).T[..., None]
     many = len(np.unique(seen.board)) > 1
 
-    def contour(own: np.ndarray, other: np.ndarray, at_mm: np.ndarray) -> tuple[np.ndarray, ...]:
+    def contour(own: np.ndarray, other: np.ndarray, at_mm: np.ndarray) -> Contour:
         """Sizes of POD 90 % at the other sizes ``at_mm`` (k,), with the ends of their intervals; ``own`` and ``other``
         (draws + 1, 1) are their coefficients."""
         slope = own + b3 * np.log(at_mm)
@@ -225,12 +229,16 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
         ends = [percentiles(column) if many else UNKNOWN for column in found[1:].T]
         return at_mm, found[0], np.array([end.low for end in ends]), np.array([end.high for end in ends])
 
-    contours = (*contour(b1, b2, np.geomspace(*depths, STEPS)), *contour(b2, b1, np.geomspace(*diameters, STEPS)))
+    of_depth, of_diameter = (
+        contour(b1, b2, np.geomspace(*depths, STEPS)),
+        contour(b2, b1, np.geomspace(*diameters, STEPS)),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         rise = b1 + b3 * d.mean()
         slopes = np.where(rise > 0, (b2 + b3 * a.mean()) / rise, np.nan)[:, 0]
     of_slope = percentiles(slopes[1:]) if many else UNKNOWN
-    return PodSurface(link, b, p, deviance, *contours, float(slopes[0]), of_slope, diameters, depths, note), ""
+    whole = (*of_depth, *of_diameter, float(slopes[0]), of_slope, diameters, depths, note)
+    return PodSurface(link, b, p, deviance, *whole), ""
 
 
 def _coefficients(
