@@ -166,7 +166,7 @@ def _from_study(options: argparse.Namespace) -> GuessedCurve:
         fix = "tell a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
         raise UserError(f"{options.study}: {record.label} has no curve to guess from: {limit.why}", fix=fix)
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
-    seen, boards = record.inspected.diameter_mm, record.unflawed.area_m2
+    seen, boards = record.inspected.size_mm, record.unflawed.area_m2
     low, high = inspected = float(seen.min()), float(seen.max())
     if options.sizes is not None:
         low, high = options.sizes

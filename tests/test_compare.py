@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from itertools import count, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,17 @@ from scipy import stats
 from harness import compare
 from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.study.limit import limit_of
-from harness.evaluation.study.paired import calls_change, hits_change, limit_change, mcnemar, shared_rows, sign_flip
-from harness.evaluation.study.record import Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
+from harness.evaluation.study.paired import (
+    _threshold_error,
+    calls_change,
+    found_from,
+    hits_change,
+    limit_change,
+    mcnemar,
+    shared_rows,
+    sign_flip,
+)
+from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
 from harness.evaluation.study.verdict import (
     ALPHA,
     Comparison,
@@ -305,8 +315,8 @@ def test_a_curve_that_flattens_is_worse_by_the_test_of_a90():
     row = only_row(one, other)
     assert (row.mark, row.limit_test(0), row.limit_test(1)) == ("worse", "a90", "hits")
     assert row.hits.fewer_p > 0.01
-    # twice for two tests of one question; Holm's first of two questions
-    assert row.limit_p[0] == pytest.approx(2 * 2 * row.swap.grown_p)
+    # twice for two tests of one question; Holm's first of three questions
+    assert row.limit_p[0] == pytest.approx(2 * 3 * row.swap.grown_p)
     grid = COMPARED.grid(compare_studies(one, other).rows)
     assert grid.rows[0][grid.heads.index("p")].text == f"{row.limit_p[0]:.2g} (a90)"
 
@@ -323,6 +333,55 @@ def test_a_significant_loss_within_the_margin_is_as_good():
     one = study_record(Study((SetUp(a50_mm=8.0, own_noise=0.0),), boards=120))
     row = only_row(one, study_record(Study((SetUp(a50_mm=8.5, own_noise=0.0),), boards=120)))
     assert row.limit_p[0] < ALPHA and 1.0 < row.limit.ratio < 1.1 and row.mark == "as good"
+
+
+def weaker(study: StudyRecord, by: float, above: float = 1.0, **changed: Any) -> StudyRecord:
+    """The study with all signals times ``by``, found from ``above`` times as much on."""
+    record = study.set_ups[0]
+    signal, at = by * record.inspected.signal, above * record.threshold
+    return first_set_up(study, inspected=replace(record.inspected, signal=signal, hit=signal > at), **changed)
+
+
+def test_weaker_signals_and_a_higher_threshold_are_worse_though_a90_is_not():
+    """Signals grow so fast with size that the limit moves by less than the margin."""
+    one = small(SetUp(a50_mm=7.0, width_mm=0.2), boards=20)
+    seen = one.set_ups[0].inspected
+    one = first_set_up(
+        one, inspected=replace(seen, signal=5.0 * (seen.diameter_mm / 7.0) ** 5, hit=seen.diameter_mm > 7)
+    )
+    for by, threshold in ((1 / 1.4, 1.0), (1.0, 1.2)):
+        row = only_row(one, weaker(one, by, threshold))
+        assert row.limit.ratio < 1.1 and row.mark == "worse" and row.why.startswith("signals over what is needed")
+        assert row.signal.ratio == pytest.approx(by / threshold, rel=0.06) and row.signal_p[0] < ALPHA
+    assert only_row(one, weaker(one, 0.95)).mark == "as good", "within the margin"
+    other = weaker(one, 1 / 1.4, detector="another")
+    assert only_row(one, other).signal is None, "other scores are in other units"
+
+
+def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
+    """Scores of 48 runs scatter by 7 %, so a threshold that was calibrated anew is known to some per cent only."""
+    one = small(boards=20)
+    scores = 5.0 * np.exp(0.07 * np.random.default_rng(1).standard_normal(48))
+    runs = Calibrated(np.arange(48), np.zeros(48, int), scores, np.zeros(48), np.zeros(48))
+    threshold = float(np.sort(scores)[-9])
+    first = first_set_up(one, calibrated=runs, threshold=threshold)
+    again = replace(runs, score=1.13 * runs.score)
+    lucky = weaker(first, 1.0, 1.13, threshold=1.13 * threshold, calibrated=again)
+    assert only_row(first, weaker(first, 1 / 1.13)).signal.less_p < 1e-6
+    draws = np.sort(5.0 * np.exp(0.07 * np.random.default_rng(2).standard_normal((4000, 48))), axis=1)[:, -9]
+    assert _threshold_error(first.set_ups[0]) == pytest.approx(np.log(draws).std(), rel=0.5)
+    assert only_row(first, lucky).signal.error > 1.2 * _threshold_error(first.set_ups[0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_found_from_parts_hits_from_misses_with_the_fewest_exceptions(seed):
+    """Of random hits, the more the stronger the signal: no other cut has fewer exceptions."""
+    random, n = np.random.default_rng(seed), 40
+    signal = random.lognormal(size=n)
+    hit = random.random(n) < 1 / (1 + np.exp(-6 * np.log(signal)))
+    seen = Inspected(np.arange(n), np.full(n, "1"), np.zeros(n, int), *np.ones((4, n)), hit, signal)
+    exceptions = [int((hit != (signal > level)).sum()) for level in (found_from(seen), *signal, 0.0)]
+    assert exceptions[0] == min(exceptions)
 
 
 def test_more_false_calls_are_worse_whatever_the_limit():
@@ -367,7 +426,8 @@ def test_holm_by_hand():
 def test_many_set_ups_ask_for_more():
     """A loss that convicts a single set-up does not convict one of five."""
     one = small(boards=14, hole_free_boards=4)
-    seen = one.set_ups[0].inspected
+    seen = replace(one.set_ups[0].inspected, signal=np.full(len(one.set_ups[0].inspected.hit), np.nan))
+    one = first_set_up(one, inspected=seen)  # of hits alone
     worse = first_set_up(one, inspected=replace(seen, hit=seen.hit & (seen.diameter_mm > 10)))
     alone = only_row(one, worse)
     assert alone.mark == "worse" and alone.hits.fewer_p > ALPHA / 20
@@ -437,4 +497,4 @@ def test_so_many_boards_and_no_fewer_can_convict(set_ups):
     """Of a study in which every board has lost, the smallest p that the rule can give."""
     for boards, convicts in ((fewest_boards(set_ups), True), (fewest_boards(set_ups) - 1, False)):
         hits_p, _ = sign_flip(np.full(boards, -1))
-        assert (2 * hits_p * 2 * set_ups < ALPHA) == convicts
+        assert (2 * hits_p * 3 * set_ups < ALPHA) == convicts

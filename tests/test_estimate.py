@@ -15,7 +15,12 @@ from harness.engine.work import Ended, EngineOptions, Outcome, Shard, StageCount
 from harness.experiment.load import load_experiment
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
-STUDY = ["study.boards=3", "study.hole_free_boards=2", "threshold.calibrate.boards=20"]
+STUDY = [
+    "study.boards=3",
+    "study.hole_free_boards=2",
+    "threshold.calibrate.boards=20",
+    "sweep={capture.frames: [1, 50]}",
+]
 
 
 def plan(cache: Path, name: str = "smoke", *overrides: str) -> SweepPlan:

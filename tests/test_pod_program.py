@@ -80,6 +80,21 @@ def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
     assert said["a50"] < said["a90"] < said["a90_95"]["size"]
 
 
+def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path: Path) -> None:
+    """The curve is the best model's, the limit that of all within 2 of its deviance; a model asked for is alone."""
+    sizes = np.linspace(0.5, 10.0, 400)
+    file = str(table(tmp_path / "a.csv", size=sizes, hit=hits(sizes)))
+    assert main([file, "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
+    said, page = stated(tmp_path), (tmp_path / "pod.html").read_text()
+    near = [row for row in said["models"] if row["deviance"] <= said["models"][0]["deviance"] + 2]
+    assert 1 < len(near) < len(said["models"]) and [row for row in said["models"] if row["in_a90_95"]] == near
+    assert said["a90_95"]["size"] == max(row["a90_95"]["size"] for row in near)
+    assert f"{len(near)} models are within 2 of the least" in page and page.count("(compared)") == len(near) - 1
+    alone = ["--link", near[0]["model"].partition(",")[0], "--log" if "ln" in near[0]["model"] else "--no-log"]
+    assert main([file, "--hit", "hit", "--size", "size", *alone, "--out", str(tmp_path)]) == 0
+    assert stated(tmp_path)["a90_95"]["size"] == near[0]["a90_95"]["size"]
+
+
 def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every target inspected five times, alike each time: the limit is that of the targets, and both are shown."""
     single = read_inspections(table(tmp_path / "one.csv", size=SIZES, hit=hits()), "size", ["hit"])
@@ -110,10 +125,11 @@ def test_what_is_not_demonstrated_is_said(tmp_path: Path, capsys: pytest.Capture
     assert "not demonstrated" in (tmp_path / "pod.html").read_text()
 
 
+@pytest.mark.parametrize("model", [{"link": "logit", "log_size": False}, {}], ids=["one model", "several"])
 @pytest.mark.parametrize("method", ["likelihood-ratio", "profile", "wald"])
-def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, method: str) -> None:
+def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, method: str, model: dict) -> None:
     read = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", ["hit"])
-    said = state_hits(read, link="logit", log_size=False, method=method.replace("-", " "))
+    said = state_hits(read, **model, method=method.replace("-", " "))
     rising = np.maximum.accumulate(said.lower)
     assert float(np.interp(0.9, rising, said.sizes)) == pytest.approx(said.bound.value, rel=2e-3)
     assert np.all(said.lower <= said.curve.pod(said.sizes) + 1e-9)

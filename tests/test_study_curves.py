@@ -222,7 +222,7 @@ class TestSurface:
         columns = [np.ones(len(seen.hit)), np.log(seen.diameter_mm), np.log(seen.depth_mm)]
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[surface.link]
         fit = sm.GLM(seen.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)).fit()
-        assert surface.b == pytest.approx(fit.params, rel=1e-5)
+        assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5) and surface.b[3] == 0
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
 
     def test_depth_that_does_not_matter_has_no_slope(self):
@@ -237,10 +237,41 @@ class TestSurface:
         hit = np.random.default_rng(5).random(len(chance)) < chance
         return dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
 
-    def test_an_interaction_is_told_and_left_out(self):
-        surface, why = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d), draws=50)
-        assert why == "" and len(surface.b) == 3 and surface.interaction_p < 0.05
-        assert "diameter and depth interact" in surface.note
+    def test_an_interaction_that_the_data_show_is_fitted(self):
+        sm = pytest.importorskip("statsmodels.api")
+        record = self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d)
+        surface, why = surface_of(record, draws=50)
+        assert why == surface.note == "" and surface.interaction_p < 0.05
+        a, d = np.log(record.inspected.diameter_mm), np.log(record.inspected.depth_mm)
+        link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[surface.link]
+        columns = np.column_stack([np.ones_like(a), a, d, a * d])
+        fit = sm.GLM(record.inspected.hit.astype(float), columns, family=sm.families.Binomial(link)).fit()
+        assert surface.b == pytest.approx(fit.params, rel=1e-4)
+        assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
+
+    def test_contours_in_both_directions_are_of_one_surface(self):
+        """POD is 90 % on both, and the depths fall as the diameter grows."""
+        surface, _ = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d), draws=50)
+        assert surface.pod(surface.a90_mm, surface.depth_mm) == pytest.approx(0.9, abs=1e-9)
+        reached = np.isfinite(surface.d90_mm)
+        assert surface.pod(surface.diameter_mm, surface.d90_mm)[reached] == pytest.approx(0.9, abs=1e-9)
+        assert reached.sum() > 15 and np.all(np.diff(surface.d90_mm[reached]) < 0)
+        assert np.all(surface.d90_low_mm <= surface.d90_mm) and np.all(surface.d90_mm <= surface.d90_high_mm)
+
+    @pytest.mark.slow
+    def test_the_depth_found_holds_the_truth(self):
+        """Drawn 15 times from logit = -18 + 9 ln a + 3 ln d: as `test_a_known_plane_is_found`, for the depth."""
+        record, held = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[0], 0
+        seen = record.inspected
+        chance = special.expit(-18.0 + 9.0 * np.log(seen.diameter_mm) + 3.0 * np.log(seen.depth_mm))
+        for seed in range(15):
+            hit = np.random.default_rng(seed).random(len(chance)) < chance
+            again = dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
+            surface, _ = surface_of(again, draws=100)
+            at = int(np.abs(surface.diameter_mm - 5.0).argmin())
+            true = np.exp((special.logit(0.9) + 18.0 - 9.0 * np.log(surface.diameter_mm[at])) / 3.0)
+            held += surface.d90_low_mm[at] < true < surface.d90_high_mm[at]
+        assert held >= 11
 
     def test_a_chance_that_falls_with_diameter_has_none(self):
         surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))

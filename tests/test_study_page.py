@@ -16,6 +16,7 @@ from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.report.study_page import study_html, study_parts, write_study_report
 from harness.tables.limits import limit_sentence
+from harness.tables.study import DEPTH_LIMITS, depths_at
 from harness.tables.text import text_of, unbroken
 from harness.vocabulary.errors import UserError
 from scenes.target.thesis import DIAMETERS_IN
@@ -119,7 +120,17 @@ def structure(page: str) -> Structure:
 
 def test_every_section_is_there(page: str) -> None:
     assert headings(page) == SECTIONS
-    for name in ("curves", "axis-1", "axis-2", "surface", "signals", "operating", "examples-1", "examples-2"):
+    for name in (
+        "curves",
+        "axis-1",
+        "axis-2",
+        "surface",
+        "depth-limits",
+        "signals",
+        "operating",
+        "examples-1",
+        "examples-2",
+    ):
         assert f'<figure id="{name}"' in page
     assert "No data for this figure" not in page
 
@@ -132,7 +143,7 @@ def test_nothing_comes_from_outside_and_no_script_runs(structure: Structure) -> 
 
 
 def test_every_figure_has_words_for_those_who_cannot_see(structure: Structure, whole: StudyResult) -> None:
-    assert len(structure.labels) == 8
+    assert len(structure.labels) == 9
     assert all(len(label) > 40 for label in structure.labels)
     assert not [label for label in structure.labels if "nan" in label.split()]
 
@@ -251,6 +262,15 @@ def test_where_everything_is_found_the_bound_needs_no_curve() -> None:
     assert result.limits[0].a90_95.demonstrated
     assert unbroken(limit_sentence(result.limits[0])) in page
     assert "all found: binomial on the 29 smallest" in section(page, "Detection limits")
+
+
+def test_the_depths_that_are_drawn_stand_in_their_file(whole: StudyResult) -> None:
+    frame = DEPTH_LIMITS.frame(depths_at(whole.set_ups))
+    for one in whole.set_ups:
+        rows = frame[frame["set_up"] == one.limit.record.label]
+        assert rows["diameter_mm"].tolist() == one.surface.diameter_mm.tolist()
+        for name, column in (("depth_mm", "d90_mm"), ("depth_low_mm", "d90_low_mm"), ("depth_high_mm", "d90_high_mm")):
+            np.testing.assert_array_equal(rows[name], getattr(one.surface, column))
 
 
 def test_depths_without_a_surface_say_why() -> None:

@@ -206,11 +206,11 @@ def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDam
         if group.poses is not None:
             continue
         seen = limit.record.inspected
-        sizes = (limit.a90_95.value, limit.a90_mm, limit.a50_mm, float(np.median(seen.diameter_mm)))
-        limit_mm = min(next(size for size in sizes if np.isfinite(size)), seen.diameter_mm.max() / max(SHARES.values()))
+        sizes = (limit.a90_95.value, limit.a90_mm, limit.a50_mm, float(np.median(seen.size_mm)))
+        limit_mm = min(next(size for size in sizes if np.isfinite(size)), seen.size_mm.max() / max(SHARES.values()))
         rows: dict[Where, int] = {}
         for where, share in SHARES.items():
-            apart = np.abs(seen.diameter_mm - share * limit_mm)
+            apart = np.abs(seen.size_mm - share * limit_mm)
             apart[list(rows.values())] = np.inf
             rows[where] = int(apart.argmin())
         half_m = (max(seen.diameter_mm[row] for row in rows.values()) / 2 + ROOM_MM) * MM
@@ -249,7 +249,7 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
         board=int(seen.board[row]),
         hole=str(seen.hole[row]),
         where=where,
-        pod=float("nan") if curve is None else float(curve.pod(seen.diameter_mm[row])),
+        pod=float("nan") if curve is None else float(curve.pod(seen.size_mm[row])),
         hit=bool(seen.hit[row]),
         score=float(seen.signal[row]),
         diameter_mm=damage.diameter_m / MM,

@@ -313,15 +313,29 @@ def _drafts(
 ) -> Iterator[Draft]:
     """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
     names = names_of(telling)
+    told = {
+        id(one): one.name or f"{names[one.path]}={value_text(one.path, _differing(one.value, axis))}"
+        for axis in axes
+        for one in axis
+        if one.path in telling
+    }
     for settings in product(*axes):
         # a set-up is called like ``camera=kinect_v2, distance=0.75 m``
-        said = [s.name or f"{names[s.path]}={value_text(s.path, s.value)}" for s in settings if s.path in telling]
+        said = [told[id(one)] for one in settings if one.path in telling]
         yield Draft(_label(settings), ", ".join(said) or MAIN, settings, settings[-1].written_at if settings else ())
     common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
     for variation in variations:
         for frames in variation.frames or common:
             label, settings = f"{variation.label}, {FRAMES}={frames.value}", (frames, *variation.settings)
             yield replace(variation, label=label, variant=variation.label, settings=settings)
+
+
+def _differing(value: Any, axis: Iterable[Setting]) -> Any:
+    """Leave out of a mapping what all mappings on the axis have in common."""
+    others = [other.value for other in axis]
+    if not all(isinstance(other, dict) for other in others):
+        return value
+    return {key: own for key, own in value.items() if any(other.get(key) != own for other in others)}
 
 
 def _points(

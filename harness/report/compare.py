@@ -62,6 +62,8 @@ COMPARED = Table(
             lambda row: " → ".join(f"{rate:.2f}" for rate in row.calls.rates_per_m2) if row.calls else "–",
         ),
         Column("", "p of calls", lambda row: p_value(row.calls_p[0]) if row.calls else "–"),
+        Column("", "signal", lambda row: f"{100 * (row.signal.ratio - 1):+.1f} %" if row.signal else "–"),
+        Column("", "p of signal", lambda row: p_value(row.signal_p[0]) if row.signal else "–"),
     ),
     formats=(),
     left=3,
@@ -72,7 +74,9 @@ TESTS = (
     f"than {100 * (MARGIN - 1):.0f} % and hits do not decide, of an exchange test of a90 itself, marked (a90) where it "
     "is the smaller. Where the studies have different boards, p is of boards drawn again for each (500 draws). The p "
     "of false calls is of a sign-flip test where frames and threshold are the same; else it allows for the luck of "
-    "each calibration. All are one-sided, of being worse, and adjusted. 95 %: of the change of a90, boards drawn again."
+    "each calibration. Signal: median change of the signals of damage over the signal from which damage is found; its "
+    "p is of a normal test with the scatter over boards and of both calibrations. All are one-sided, of being worse, "
+    "and adjusted. 95 %: of the change of a90, boards drawn again."
 )
 
 
@@ -101,8 +105,9 @@ def compare_parts(comparison: Comparison) -> list[str | Grid]:
 def rule(comparison: Comparison) -> str:
     """Return what the marks mean."""
     return (
-        f"Worse (+): a90, or the rate of false calls, has grown by more than {100 * (MARGIN - 1):.0f} %, and a test "
-        f"says that it is not by chance (p < {comparison.alpha:g} by Holm over all set-ups and both questions). Better "
+        f"Worse (+): a90, the rate of false calls, or what is needed over the signals, has grown by more than "
+        f"{100 * (MARGIN - 1):.0f} %, and a test "
+        f"says that it is not by chance (p < {comparison.alpha:g} by Holm over all set-ups and questions). Better "
         "(-): likewise for a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed "
         "trials. *: a limit for the first time. x: measured with another stick. < and >: in the first, in the second "
         "study only."
@@ -167,6 +172,8 @@ def _row_data(row: ComparedSetUps) -> dict[str, Any]:
         data["a90_swap"] = vars(row.swap)
     if row.hits is not None:
         data["hits"] = {**vars(row.hits), "boards_p": row.hits.boards_p}
+    if row.signal is not None:
+        data["signal"] = {**vars(row.signal), "decides": dict(zip(sides, row.signal_p, strict=True))}
     if row.calls is not None:
         data["false_calls"] = {**vars(row.calls), "ratio": row.calls.ratio}
         data["false_calls"]["decides"] = dict(zip(sides, row.calls_p, strict=True))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.pod.curve import Bound
+from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
 from harness.evaluation.pod.statement import POD, PodStatement
 from harness.report.blocks import (
     BLUE,
@@ -53,8 +54,14 @@ def pod_html(statement: PodStatement, command: str) -> str:
     )
     chosen_by = (
         f"Sorted by {statement.criterion}, smaller is nearer to the data. Unless one was asked for, that alone "
-        "chooses, never the limit."
+        "chooses the curve, never the limit."
     )
+    if len(statement.fits) > 1:
+        chosen_by += (
+            f" {len(statement.fits)} models are within {NEAR_DEVIANCE:g} of the least (for each inspection of a "
+            "target), too little to tell them apart: every a90/95 to quote is the largest of theirs, and the band "
+            "holds all their bands."
+        )
     size_in, draw = _plan(statement)
     drawn = svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
     body = [heading("Curve"), figure({"pod": drawn}, "pod", caption), heading("Sizes"), sizes_grid(statement).html()]
@@ -80,8 +87,9 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 
 def sizes_grid(statement: PodStatement) -> Grid:
     """a50, a90 and every bound: size, and how it was found."""
-    bounds = [(statement.bound, f"{statement.bound.method}: the limit to quote")]
-    bounds += [(each, each.method) for each in statement.others]
+    of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
+    bounds = [(statement.bound, f"{statement.bound.method}{of}: the limit to quote")]
+    bounds += [(each, f"{each.method}{of}") for each in statement.others]
     if statement.independent is not None:
         bounds.append((statement.independent, "WRONG here: as if every inspection were a target of its own"))
     rows = [(name, sized(getattr(statement, name), statement.unit), "estimate") for name in ("a50", "a90")]
@@ -93,7 +101,7 @@ MODELS = Table(
     "models",
     "one row per model that was tried",
     (
-        Column("", "model", lambda row: f"{row.name}{' (used)' if row.chosen else ''}"),
+        Column("", "model", lambda row: f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.near else ''}"),
         Column("", "criterion", lambda row: f"{row.criterion:.2f}"),
         Column("", "a50", lambda row: sized(row.a50, "")),
         Column("", "a90", lambda row: sized(row.a90, "")),
@@ -104,7 +112,7 @@ MODELS = Table(
 
 
 def models_grid(statement: PodStatement) -> Grid:
-    """The models that were tried, the one in use marked."""
+    """The models that were tried; marked: that of the curve, and those whose bounds are compared with its own."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
     heads = {name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
     return MODELS.grid(statement.models, heads={"criterion": statement.criterion, **heads})

@@ -55,13 +55,13 @@ def curves_figure(limits: Sequence[SetUpLimit]) -> str:
             draw_pod(axes, limit.statement, limit.a90_95, strength, most=limit.largest_mm)
         else:
             seen = limit.record.inspected
-            draw_hits(axes, seen.diameter_mm, seen.hit, strength=strength)
+            draw_hits(axes, seen.size_mm, seen.hit, strength=strength)
             hits_in_view(axes)
             if limit.a90_95.demonstrated:
                 axes.plot([limit.a90_95.value], [0.9], "o", color=PURPLE, label=f"a90/95: {limit.a90_95.value:.2f} mm")
             words, place = plain(fill(f"no curve: {limit.why}", 44)), axes.transAxes
             axes.text(0.5, 0.5, words, transform=place, ha="center", va="center", color=GREY, fontsize=9)
-        axes.set(xlim=span, xlabel="diameter (mm)", ylabel="probability of detection")
+        axes.set(xlim=span, xlabel=_size_axis(limit), ylabel="probability of detection")
 
     return _panels("curves", limits, draw, " ".join(limit_sentence(limit) for limit in limits))
 
@@ -72,10 +72,10 @@ def signals_figure(limits: Sequence[SetUpLimit]) -> str:
     def draw(axes: Axes, limit: SetUpLimit) -> None:
         assert limit.signals is not None
         draw_signals(axes, limit.signals)
-        axes.set(xlim=_span([limit]), xlabel="diameter (mm)", ylabel="highest score at the damage")
+        axes.set(xlim=_span([limit]), xlabel=_size_axis(limit), ylabel="highest score at the damage")
 
     names = "; ".join(name_of(limit) for limit in limits)
-    return _panels("signals", limits, draw, f"Score of each damage against its diameter, with the threshold: {names}.")
+    return _panels("signals", limits, draw, f"Score of each damage against its size, with the threshold: {names}.")
 
 
 def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
@@ -106,6 +106,29 @@ def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
     return _panels("surface", [limit for limit, _ in surfaces], draw, alt, one_legend=True)
 
 
+def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
+    """Draw the depth found 90 % of the time against diameter with its interval, a line for each set-up's surface."""
+    surfaces = [(one.limit, one.surface) for one in results if one.surface is not None][: len(COLOURS)]
+    deepest = max(surface.depth_range_mm[1] for _, surface in surfaces)
+    shallowest = min(surface.depth_range_mm[0] for _, surface in surfaces)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for (limit, surface), colour in zip(surfaces, COLOURS, strict=False):
+            low, high = np.nan_to_num(surface.d90_low_mm), np.nan_to_num(surface.d90_high_mm, nan=np.inf)
+            inside = (surface.d90_mm >= surface.depth_range_mm[0]) & (surface.d90_mm <= surface.depth_range_mm[1])
+            band = np.clip(low, shallowest, deepest), np.clip(high, shallowest, deepest)
+            axes.fill_between(surface.diameter_mm, *band, where=inside, color=colour, alpha=0.15, lw=0)
+            name = plain(fill(name_of(limit), LONGEST_NAME))
+            axes.plot(surface.diameter_mm, np.where(inside, surface.d90_mm, np.nan), color=colour, label=name)
+        axes.set(xlabel="diameter (mm)", ylabel="depth found 90 % of the time (mm)", ylim=(0, deepest))
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center")
+
+    lines = sum(-(-len(name_of(limit)) // LONGEST_NAME) for limit, _ in surfaces)
+    alt = "Smallest depth found 90 % of the time against diameter, as depth_limits.csv says."
+    return svg("depth-limits", (8.6, 4.4 + 0.17 * lines), alt, draw)
+
+
 def _panels(
     name: str,
     limits: Sequence[SetUpLimit],
@@ -133,9 +156,13 @@ def _panels(
     return svg(name, (PANEL_IN[0] * across, high) if across > 1 else ONE_IN, alt, draw)
 
 
+def _size_axis(limit: SetUpLimit) -> str:
+    return f"{limit.record.inspected.limit_of} (mm)"
+
+
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
     """The sizes inspected with 4 % of them on either side; of a single size a tenth of it."""
-    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     if not len(sizes):
         return 0.0, 1.0
     low, high = float(sizes.min()), float(sizes.max())
@@ -302,6 +329,7 @@ def study_html(
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
     figures |= {"curves": curves_figure(inspected)} if inspected else {}
     figures |= {"surface": surface_figure(surfaces)} if surfaces else {}
+    figures |= {"depth-limits": depth_limits_figure(shown)} if surfaces else {}
     figures |= {"signals": signals_figure(signals)} if signals else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}
     named: list[tuple[str, str]] = []

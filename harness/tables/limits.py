@@ -54,8 +54,9 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 
 
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
-FOUND_50, FOUND_90 = (f"diameter found {share} % of the time" for share in (50, 90))
+FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
+OF = "what these sizes are: the diameter, or the depth where all damage has one diameter"
 EFFECT = "variance of a90 with boards as units over that with damages as units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (
@@ -143,9 +144,10 @@ LIMITS = Table(
         Column("units", "", "record.units", "units of the camera"),
         Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
         Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, likewise", **BRIEF),
+        Column("limit_of", "", "record.inspected.limit_of", OF),
         Column("is_at_most", "", "is_at_most", "everything was found: a50 and a90 are at most this"),
-        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest diameter inspected"),
-        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest diameter inspected"),
+        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest size inspected"),
+        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest size inspected"),
         *CALLS,
         Column(
             "beside_per_m2",
@@ -203,7 +205,7 @@ def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid
 
 
 def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
-    sizes = np.concatenate([limit.record.inspected.diameter_mm for limit in limits])
+    sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
 
 
@@ -223,11 +225,14 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
         return (
             f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected{_sizes(*limits)}."
         )
-    best, worst = shown[0], shown[-1]
-    span = (
-        f"Of {len(limits)} set-ups, the smallest limit (a90/95) is {text.size(quoted(best).value)} mm "
-        f"({best.record.label}), the largest {text.size(quoted(worst).value)} mm ({worst.record.label})"
-    )
+    kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
+    spans = []
+    for kind in kinds:  # a depth is not compared with a diameter
+        some = [one for one in shown if one.record.inspected.limit_of == kind]
+        best, worst = ((text.size(quoted(one).value), one.record.label) for one in (some[0], some[-1]))
+        of = f" of {kind}" if len(kinds) > 1 else ""
+        spans.append("the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(of, *best, *worst))
+    span = f"Of {len(limits)} set-ups, {'; '.join(spans)}"
     without = len(limits) - len(shown)
     few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
     return f"{span}{few} no limit within the sizes inspected." if without else f"{span}."
@@ -241,14 +246,15 @@ def limit_sentence(limit: SetUpLimit) -> str:
     if not quote.demonstrated:
         reason = _reason(quote)
         if reason.startswith("a chance that does not grow with size"):
-            reason = "the hits do not grow clearly with diameter"
+            reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
         # without its statistics, which stand in the notes
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
     elif not is_within_sizes(limit, quote):
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
     else:
         confidence, size = f"{100 * quote.confidence:.0f} %", text.size(quote.value)
-        found = f"damage of {size} mm is found 90 % of the time{new} with {confidence} confidence (a90/95)"
+        size = f"{size} mm deep" if limit.record.inspected.limit_of == "depth" else f"of {size} mm"
+        found = f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
     calls, rate = limit.false_calls, ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
@@ -302,6 +308,6 @@ def _reason(bound: Bound) -> str:
 
 
 def _sizes(*limits: SetUpLimit) -> str:
-    """`` (4.3 to 15.9 mm)``: the diameters inspected; empty without any."""
+    """`` (4.3 to 15.9 mm)``: the sizes inspected; empty without any."""
     low, high = _ends_mm(*limits)
     return "" if np.isnan(low) else f" ({low:.3g} to {high:.3g} mm)"

@@ -407,6 +407,35 @@ SURFACES = Table(
 )
 
 
+class DepthAt(NamedTuple):
+    """The depth that one set-up finds 90 % of the time at one diameter."""
+
+    limit: SetUpLimit
+    diameter_mm: float
+    depth: Estimate
+
+
+def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
+    """Return the contours of all surfaces."""
+    rows = []
+    for limit, surface in ((one.limit, one.surface) for one in results if one.surface is not None):
+        depths = np.stack([surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1).tolist()
+        for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
+            rows.append(DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1])))
+    return rows
+
+
+DEPTH_LIMITS = Table(
+    "depth_limits",
+    "one row per set-up and number of frames with a surface, and diameter: the depth found 90 % of the time",
+    (
+        SET_UP_OF,
+        Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),
+        Column("depth_mm", "depth (mm)", "depth", "found 90 % of the time; inf: none is", interval=True),
+    ),
+)
+
+
 class KnownSize(NamedTuple):
     """POD of one set-up at a known hole: its number, its row, the bounds of its POD."""
 
@@ -435,7 +464,7 @@ SIZES = Table(
         Column("near_rate", "found", ("row.near_rate", "row.near_interval"), "share of them found", _pod_text),
     ),
 )
-STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, SIZES)
+STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, DEPTH_LIMITS, SIZES)
 
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
@@ -454,6 +483,7 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
         ],
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         SURFACES: [one for one in set_ups if one.surface is not None],
+        DEPTH_LIMITS: depths_at(set_ups),
         SIZES: [
             KnownSize(one.limit, number, row, Interval(row.lower, row.upper))
             for one in set_ups

@@ -38,8 +38,13 @@ def value_text(path: str, value: Any) -> str:
 
 
 def on_one_line(value: Any) -> str:
-    """A value as text of at most `LONGEST` characters."""
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    """A value as text of at most `LONGEST` characters; of a mapping first which of several it is: ``flat {...}``."""
+    choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
+    if choice:
+        rest = {key: other for key, other in value.items() if key != choice}
+        text = f"{value[choice]} {json.dumps(rest, ensure_ascii=False)}".replace('"', "").removesuffix(" {}")
+    else:
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 

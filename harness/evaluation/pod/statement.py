@@ -14,11 +14,13 @@ from harness.evaluation.pod.hit_miss import (
     METHODS,
     Between,
     HitMissFit,
-    band,
     bound,
     choose_model,
     fit_hit_miss,
     floor_ceiling_test,
+    largest_bound,
+    near_models,
+    widest_band,
 )
 from harness.evaluation.pod.inspections import Inspections
 from harness.vocabulary.errors import UserError
@@ -40,7 +42,8 @@ TESTED: dict[Between, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model that was tried: its name, how far from the data (``criterion``, smaller is better), its sizes."""
+    """One model that was tried: its name, how far from the data (``criterion``, smaller is better), its sizes;
+    ``near``: its bound is one of those of which the statement's is the largest."""
 
     name: str
     criterion: float
@@ -48,13 +51,15 @@ class ModelRow:
     a90: float
     bound: Bound
     chosen: bool
+    near: bool
 
 
 @dataclass(frozen=True)
 class PodStatement:
     """Sizes are in ``unit``. ``size``, ``response`` (n,) as read; ``sizes``, ``lower``, ``upper`` (m,) the band to be
     drawn; ``independent``: the bound had every row been a target of its own, None where it was. ``numbers``: what else
-    the fit says; ``tests``: (what, p-value, how it reads); ``signal``: the regression, None of hits."""
+    the fit says; ``tests``: (what, p-value, how it reads); ``signal``: the regression, None of hits. ``fits``: of hits,
+    the models over which bounds and band are the widest, that of ``curve`` first."""
 
     path: Path
     kind: str
@@ -79,6 +84,7 @@ class PodStatement:
     notes: tuple[str, ...]
     signal: AhatFit | None
     tests: tuple[tuple[str, float, str], ...]
+    fits: tuple[HitMissFit, ...] = ()
     criterion: str = "deviance"
 
     @property
@@ -93,7 +99,7 @@ class PodStatement:
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma", "floor", "ceiling")}
         models = [
             {"model": row.name, self.criterion: finite(row.criterion), "a50": finite(row.a50), "a90": finite(row.a90)}
-            | {"a90_95": _bound_data(row.bound), "chosen": row.chosen}
+            | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
             for row in self.models
         ]
         return {
@@ -126,8 +132,9 @@ def state_hits(
 ) -> PodStatement:
     """State the curve of hits and misses: of all links and sizes or their logarithms (of those that ``link``,
     ``log_size`` leave) the fit with the least deviance, with a floor or ceiling where ``bounded``; bounds by all
-    `METHODS` that it has, ``method``'s first. Of targets inspected more than once also the limit as if every row had
-    its own. ``tested``: for a floor and a ceiling, which takes most of the time."""
+    `METHODS` that it has, ``method``'s first, each the largest over the `near_models` of those left. Of targets
+    inspected more than once also the limit as if every row had its own. ``tested``: for a floor and a ceiling, which
+    takes most of the time."""
     from threadpoolctl import threadpool_limits
 
     # L-BFGS-B hands systems of four unknowns to LAPACK, whose threads wait for each other: 9 s, not 0.6 s, on two
@@ -135,21 +142,23 @@ def state_hits(
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
         tried = choose_model(size, hit, inspections=read.target, bounded=bounded)
-        fit = next(one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size))
+        left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
+        fit, near = left[0], near_models(left)
         curve, notes, tests, independent = fit.curve, [*read.notes, *fit.notes], [], None
         if fit.targets < fit.n:
             # A fit of its own, because where hits and misses separate the penalty counts targets.
-            rows = fit_hit_miss(size, hit, link=curve.link, log_size=curve.log_size, bounded=fit.bounded)
-            independent = bound(rows, POD, CONFIDENCE, method)
+            axes = [(one.curve.link, one.curve.log_size, one.bounded) for one in near]
+            rows = [fit_hit_miss(size, hit, link=of, log_size=log, bounded=with_) for of, log, with_ in axes]
+            independent = largest_bound(rows, method)
         if tested and bounded == "none" and fit.method == "ML":
             model: dict[str, Any] = {"link": curve.link, "log_size": curve.log_size, "inspections": read.target}
             tests = [floor_ceiling_test(size, hit, bounded=one, **model) for one in TESTED]
         models = [(one, bound(one, POD, CONFIDENCE, method)) for one in tried]
         others = [one for one in METHODS if one != method and (bounded == "none" or one != "wald")]
-        further = tuple(bound(fit, POD, CONFIDENCE, one) for one in others)
-        limit = next(limit for one, limit in models if one is fit)
+        further = tuple(largest_bound(near, one) for one in others)
+        limit = largest_bound(near, method)
         sizes = drawn_sizes(size, curve.log_size, (curve.size_at(POD), limit.value))
-        lower, upper = band(fit, sizes, CONFIDENCE, method)
+        lower, upper = widest_band(near, sizes, method)
 
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -171,7 +180,8 @@ def state_hits(
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
     bounds = (limit, further, independent)
-    return _statement(read, "hit/miss", unit, fit, models, bounds, (sizes, lower, upper), numbers, notes, said)
+    drawn = (sizes, lower, upper)
+    return _statement(read, "hit/miss", unit, near, models, bounds, drawn, numbers, notes, said)
 
 
 def state_signals(
@@ -206,14 +216,14 @@ def state_signals(
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
     kind, bounds = "signal against size", (limit, (), rows)
-    return _statement(read, kind, unit, fit, models, bounds, drawn, numbers, [*read.notes, *fit.notes], said)
+    return _statement(read, kind, unit, (fit,), models, bounds, drawn, numbers, [*read.notes, *fit.notes], said)
 
 
 def _statement(
     read: Inspections,
     kind: str,
     unit: str,
-    fit: HitMissFit | AhatFit,
+    fits: tuple[Any, ...],
     models: list[tuple[Any, Bound]],
     bounds: tuple[Bound, tuple[Bound, ...], Bound | None],
     drawn: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -221,7 +231,9 @@ def _statement(
     notes: list[str],
     tests: list[tuple[str, float, str]],
 ) -> PodStatement:
-    """The statement of ``fit``, one of ``models`` (fits with their limits). ``bounds``: limit, others, of rows."""
+    """The statement of the first of ``fits``, all of them among ``models`` (fits with their limits). ``bounds``: limit,
+    others, of rows."""
+    fit: HitMissFit | AhatFit = fits[0]
 
     def name(one: HitMissFit | AhatFit) -> str:
         size = "ln size" if one.curve.log_size else "size"
@@ -231,15 +243,17 @@ def _statement(
         return f"{one.curve.link}, {size}{bounded}"
 
     rows = [
-        ModelRow(name(one), one.deviance, one.curve.size_at(0.5), one.curve.size_at(POD), limit, one is fit)
+        ModelRow(
+            name(one), one.deviance, one.curve.size_at(0.5), one.curve.size_at(POD), limit, one is fit, one in fits
+        )
         for one, limit in models
     ]
     a50, a90, signal = fit.curve.size_at(0.5), fit.curve.size_at(POD), fit if isinstance(fit, AhatFit) else None
     columns = (read.size_column, read.response_column, read.size, read.response, read.targets)
     what = (fit.curve, a50, a90, name(fit), tuple(rows))
-    return PodStatement(
-        read.path, kind, unit, *columns, *what, *bounds, *drawn, numbers, tuple(notes), signal, tuple(tests)
-    )
+    of_hits = fits if signal is None else ()
+    first = (read.path, kind, unit, *columns, *what)
+    return PodStatement(*first, *bounds, *drawn, numbers, tuple(notes), signal, tuple(tests), of_hits)
 
 
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:

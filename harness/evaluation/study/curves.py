@@ -151,12 +151,20 @@ class PixelCurves:
 
 
 def roc_curves(
-    holes: pd.DataFrame, sites: pd.DataFrame, threshold: float, a50_mm: float, a90_mm: float, draws: int = DRAWS
+    holes: pd.DataFrame,
+    sites: pd.DataFrame,
+    threshold: float,
+    a50_mm: float,
+    a90_mm: float,
+    draws: int = DRAWS,
+    *,
+    by: str = "diameter",
 ) -> tuple[Roc, ...]:
-    """Draw the ROC of all damages, and of those below a50, from a50 to a90 and above, where there are any."""
+    """Draw the ROC of all damages, and of those whose size, ``by`` its name, lies below a50, from a50 to a90 and above,
+    where there are any."""
     if holes.empty or sites.empty:
         return ()
-    size, negative, found = holes["true_diameter_mm"].to_numpy(float), _signal(sites), []
+    size, negative, found = holes[f"true_{by}_mm"].to_numpy(float), _signal(sites), []
     of_free = row_weights(sites["board"].to_numpy(), draws, "hole-free")
     for name, of in (
         ("all sizes", np.ones(len(size), bool)),

@@ -1,12 +1,13 @@
 """The detection limit of one set-up: a90/95, the same over boards drawn again, and POD over diameter and depth.
 
-The headline is the likelihood ratio bound of the hit/miss curve (`harness.evaluation.pod.statement.state_hits`), in
-which damages are the independent targets. Damages of one board are not quite that; beside it stands the same bound with
-its criterion multiplied by the boards' design effect. Where the a50 of boards scatters by 2 mm about 6 mm, a90/95
-covers 88 % (60 boards) and 91 % (20), that bound 93 % and 95 %; where boards do not matter both cover 95 to 97 %. The
-upper percentile of boards drawn again is no substitute: it covers 86 % with 20 boards (300 studies,
-``tests/validation/study_coverage.py``). Boards, not damages, are what a study draws at random, so whole boards are
-resampled with replacement (the cluster bootstrap; Davison and Hinkley 1997, section 3.8)."""
+The headline is the likelihood ratio bound of the hit/miss curve, the largest over models that fit about as well
+(`harness.evaluation.pod.statement.state_hits`), in which damages are the independent targets. Damages of one board are
+not quite that; beside it stands the same bound with its criterion multiplied by the boards' design effect. Where the
+a50 of boards scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) and 91 % (20), that bound
+93 % and 95 %; where boards do not matter both cover 95 to 97 %. The upper percentile of boards drawn again is no
+substitute: it covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). Boards, not damages,
+are what a study draws at random, so whole boards are resampled with replacement (the cluster bootstrap; Davison and
+Hinkley 1997, section 3.8)."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ from harness.evaluation.pod.curve import (
     penalised_maxima,
     slopes_of_link,
 )
-from harness.evaluation.pod.hit_miss import HitMissFit, band, bound, fit_hit_miss
+from harness.evaluation.pod.hit_miss import METHODS, largest_bound, widest_band
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
@@ -137,16 +138,22 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
 LINKS = ("logit", "probit")
 LEAST_RATIO = 1.2
 """Deepest over shallowest damage below which a coefficient of depth would be guesswork."""
-DEPTHS = 25
-"""Depths at which a90 is drawn, in equal ratios over those inspected."""
+STEPS = 25
+"""Depths at which a90 is drawn, and diameters at which the depth found is, in equal ratios over those inspected."""
+
+
+Contour = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Sizes (k,), the other size with a POD of 90 % there (k,), and the ends of its interval (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PodSurface:
-    """``b`` (3,): coefficients of 1, ln a and ln d, sizes in mm; ``interaction_p``: p-value of ln a ln d, which is not
-    fitted. ``depth_mm`` (k,), ``a90_mm`` (k,) with ``a90_low_mm``, ``a90_high_mm`` (k,) 95 % percentiles over boards,
-    which hold the truth in some 87 % of studies of 30 boards. ``depth_slope``: minus d ln a90 / d ln depth (b2 / b1),
-    with its interval. ``diameter_range_mm``, ``depth_range_mm``: inspected. ``note``: what to know beside it, or ""."""
+    """``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm, the last 0 unless ``interaction_p``, its
+    p-value, is below 5 %. ``depth_mm`` (k,), ``a90_mm`` (k,) with ``a90_low_mm``, ``a90_high_mm`` (k,) 95 % percentiles
+    over boards, which hold the truth in some 87 % of studies of 30 boards; ``diameter_mm``, ``d90_mm``, ``d90_low_mm``,
+    ``d90_high_mm`` (k,): the depth found 90 % of the time at each diameter, likewise; infinite where depth does not
+    help. ``depth_slope``: minus d ln a90 / d ln depth at the mean logarithms, with its interval. ``diameter_range_mm``,
+    ``depth_range_mm``: inspected. ``note``: what to know beside it, or ""."""
 
     link: str
     b: np.ndarray
@@ -156,6 +163,10 @@ class PodSurface:
     a90_mm: np.ndarray
     a90_low_mm: np.ndarray
     a90_high_mm: np.ndarray
+    diameter_mm: np.ndarray
+    d90_mm: np.ndarray
+    d90_low_mm: np.ndarray
+    d90_high_mm: np.ndarray
     depth_slope: float
     depth_slope_interval: Interval
     diameter_range_mm: tuple[float, float]
@@ -164,7 +175,8 @@ class PodSurface:
 
     def pod(self, diameter_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """POD at diameters and depths of a common shape."""
-        return link_cdf(self.link, self.b[0] + self.b[1] * np.log(diameter_mm) + self.b[2] * np.log(depth_mm))
+        a, d = np.log(diameter_mm), np.log(depth_mm)
+        return link_cdf(self.link, self.b[0] + self.b[1] * a + self.b[2] * d + self.b[3] * a * d)
 
 
 def depth_varies(depth_mm: np.ndarray) -> bool:
@@ -192,31 +204,47 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
 
     def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
-        """Deviance, coefficients and link."""
+        """Deviance, coefficients (4,) and link."""
         hits = hit.astype(float)
         b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
-        return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), b, link
+        return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), np.pad(b, (0, 4 - len(b))), link
 
     deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
     if b[1] <= 0:
         return None, "the chance of detection does not grow with diameter"
-    p, note = np.nan, "POD falls with depth" if b[2] < 0 else ""
+    p, terms, note = np.nan, 3, "POD falls with depth" if b[2] < 0 else ""
     if not _separated(crossed, hit):
-        p = float(chi2.sf(max(deviance - fit(link, crossed)[0], 0.0) / repeats, 1))
-        if p < 0.05:
+        least, bent, _ = fit(link, crossed)
+        p = float(chi2.sf(max(deviance - least, 0.0) / repeats, 1))
+        rises = min(bent[1] + bent[3] * np.log(depths).min(), bent[1] + bent[3] * np.log(depths).max()) > 0
+        if p < 0.05 and rises:
+            deviance, b, terms = least, bent, 4
+        elif p < 0.05:
             note += f"{'; ' if note else ''}diameter and depth interact (p = {p:.2g}), which the surface leaves out"
-    weights, level = row_weights(seen.board, draws), float(link_ppf(link, np.array(0.9)))
-    drawn = np.vstack([b, _coefficients(crossed[:, :3], weights * hit, weights * ~hit, link, b)])
-    depth_mm, many = np.geomspace(*depths, DEPTHS), len(np.unique(seen.board)) > 1
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        a90 = np.exp((level - drawn[:, :1] - drawn[:, 2:] * np.log(depth_mm)) / drawn[:, 1:2])
-        slope = np.where(drawn[:, 1] > 0, drawn[:, 2] / drawn[:, 1], np.nan)
-    a90 = np.where(drawn[:, 1:2] > 0, a90, np.inf)
-    edges = [percentiles(column) if many else UNKNOWN for column in a90[1:].T]
-    low, high = np.array([(edge.low, edge.high) for edge in edges]).T
-    of_slope = percentiles(slope[1:]) if many else UNKNOWN
-    drawn_a90 = (depth_mm, a90[0], low, high)
-    return PodSurface(link, b, p, deviance, *drawn_a90, float(slope[0]), of_slope, diameters, depths, note), ""
+    weights, level = row_weights(seen.board, draws), float(link_ppf(link, np.array(POD)))
+    again = _coefficients(crossed[:, :terms], weights * hit, weights * ~hit, link, b[:terms])
+    b0, b1, b2, b3 = np.vstack([b, np.pad(again, ((0, 0), (0, 4 - terms)))]).T[..., None]
+    many = len(np.unique(seen.board)) > 1
+
+    def contour(own: np.ndarray, other: np.ndarray, at_mm: np.ndarray) -> Contour:
+        """Sizes of POD 90 % at the other sizes ``at_mm`` (k,), with the ends of their intervals; ``own`` and ``other``
+        (draws + 1, 1) are their coefficients."""
+        slope = own + b3 * np.log(at_mm)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            found = np.where(slope > 0, np.exp((level - b0 - other * np.log(at_mm)) / slope), np.inf)
+        ends = [percentiles(column) if many else UNKNOWN for column in found[1:].T]
+        return at_mm, found[0], np.array([end.low for end in ends]), np.array([end.high for end in ends])
+
+    of_depth, of_diameter = (
+        contour(b1, b2, np.geomspace(*depths, STEPS)),
+        contour(b2, b1, np.geomspace(*diameters, STEPS)),
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rise = b1 + b3 * d.mean()
+        slopes = np.where(rise > 0, (b2 + b3 * a.mean()) / rise, np.nan)[:, 0]
+    of_slope = percentiles(slopes[1:]) if many else UNKNOWN
+    whole = (*of_depth, *of_diameter, float(slopes[0]), of_slope, diameters, depths, note)
+    return PodSurface(link, b, p, deviance, *whole), ""
 
 
 def _coefficients(
@@ -253,15 +281,16 @@ WIDER = 1.1
 
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
-    """Sizes in mm. ``statement``: curve, band and bounds from hits, None where none can be fitted, and ``why``.
-    ``a90_95``: the limit to quote; infinite where not demonstrated. ``a90_draws_mm`` (B,): over boards drawn again, in
-    one order for all set-ups of as many boards. ``over_boards``: a90/95 were damages of one board as alike as the data
-    say. Where everything is found the estimates are the smallest size inspected, which they do not exceed; where
-    nothing is, or POD does not grow with size, they are NaN and their draws infinite. ``signals``: a second opinion,
-    the signal's regression with the threshold as decision, or ``signals_why`` not. ``over_units``: limits of the units
-    of a study with several and of a new one; draws are then over boards and units. ``beside``: findings on damaged
-    boards that count for no damage. ``size_error_mm``: median size of the error of the diameter of those ``sized``,
-    hits whose diameter a model gives. ``seconds_detect``: median a cloud."""
+    """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits, None
+    where none can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite where not demonstrated.
+    ``a90_draws_mm`` (B,): over boards drawn again, in one order for all set-ups of as many boards. ``over_boards``:
+    a90/95 were damages of one board as alike as the data say. Where everything is found the estimates are the smallest
+    size inspected, which they do not exceed; where nothing is, or POD does not grow with size, they are NaN and their
+    draws infinite. ``signals``: a second opinion, the signal's regression with the threshold as decision, or
+    ``signals_why`` not. ``over_units``: limits of the units of a study with several and of a new one; draws are then
+    over boards and units. ``beside``: findings on damaged boards that count for no damage. ``size_error_mm``: median
+    size of the error of the diameter of those ``sized``, hits whose diameter a model gives. ``seconds_detect``: median
+    a cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -314,7 +343,7 @@ def limit_of(
     regression of signals as censored; NaN where unknown. ``tested``: for a floor and a ceiling too, with a note.
     Deterministic. No error for data without a curve: ``why``."""
     seen = record.inspected
-    targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+    targets = targets_of(seen.board, seen.hole, seen.size_mm, seen.hit)
     statement: PodStatement | None = None
     why, effect, n = "no damage was inspected", np.nan, len(seen.hit)
     units: OverUnits | None = None
@@ -324,7 +353,7 @@ def limit_of(
         except UserError as error:
             why = error.message
     if statement is not None:
-        if depth_varies(seen.depth_mm):
+        if seen.limit_of == "diameter" and depth_varies(seen.depth_mm):
             low, high = seen.depth_mm.min(), seen.depth_mm.max()
             note = f"depths from {low:.3g} to {high:.3g} mm: one curve over all depths"
             statement = replace(statement, notes=(*statement.notes, note))
@@ -332,12 +361,14 @@ def limit_of(
         apart = targets
         if record.units > 1:
             unit, ones = seen.repeat % record.units, np.ones(n)
-            apart = Targets(seen.board, seen.diameter_mm, seen.hit.astype(float), ones, unit)
+            apart = Targets(seen.board, seen.size_mm, seen.hit.astype(float), ones, unit)
         of_a50, of_a90 = refitted_sizes(apart, statement.curve, (0.5, POD), draws)
-        fit = fit_of(record, statement)
-        if fit.method == "ML":
-            effect = design_effect(targets, statement.curve, POD)
-        over_boards = bound(fit, design_effect=effect) if effect > 1 else a90_95
+        over_boards = a90_95
+        if statement.fits[0].method == "ML":
+            effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
+            effect, at_least_one = effects[0], [max(1.0, one) for one in effects]
+            if max(at_least_one) > 1:
+                over_boards = largest_bound(statement.fits, METHODS[0], at_least_one)
         if apart.unit is not None:
             rows = (apart.size_mm, seen.hit, target_names(seen), apart.unit)
             units = over_units(*rows, statement.curve, over_boards)
@@ -351,7 +382,7 @@ def limit_of(
         of_a50 = of_a90 = np.full(draws, a90)
     else:
         a50 = a90 = np.nan
-        a90_95 = over_boards = Bound(POD, CONFIDENCE, "likelihood ratio", np.inf, f"not demonstrated: {why}")
+        a90_95 = over_boards = Bound(POD, CONFIDENCE, METHODS[0], np.inf, f"not demonstrated: {why}")
         of_a50 = of_a90 = np.full(draws, np.inf)
     rate_interval = UNKNOWN
     if targets.hits.sum() not in (0.0, targets.inspections.sum()):
@@ -372,7 +403,7 @@ def limit_of(
     ends = (UNKNOWN, UNKNOWN) if statement is None else (percentiles(of_a50), percentiles(of_a90))
     counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n, float(seen.hit.mean()) if n else np.nan)
     estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
-    largest_mm = float(seen.diameter_mm.max()) if n else np.nan
+    largest_mm = float(seen.size_mm.max()) if n else np.nan
     further = (signals_why, largest_mm, units, beside)
     return SetUpLimit(
         record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
@@ -387,13 +418,6 @@ def median_over_boards(board: np.ndarray, values: np.ndarray, draws: int = DRAWS
     below = np.cumsum(row_weights(board, draws)[:, order], axis=1)
     drawn = values[order][(2.0 * below >= below[:, -1:]).argmax(axis=1)]
     return float(np.median(values)), percentiles(drawn) if len(np.unique(board)) > 1 else UNKNOWN
-
-
-def fit_of(record: SetUpRecord, statement: PodStatement) -> HitMissFit:
-    """Fit the curve of a statement on the record's hits again, for bounds and bands at further sizes."""
-    seen, curve = record.inspected, statement.curve
-    names = target_names(seen)
-    return fit_hit_miss(seen.diameter_mm, seen.hit, link=curve.link, log_size=curve.log_size, inspections=names)
 
 
 def target_names(seen: Inspected) -> np.ndarray:
@@ -423,7 +447,7 @@ def _rows(record: SetUpRecord, response: np.ndarray, kept: np.ndarray) -> Inspec
     target = names if len(np.unique(names)) < len(names) else None
     values = np.asarray(response[kept], float)
     lines = np.flatnonzero(kept) + 1
-    return Inspections(Path(record.label), "diameter", column, seen.diameter_mm[kept], values, target, lines)
+    return Inspections(Path(record.label), seen.limit_of, column, seen.size_mm[kept], values, target, lines)
 
 
 def _all_found(size_mm: np.ndarray, what: str) -> Bound:
@@ -451,11 +475,13 @@ class SizeRow:
 
 
 def pod_at(limit: SetUpLimit, diameters_mm: Sequence[float]) -> tuple[SizeRow, ...]:
-    """State POD at given diameters, such as those of a board that one has: one row each, in the given order."""
-    sizes, seen = np.asarray(diameters_mm, float), limit.record.inspected
+    """State POD at given diameters, such as those of a board that one has: one row each, in the given order; none where
+    the limit is of depth."""
+    seen = limit.record.inspected
+    sizes = np.asarray(diameters_mm if seen.limit_of == "diameter" else (), float)
     of_curve = np.full((3, len(sizes)), np.nan)
     if limit.statement is not None and len(sizes):
-        of_curve = np.array([limit.statement.curve.pod(sizes), *band(fit_of(limit.record, limit.statement), sizes)])
+        of_curve = np.array([limit.statement.curve.pod(sizes), *widest_band(limit.statement.fits, sizes, METHODS[0])])
     low, high = seen.diameter_mm.min(initial=np.inf), seen.diameter_mm.max(initial=-np.inf)
     names, rows = target_names(seen), []
     for size, pod, lower, upper in np.vstack([sizes, of_curve]).T.tolist():

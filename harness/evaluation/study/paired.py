@@ -1,7 +1,7 @@
 """Two set-ups compared: hits and a90 board by board, their limits, and their false calls. Boards are the unit: damages
 of one board share its render, its pose and its surface, so they are not exchanged one by one. Not in any test of hits
-and limits: that each set-up drew its own calibration of the threshold. A gate needs a margin for that
-(`harness.evaluation.study.verdict`). Of two one-sided p the first is of being worse."""
+and limits: that each set-up drew its own calibration of the threshold; the tests of signals and of false calls have it.
+A gate needs a margin for that (`harness.evaluation.study.verdict`). Of two one-sided p the first is of being worse."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def exchange(first: Inspected, second: Inspected) -> Exchange | None:
     if not len(one):
         return None
     before, now = (
-        targets_of(first.board[one], first.hole[one], first.diameter_mm[one], hit)
+        targets_of(first.board[one], first.hole[one], first.size_mm[one], hit)
         for hit in (first.hit[one], second.hit[two])
     )
     centre, spread = float(before.size_mm.mean()), float(before.size_mm.std()) or 1.0
@@ -230,6 +230,77 @@ def _curves(z: np.ndarray, hits: np.ndarray, misses: np.ndarray) -> HitsAndMisse
 
 SAME = 1e-6
 """Relative difference of one threshold from machine to machine."""
+
+
+@dataclass(frozen=True)
+class SignalChange:
+    """Median change of ``damages``' signals over the signal from which damages are found (``found_from``, first and
+    second), as a factor ``ratio``. ``error``: standard error of its logarithm, over boards and over both calibrations;
+    ``less_p``, ``more_p``: one-sided, normal."""
+
+    damages: int
+    ratio: float
+    found_from: tuple[float, float]
+    error: float
+    less_p: float
+    more_p: float
+
+
+def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | None:
+    """Compare signals on the inspections that both have. It sees what hits hardly show: signals change with all of the
+    noise and the threshold, hits only near the limit. Damages count whose two signals, each over what is needed, exceed
+    1 in the geometric mean: smaller ones are noise. None where fewer than two boards have any, or for two detectors."""
+    from scipy.stats import norm
+
+    one, two = shared_rows(first.inspected, second.inspected)
+    if first.detector != second.detector or not len(one):
+        return None
+    needed = found_from(first.inspected), found_from(second.inspected)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        before, now = (
+            np.log(of.signal[rows] / at)
+            for of, rows, at in zip((first.inspected, second.inspected), (one, two), needed, strict=True)
+        )
+        clear = np.isfinite(before + now) & (before + now > 0)
+    change, board = (now - before)[clear], first.inspected.board[one][clear]
+    names, which = np.unique(board, return_inverse=True)
+    if len(names) < 2:
+        return None
+    of_boards = np.bincount(which, change) / np.bincount(which)
+    luck = [0.0, 0.0]
+    if not np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
+        luck = [_threshold_error(first), _threshold_error(second)]
+    error = float(np.sqrt(of_boards.var(ddof=1) / len(names) + luck[0] ** 2 + luck[1] ** 2))
+    median = float(np.median(change))
+    p = norm.cdf([median, -median], scale=error).tolist() if error > 0 else [float(median >= 0), float(median <= 0)]
+    return SignalChange(len(change), float(np.exp(median)), needed, error, *p)
+
+
+def found_from(seen: Inspected) -> float:
+    """Find the signal that parts hits from misses with the fewest exceptions, midway between its two neighbours: the
+    threshold as it acts, whatever the record says of it. Hits by missing returns alone do not count; NaN without any
+    signal."""
+    hit = seen.hit if seen.by_depth is None else seen.by_depth
+    known = np.flatnonzero(seen.signal > 0)
+    if not len(known):
+        return np.nan
+    order = known[np.argsort(seen.signal[known], kind="stable")]
+    signal, hit = seen.signal[order], hit[order]
+    exceptions = np.append(0, np.cumsum(hit)) + np.append(np.cumsum(~hit[::-1])[::-1], 0)
+    at = int(np.argmin(exceptions))
+    return float(np.sqrt(signal[max(at - 1, 0)] * signal[min(at, len(signal) - 1)]))
+
+
+def _threshold_error(record: SetUpRecord) -> float:
+    """Standard error of a calibrated threshold's logarithm: half the distance of the scores one standard deviation of
+    its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
+    if record.calibrated is None or len(record.calibrated.score) < 2:
+        return 0.0
+    falling = np.sort(np.maximum(record.calibrated.score, 1e-9))[::-1]
+    n, rank = len(falling), max(int((falling >= record.threshold).sum()), 1)
+    reach = np.sqrt(rank * max(1 - rank / n, 1 / n))
+    ends = np.interp([rank - reach, rank + reach], np.arange(1, n + 1), np.log(falling))
+    return float(0.5 * (ends[0] - ends[1]))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -113,6 +113,17 @@ class Inspected:
     signal: NumbersOrNull
     by_depth: Truths | None = None
     by_no_return: Truths | None = None
+
+    @property
+    def limit_of(self) -> Literal["diameter", "depth"]:
+        """Name the size that limits are of: the depth where damage of one diameter differs in it, else the diameter."""
+        one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
+        return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else "diameter"
+
+    @property
+    def size_mm(self) -> np.ndarray:
+        """Sizes (n,) that `limit_of` names."""
+        return self.depth_mm if self.limit_of == "depth" else self.diameter_mm
 
 
 @dataclass(frozen=True, eq=False)

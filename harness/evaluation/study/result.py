@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.intervals import SITES_PER_TARGET, Interval, percentiles
+from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
 from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.evaluation.study.curves import (
     ChanceHits,
@@ -82,7 +83,8 @@ def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
         for index, place in enumerate(places):
             if axis in place:
                 held = {name: value for name, value in place.items() if name != axis}
-                groups.setdefault(canonical_json(held), []).append(index)
+                same = [limits[index].record.inspected.limit_of, held]  # a depth is not compared with a diameter
+                groups.setdefault(canonical_json(same), []).append(index)
         for members in groups.values():
             values = [places[index][axis] for index in members]
             numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
@@ -115,6 +117,7 @@ Section = tuple[str, tuple[str, ...]]
 KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom", "dent": "spherical dents"}
 TESTS_THE_HARNESS = ("oracle", "blind")
 """Detectors whose limits say something of the harness only."""
+NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
 RISE = (0.05, 0.95)
 """POD between which the curve rises; sizes should reach past both, or the curve is known from one side."""
 
@@ -164,7 +167,8 @@ def _departures(
     limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
 ) -> tuple[str, ...]:
     a_board = max((one.targets / one.boards for one in limits if one.boards), default=1.0)
-    depths = [one.record.inspected.depth_mm for one in limits if one.statement]
+    inspected = [one.record.inspected for one in limits if one.statement]
+    depths = [seen.depth_mm for seen in inspected if seen.limit_of == "diameter"]
     depths = [one for one in depths if depth_varies(one)]
     of_depths = np.concatenate(depths) if depths else np.zeros(1)
     few = [one for one in limits if one.targets < LEAST_TARGETS]
@@ -200,7 +204,7 @@ def _departures(
             "Besides, false calls are counted on the whole face of hole-free boards.",
         ),
         *(rule for limit in limits if limit.statement for rule in _sizes_miss_the_rise(limit)),
-        (chosen, "The model is the one with the least deviance; that the same data chose it is not in its bound."),
+        (chosen, f"The same data chose the model: a90/95 is the largest over models whose {NEARLY}."),
         (
             all_found,
             f"Where everything was found there is no curve. a90/95 is then the {ALL_FOUND}th smallest size: were its "
@@ -215,7 +219,7 @@ def _departures(
 def _sizes_miss_the_rise(limit: SetUpLimit) -> tuple[tuple[bool, str], ...]:
     assert limit.statement is not None
     label, curve = limit.record.label, limit.statement.curve
-    low, high = curve.pod(np.array([limit.record.inspected.diameter_mm.min(), limit.largest_mm])).tolist()
+    low, high = curve.pod(np.array([limit.record.inspected.size_mm.min(), limit.largest_mm])).tolist()
     beyond = limit.a90_95.demonstrated and limit.beyond(limit.a90_95.value)
     return (
         (low > RISE[0], f"{label}: the smallest size inspected is found with a POD of {100 * low:.2g} %."),
@@ -325,7 +329,7 @@ def _set_up(
     chance = None
     if not holes.empty and not runs.empty:
         chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls, draws)
-    roc = roc_curves(holes, sites, record.threshold, a50, a90, draws)
+    roc = roc_curves(holes, sites, record.threshold, a50, a90, draws, by=record.inspected.limit_of)
     response = free_response(own(tables.operating), runs, holes, draws)
     pixels, sizes = pixel_curves(own(tables.pixels), draws), pod_at(limit, diameters_mm)
     return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws), sizes, floor)

@@ -1,6 +1,7 @@
 """The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. Worse
-is a set-up whose a90, or rate of false calls, has grown by more than `MARGIN` and than chance explains, by Holm's
-step-down over both questions of all set-ups at `ALPHA`; or that has no limit any more. On the same boards two tests
+is a set-up whose a90, or rate of false calls, has grown by more than `MARGIN`, or whose signals over the threshold have
+fallen by as much, and than chance explains, by Holm's step-down over the three questions of all set-ups at `ALPHA`; or
+that has no limit any more. On the same boards two tests
 answer for the limit, and its p is twice the smaller one's: that of hits, and that of a90 itself, which takes seconds
 and is asked only where a90 has changed by more than the margin and hits do not decide. On other boards the bootstrap of
 a90 answers. See `harness.evaluation.study.paired`."""
@@ -18,21 +19,26 @@ from harness.evaluation.study.paired import (
     CallsChange,
     HitsChange,
     LimitChange,
+    SignalChange,
     SwapChange,
     Tails,
     calls_change,
     hits_change,
     limit_change,
+    signal_change,
     swap_change,
 )
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
 MARGIN = 1.10
-"""Growth of a90, or of the rate of false calls, up to which nothing is worse (and shrinkage, nothing better)."""
+"""Growth of a90, of the rate of false calls, or of the threshold over signals, up to which nothing is worse (and
+shrinkage, nothing better)."""
 ALPHA = 0.001
 """Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
 its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
+QUESTIONS = 3
+"""Limit, false calls and signals of a set-up."""
 LIMIT_TESTS = 2
 """Two tests, of hits and of a90: each p is multiplied by their number."""
 TOSSES_PER_QUESTION, MOST_TOSSES = 5_000, 50_000
@@ -53,7 +59,8 @@ Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
     """One set-up of two studies; ``why``: the reason of ``mark``. ``swap``: the test of a90 on the same boards, None
-    where it was not asked. ``limit_p``, ``calls_p``: adjusted p of (worse, better), 1 where there is no test."""
+    where it was not asked. ``limit_p``, ``calls_p``, ``signal_p``: adjusted p of (worse, better), 1 where there is no
+    test."""
 
     first: SetUpLimit | None
     second: SetUpLimit | None
@@ -61,9 +68,11 @@ class ComparedSetUps:
     limit: LimitChange | None = None
     hits: HitsChange | None = None
     calls: CallsChange | None = None
+    signal: SignalChange | None = None
     swap: SwapChange | None = None
     limit_p: Tails = (1.0, 1.0)
     calls_p: Tails = (1.0, 1.0)
+    signal_p: Tails = (1.0, 1.0)
     mark: Mark = "as good"
     why: str = ""
 
@@ -103,7 +112,7 @@ class Comparison:
 def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
     """Shared boards from which on the tests can convict one of so many set-ups at all: if every board is worse, one
     toss in 2^boards says as much, and that p is multiplied by the tests of a limit and by all set-ups' questions."""
-    return int(np.floor(np.log2(LIMIT_TESTS * 2 * set_ups / alpha))) + 1
+    return int(np.floor(np.log2(LIMIT_TESTS * QUESTIONS * set_ups / alpha))) + 1
 
 
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
@@ -121,7 +130,8 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         same = one.targets_digest == other.targets_digest
         hits = hits_change(one.inspected, other.inspected) if same else None
         calls = calls_change(one, other, first.false_calls_per_m2)
-        rows.append(ComparedSetUps(before, now, changed, limit_change(before, now, same), hits, calls))
+        signal = signal_change(one, other) if same else None
+        rows.append(ComparedSetUps(before, now, changed, limit_change(before, now, same), hits, calls, signal))
     questions = sum(p is not None for row in rows for p in _p_values(row))
     rows = [_with_swap(row, questions, alpha) for row in rows]
     # A question that was not asked is no member of the family.
@@ -133,7 +143,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
     p = list(zip(*sides, strict=True))
     judged = []
     for k, row in enumerate(rows):
-        row = replace(row, limit_p=p[2 * k], calls_p=p[2 * k + 1])
+        row = replace(row, limit_p=p[3 * k], calls_p=p[3 * k + 1], signal_p=p[3 * k + 2])
         mark, why = (row.mark, row.why) if row.limit is None else _verdict(row, alpha)
         judged.append(replace(row, mark=mark, why=why))
     return Comparison(first, second, tuple(judged), alpha)
@@ -226,14 +236,15 @@ def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSet
     return replace(row, swap=swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
 
 
-def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None]:
-    """(worse, better) of the limit and of false calls."""
+def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
+    """(worse, better) of the limit, of false calls and of signals."""
     calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
+    signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.hits is not None:
         both = zip(*_of_limit(row.hits, row.swap), strict=True)
         worse, better = (min(1.0, LIMIT_TESTS * min(pair)) for pair in both)
-        return (worse, better), calls
-    return None if row.limit is None else (row.limit.grown_p, row.limit.shrunk_p), calls
+        return (worse, better), calls, signal
+    return None if row.limit is None else (row.limit.grown_p, row.limit.shrunk_p), calls, signal
 
 
 def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
@@ -247,16 +258,26 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
         grown = f"a90/95 {there} → {here}"
     if why := _lost(first, second):
         return "newly failing", why
-    if growth > MARGIN and row.limit_p[0] < alpha:
+    margin = limit_margin(row.signal)
+    if growth > margin and row.limit_p[0] < alpha:
         return "worse", grown
     if calls is not None and calls.ratio > MARGIN and row.calls_p[0] < alpha:
         return "worse", "false calls {:.2f} → {:.2f} per m²".format(*calls.rates_per_m2)
+    if row.signal is not None and row.signal.ratio < 1 / MARGIN and row.signal_p[0] < alpha:
+        needed = "{:.3g} → {:.3g}".format(*row.signal.found_from)
+        return "worse", f"signals over what is needed {100 * (row.signal.ratio - 1):+.0f} % (needed {needed})"
     if np.isnan(growth):
         why = _lost(second, first)
         return ("newly working", f"before: {why}") if why else ("no limit", second.why)
-    if growth < 1 / MARGIN and row.limit_p[1] < alpha:
+    if growth < 1 / margin and row.limit_p[1] < alpha:
         return "better", grown
     return ("as good", "") if 1 / MARGIN <= growth <= MARGIN else ("not significant", grown)
+
+
+def limit_margin(signal: SignalChange | None) -> float:
+    """Widen the margin of a90 by two standard errors of the signals over the threshold, where these are known: a depth
+    limit moves as they do, and no test of hits has the luck of two calibrations."""
+    return MARGIN * float(np.exp(2 * signal.error)) if signal else MARGIN
 
 
 def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
