@@ -28,13 +28,22 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number; of a mapping each key and value; of a camera's
-    file, its name."""
+    """A value on one line, short, with its unit where it is a number or a range of two; of a mapping which of several
+    it is, then each key and value; of a camera's file, its name."""
     if isinstance(value, dict) and value:
-        return on_one_line(", ".join(f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items()))
+        choice = next((key for key in CHOICES if key in value), "")
+        rest = (f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items() if key != choice)
+        return on_one_line(", ".join(([str(value[choice])] if choice else []) + list(rest)))
+    unit = unit_of(path)
+    if unit and isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_number, value)):
+        low, high = value
+        return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
     text = on_one_line(Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return f"{value:g} {unit_of(path)}" if number and unit_of(path) else text
+    return f"{value:g} {unit}" if _is_number(value) and unit else text
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def on_one_line(value: Any) -> str:
