@@ -304,6 +304,25 @@ class LooksAtDistance(Sound):
         return replace(found, score=found.score * (cloud.points_m[..., 2] / 0.7) ** 2)
 
 
+class LearnsAnew(Sound):
+    times = 0
+
+    def calibrate(self, hole_free):
+        LearnsAnew.times += 1
+        return {"times": np.array([LearnsAnew.times])}
+
+    def calibrated(self, learned):
+        return self
+
+
+class LearnsObjects(Sound):
+    def calibrate(self, hole_free):
+        return {"clouds": np.array([{"clouds": len(hole_free)}])}
+
+    def calibrated(self, learned):
+        return self
+
+
 BROKEN: list[tuple[Callable[..., None], type[Sound], str]] = [
     (checks.declares_itself, NoVersion, "`version` is True"),
     (checks.declares_itself, NoDefaults, "all defaults, ended in ValidationError"),
@@ -334,6 +353,8 @@ BROKEN: list[tuple[Callable[..., None], type[Sound], str]] = [
     (checks.measures_extents, OtherScore, "`measure` says score 0"),
     (checks.survives_pickling, Unpicklable, "pickling the detector ended in"),
     (checks.survives_pickling, LosesItself, "a detector that was pickled gave another result"),
+    (checks.learns_plain_arrays, LearnsAnew, "taught something else"),
+    (checks.learns_plain_arrays, LearnsObjects, "an .npz without pickling"),
     (checks.turns_with_the_cloud, AlongRows, "turned by 90 degrees, a score changed"),
     (checks.turns_with_the_cloud, LooksAtX, "turned by 90 degrees, a finding's centre"),
     (checks.moves_with_the_cloud, LooksAtDistance, "moved by 37 mm, a score changed"),

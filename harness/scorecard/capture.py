@@ -350,11 +350,13 @@ def _opened(options: argparse.Namespace) -> Recording:
 
 
 def camera_of_size(lens: Lens) -> str:
-    """The one simulated camera with as many pixels. Raises UserError where there is none, or more than one."""
+    """The one simulated camera with as many pixels; of several the one whose precision is no guess. Raises UserError
+    where there is none, or more than one."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
-    if len(fitting) == 1:
-        return fitting[0]
+    known = [name for name in fitting if load_camera(name).photons.signal_electrons.tag != "G"]
+    if len(known or fitting) == 1:
+        return (known or fitting)[0]
     wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not ones aligned to a"
     raise UserError(
         f"several cameras have {wrong}: {', '.join(fitting)}" if fitting else f"no simulated camera has {wrong}",

@@ -192,12 +192,12 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 def read_camera(path: Path) -> AnyCamera:
     """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
-    source = read_yaml(path)
-    named = source.data.get("name")
-    if named != path.stem:
-        message = f"`name` is {named}, but the file is {path.name}"
+    source = _completed(read_yaml(path))
+    camera = read_as(KINDS, "kind", source)
+    if camera.name != path.stem:
+        message = f"`name` is {camera.name}, but the file is {path.name}"
         raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])
-    return read_as(KINDS, "kind", _completed(source))
+    return camera
 
 
 def _completed(source: Source, depth: int = 0) -> Source:
