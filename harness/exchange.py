@@ -6,15 +6,15 @@ import errno
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
+from detectors.recordings.recording import slopes_of
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import FrameSource, Lens, invert
+from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, invert
 
 START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
@@ -51,8 +51,9 @@ class ExportedView:
         """Return the time of a frame."""
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
-    def exposures(self) -> Iterator[Exposure]:
-        """Yield the frames, each on the whole sensor: no range, black and no amplitude outside the simulated region."""
+    def exposures(self) -> Iterator[tuple[int, Frame]]:
+        """Yield the time of each frame and the frame on the whole sensor, as float32: no range, black and no amplitude
+        outside the simulated region."""
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
@@ -63,23 +64,9 @@ class ExportedView:
         for number, frame in enumerate(self.source.frames()):
             rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
             amplitude = frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
-            yield Exposure(
-                stamp_ns=self.stamp_ns(number),
-                z_m=on_sensor(frame.z_m.astype(np.float32), np.nan),
-                rgb=on_sensor(rgb, 0),
-                amplitude=on_sensor(amplitude.astype(np.float32), np.nan),
-            )
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One frame on the whole sensor: ``z_m`` (h, w) float32, NaN where invalid; ``rgb`` (h, w, 3) uint8; ``amplitude``
-    (h, w) float32; ``stamp_ns`` since the epoch."""
-
-    stamp_ns: int
-    z_m: np.ndarray
-    rgb: np.ndarray
-    amplitude: np.ndarray
+            z_m, amplitude = (on_sensor(each.astype(np.float32), np.nan) for each in (frame.z_m, amplitude))
+            reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
+            yield self.stamp_ns(number), Frame(frame.name, z_m, reason, rgb=on_sensor(rgb, 0), amplitude=amplitude)
 
 
 def in_turn(
@@ -131,9 +118,10 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
     for view in views:
         pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
         place = " ".join(f"{value:.9g}" for value in pose)
-        for exposure in view.exposures():
-            time = seconds_text(exposure.stamp_ns)
-            for name, picture in (("rgb", exposure.rgb[..., ::-1]), ("depth", depth_units(exposure.z_m))):
+        for stamp_ns, frame in view.exposures():
+            assert frame.rgb is not None
+            time = seconds_text(stamp_ns)
+            for name, picture in (("rgb", frame.rgb[..., ::-1]), ("depth", depth_units(frame.z_m))):
                 coded, content = cv2.imencode(".png", undistorted(lens, np.ascontiguousarray(picture)))
                 assert coded
                 (folder / name / f"{time}.png").write_bytes(content.tobytes())
@@ -225,20 +213,15 @@ def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
                     (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
                 )
             }
-            slopes = _slopes_of(view.lens)
+            slopes = slopes_of(view.lens, view.lens.whole)
             write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
-            for exposure in view.exposures():
-                write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
-                write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
+            for stamp_ns, frame in view.exposures():
+                header = _header(types.types, frame_name(view), stamp_ns)
+                write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
+                write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, packed_points(frame, slopes), header))
     except sqlite3.OperationalError as error:
         # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
-
-
-@lru_cache(maxsize=1)
-def _slopes_of(lens: Lens) -> np.ndarray:
-    """Return (h, w, 2) of the whole sensor: the views of an export share their lens."""
-    return lens.region_slopes(lens.whole)
 
 
 def frame_name(view: ExportedView) -> str:
@@ -246,14 +229,15 @@ def frame_name(view: ExportedView) -> str:
     return f"{view.name}_depth_optical_frame"
 
 
-def packed_points(exposure: Exposure, slopes: np.ndarray) -> np.ndarray:
+def packed_points(frame: Frame, slopes: np.ndarray) -> np.ndarray:
     """Return (h, w) of `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
-    points = np.zeros(exposure.z_m.shape, POINT)
-    x_y = slopes * exposure.z_m[..., None].astype(np.float64)
-    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], exposure.z_m
-    red, green, blue = np.moveaxis(exposure.rgb.astype(np.uint32), -1, 0)
+    assert frame.rgb is not None
+    points = np.zeros(frame.z_m.shape, POINT)
+    x_y = slopes * frame.z_m[..., None].astype(np.float64)
+    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], frame.z_m
+    red, green, blue = np.moveaxis(frame.rgb.astype(np.uint32), -1, 0)
     points["rgb"] = red << 16 | green << 8 | blue
-    points["intensity"] = exposure.amplitude
+    points["intensity"] = frame.amplitude
     return points
 
 
@@ -265,12 +249,11 @@ def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
     return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
-def _cloud_message(types: dict[str, Any], view: ExportedView, exposure: Exposure, slopes: np.ndarray) -> Any:
-    points = packed_points(exposure, slopes)
+def _cloud_message(types: dict[str, Any], points: np.ndarray, header: Any) -> Any:
     field = types["sensor_msgs/msg/PointField"]
     height, width = points.shape
     return types["sensor_msgs/msg/PointCloud2"](
-        header=_header(types, frame_name(view), exposure.stamp_ns),
+        header=header,
         height=height,
         width=width,
         fields=[field(name=name, offset=i * 4, datatype=FLOAT32, count=1) for i, name in enumerate(POINT.names or ())],
@@ -282,13 +265,12 @@ def _cloud_message(types: dict[str, Any], view: ExportedView, exposure: Exposure
     )
 
 
-def _info_message(types: dict[str, Any], view: ExportedView, stamp_ns: int) -> Any:
+def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
     """The lens in ROS' terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as the cloud is not rectified."""
-    lens = view.lens
     distorted = any(lens.distortion)
     region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types["sensor_msgs/msg/CameraInfo"](
-        header=_header(types, frame_name(view), stamp_ns),
+        header=header,
         height=lens.height,
         width=lens.width,
         distortion_model="rational_polynomial" if distorted else "plumb_bob",
