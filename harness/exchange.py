@@ -12,9 +12,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from detectors.recordings.recording import slopes_of
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, invert
+from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, invert, slopes_of
 
 START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
@@ -218,7 +217,7 @@ def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
             for stamp_ns, frame in view.exposures():
                 header = _header(types.types, frame_name(view), stamp_ns)
                 write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
-                write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, packed_points(frame, slopes), header))
+                write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
         # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
@@ -229,18 +228,6 @@ def frame_name(view: ExportedView) -> str:
     return f"{view.name}_depth_optical_frame"
 
 
-def packed_points(frame: Frame, slopes: np.ndarray) -> np.ndarray:
-    """Return (h, w) of `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
-    assert frame.rgb is not None
-    points = np.zeros(frame.z_m.shape, POINT)
-    x_y = slopes * frame.z_m[..., None].astype(np.float64)
-    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], frame.z_m
-    red, green, blue = np.moveaxis(frame.rgb.astype(np.uint32), -1, 0)
-    points["rgb"] = red << 16 | green << 8 | blue
-    points["intensity"] = frame.amplitude
-    return points
-
-
 # ---- messages --------------------------------------------------------------------------------------------------------
 
 
@@ -249,7 +236,15 @@ def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
     return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
-def _cloud_message(types: dict[str, Any], points: np.ndarray, header: Any) -> Any:
+def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, header: Any) -> Any:
+    """The frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
+    assert frame.rgb is not None
+    points = np.zeros(frame.z_m.shape, POINT)
+    x_y = slopes * frame.z_m[..., None].astype(np.float64)
+    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], frame.z_m
+    red, green, blue = np.moveaxis(frame.rgb.astype(np.uint32), -1, 0)
+    points["rgb"] = red << 16 | green << 8 | blue
+    points["intensity"] = frame.amplitude
     field = types["sensor_msgs/msg/PointField"]
     height, width = points.shape
     return types["sensor_msgs/msg/PointCloud2"](

@@ -120,20 +120,27 @@ DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
 
-Own = Callable[[], tuple[Lens | None, Path | None]]
-"""Finds the lens that comes with a capture, and the file that it was read from, where it has one of its own."""
-
 
 def lens_for(
-    name: str, asked: Asked, width: int, height: int, own: Own, hint: str = ""
+    name: str,
+    asked: Asked,
+    width: int,
+    height: int,
+    own: Callable[[], Lens | None] = lambda: None,
+    beside: Sequence[Path] = (),
+    hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
-    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, or ``own``. Raises
-    UserError where nobody states a lens (``hint`` ends its advice), or the one stated is of other images."""
+    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
+    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
+    (``hint`` ends its advice), or the one stated is of other images."""
     lens, file = asked.lens, asked.intrinsics
+    if lens is None and file is None:
+        lens = own()
+        suffixes = (".json", ".yaml", ".yml")
+        named = (folder / f"{stem}{suffix}" for folder in beside for stem in FOUND_BESIDE for suffix in suffixes)
+        file = next(filter(Path.is_file, named), None)
     if file is not None:
         lens = read_lens(file, width, height)
-    elif lens is None:
-        lens, file = own()
     if lens is None:
         raise UserError(
             f"{name}: nothing says which lens took these depth images, and without it they are no points",
@@ -152,15 +159,6 @@ def lens_for(
         fix="pass --intrinsics FILE with the lens of these images"
         + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
     )
-
-
-def lens_beside(folders: Sequence[Path], width: int, height: int) -> tuple[Lens | None, Path | None]:
-    """Read the first file in ``folders`` that is named like a lens. Raises UserError as `read_lens` does."""
-    for folder in folders:
-        for path in (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")):
-            if path.is_file():
-                return read_lens(path, width, height), path
-    return None, None
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
