@@ -18,7 +18,7 @@ from itertools import combinations
 
 import numpy as np
 
-from detectors.marks.mark import Mark
+from detectors.marks.mark import LEAST_MARKS, Mark
 from detectors.registration.registered import displacement_jacobian, moved_by
 from harness.vocabulary.geometry import MM, invert, transform_points
 
@@ -94,7 +94,6 @@ DISTANCE_SIGMAS = 4.0
 """A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
 """Limit of chi^2 of a matched mark's place, three degrees of freedom: a true one is lost once in 10,000."""
-LEAST_PAIRS = 3
 GUESS_SIGMA_M = 50 * MM
 """Error of the guess at marks, root mean square: five degrees over half a metre, and some centimetres."""
 PAIR_WORTH = 3.0
@@ -119,15 +118,15 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     """Match the marks of two views; the guess is used only to choose between placements that fit. The placement is
     chosen that the number of its pairs, their fit and the guess favour, if clearly."""
     counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
-    if min(len(reference), len(view)) < LEAST_PAIRS:
-        return Pairing(NO_PAIRS, f"{counts}, {LEAST_PAIRS} needed in each")
+    if min(len(reference), len(view)) < LEAST_MARKS:
+        return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
     if all(mark.code is not None for mark in (*reference, *view)):
         return _by_code(reference, view)
     ours, theirs = _side(reference), _side(view)
     swapped = len(view) < len(reference)
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
-        least = max(LEAST_PAIRS, min(len(reference), len(view)) // 2 + 1)
+        least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
         return Pairing(
             NO_PAIRS,
             f"the distances between the marks fit nowhere: of {counts} no {least} lie alike; other targets, or other"
@@ -162,8 +161,8 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
     problem = ""
-    if len(common) < LEAST_PAIRS:
-        problem = f"{len(common)} codes in common, {LEAST_PAIRS} needed: the reference shows {shown[0]}, the view "
+    if len(common) < LEAST_MARKS:
+        problem = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view "
         problem += shown[1]
     return Pairing(pairs, problem, notes)
 
@@ -210,7 +209,7 @@ def _solutions(few: _Side, many: _Side) -> list[Solution]:
     """All placements that bring more than half of the smaller set's marks together and at most `FEWER` less than the
     best, which comes first."""
     n = len(few.places)
-    least = max(LEAST_PAIRS, n // 2 + 1)
+    least = max(LEAST_MARKS, n // 2 + 1)
     # pairs of which every set of more than half of the marks holds one: disjoint ones, the longest first, and of an odd
     # number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []
