@@ -25,11 +25,12 @@ BOARD_FRAME = "board"
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_camera_board`` (4, 4) is the true pose."""
+    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4): where the camera stands in
+    the board's frame."""
 
     name: str
     source: FrameSource
-    T_camera_board: np.ndarray
+    T_board_camera: np.ndarray
     n_frames: int
     frames_per_second: float
     start_ns: int
@@ -40,11 +41,6 @@ class ExportedView:
         lens = self.source.lens
         assert lens is not None, "only simulated cameras are exported, and they have a lens"
         return lens
-
-    @property
-    def T_board_camera(self) -> np.ndarray:
-        """(4, 4): where the camera stands in the board's frame."""
-        return invert(self.T_camera_board)
 
     def stamp_ns(self, frame: int) -> int:
         """Return the time of a frame."""
@@ -74,11 +70,10 @@ def in_turn(
     """Place views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
+    starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
     return tuple(
-        ExportedView(
-            f"view_{number:0{digits}d}", source, pose, n_frames, frames_per_second, START_NS + number * length_ns
-        )
-        for number, (source, pose) in enumerate(zip(sources, poses, strict=True))
+        ExportedView(f"view_{number:0{digits}d}", source, invert(pose), n_frames, frames_per_second, start_ns)
+        for number, (source, pose, start_ns) in enumerate(zip(sources, poses, starts_ns, strict=True))
     )
 
 
@@ -246,7 +241,7 @@ def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, head
     points["rgb"] = red << 16 | green << 8 | blue
     points["intensity"] = frame.amplitude
     field = types["sensor_msgs/msg/PointField"]
-    height, width = points.shape
+    height, width = frame.z_m.shape
     return types["sensor_msgs/msg/PointCloud2"](
         header=header,
         height=height,

@@ -142,7 +142,7 @@ def _write_beside(
                 "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
                 "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
             },
-            "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
+            "damages": [damage.to_row() for damage in truth_of(targets[0], targets[0].pose.T_camera_board)],
             "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
         "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},

@@ -122,7 +122,7 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
         return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
     if all(mark.code is not None for mark in (*reference, *view)):
         return _by_code(reference, view)
-    ours, theirs = _side(reference), _side(view)
+    ours, theirs = _Side(reference), _Side(view)
     swapped = len(view) < len(reference)
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
@@ -162,21 +162,25 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
     problem = ""
     if len(common) < LEAST_MARKS:
-        problem = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view "
-        problem += shown[1]
+        problem = (
+            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+        )
     return Pairing(pairs, problem, notes)
 
 
-@dataclass(frozen=True)
 class _Side:
     """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n), the ``variances`` (n, n) of
     these, and ``worst`` (n,), each place's variance in its worst direction."""
 
-    places: np.ndarray
-    normals: np.ndarray
-    distances: np.ndarray
-    variances: np.ndarray
-    worst: np.ndarray
+    def __init__(self, marks: Sequence[Mark]) -> None:
+        self.places = np.stack([mark.centre_m for mark in marks])
+        self.normals = np.stack([mark.normal for mark in marks])
+        covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
+        apart = self.places[:, None] - self.places[None]
+        self.distances = np.linalg.norm(apart, axis=-1)
+        along = apart / np.maximum(self.distances, 1e-12)[..., None]
+        own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
+        self.variances, self.worst = own + own.T, np.linalg.eigvalsh(covariances)[:, -1]
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of pairs of marks."""
@@ -187,17 +191,6 @@ class _Side:
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
         axes = np.stack([along, np.cross(normal, along), normal], axis=-1)
         return axes, (self.places[i] + self.places[j]) / 2
-
-
-def _side(marks: Sequence[Mark]) -> _Side:
-    places = np.stack([mark.centre_m for mark in marks])
-    covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
-    apart = places[:, None] - places[None]
-    distances = np.linalg.norm(apart, axis=-1)
-    along = apart / np.maximum(distances, 1e-12)[..., None]
-    own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
-    worst = np.linalg.eigvalsh(covariances)[:, -1]
-    return _Side(places, np.stack([mark.normal for mark in marks]), distances, own + own.T, worst)
 
 
 Solution = tuple[tuple[int, ...], np.ndarray, float]

@@ -56,10 +56,8 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         raise UserError("no capture named", legal=LEGAL_FORMATS)
     for path in paths:
         if not path.is_file() and not path.is_dir():
-            what = (
-                "is neither a file nor a folder, but a device or a pipe" if path.exists() else "no such file or folder"
-            )
-            raise UserError(f"{path}: {what}", legal=LEGAL_FORMATS)
+            odd = path.exists() and "is neither a file nor a folder, but a device or a pipe"
+            raise UserError(f"{path}: {odd or 'no such file or folder'}", legal=LEGAL_FORMATS)
     asked = Asked(metres_per_unit(unit) if unit else None, **statements)
     recording = replace(_opened(paths, asked), selection=asked.frames)
     said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)

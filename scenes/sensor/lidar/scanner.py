@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+from scipy import interpolate, linalg
 
 from harness.vocabulary.geometry import MM, Region
 from harness.vocabulary.seeds import random_stream
@@ -160,12 +160,8 @@ def smear_weights(points: float) -> np.ndarray:
     """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time:
     the light is taken as linear between points."""
     reach = int(np.ceil(points / 2))
-
-    def integral(x: float) -> float:  # of the hat max(0, 1 - |x|) from -1 to x
-        x = min(max(x, -1.0), 1.0)
-        return float(0.5 + x - np.sign(x) * x**2 / 2)
-
-    weights = [integral(points / 2 - k) - integral(-points / 2 - k) for k in range(-reach, reach + 1)]
+    hat, half = interpolate.BSpline.basis_element([-1, 0, 1]), points / 2
+    weights = [hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)]
     return np.array(weights) / points
 
 
