@@ -171,7 +171,6 @@ def calibration_text(lens: Lens) -> str:
 # ---------------------------------------------------------------- ROS 2 bags
 
 
-Storage = Literal["sqlite3", "mcap"]
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
@@ -183,15 +182,16 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("in
 FOREVER = (9223372036, 854775807)  # seconds and nanoseconds that ROS 2 writes for an unlimited duration
 
 
-def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
-    """Write one view's bag into ``folder``, which must not exist. MCAP is compressed. Raises OSError as files do."""
+def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
+    """Write one view's bag into ``folder``, which must not exist, as compressed MCAP or as SQLite. Raises OSError as
+    files do."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
     types = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(folder, version=BAG_VERSION, storage_plugin=plugin)
-    if storage == "mcap":
+    if is_mcap:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
     def write(topic: str, stamp_ns: int, message: Any) -> None:

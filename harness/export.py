@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace, given: list[str]) -> int:
         if arguments.format == "tum":
             write_tum(folder, views)
         for view in () if arguments.format == "tum" else views:
-            write_bag(folder / view.name, view, "mcap" if arguments.format == "mcap" else "sqlite3")
+            write_bag(folder / view.name, view, arguments.format == "mcap")
         _write_beside(folder, arguments, experiment, source, targets, views, given)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:

@@ -306,18 +306,11 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
 
 def _r3d_frames(path: Path, size: tuple[int, int], scale_m: float) -> Iterator[Frame]:
     """Yield the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
-    width, height = size
     with _archive(path) as archive:
-
-        def plane(name: str, kind: str) -> np.ndarray:
-            expected = np.dtype(kind).itemsize * width * height
-            unpacked = _lzfse(f"{path}: {name}", _content(path, archive, name), expected)
-            return np.frombuffer(unpacked, kind).reshape(height, width)
-
         for name in _depth_names(archive):
             beside = f"{name.removesuffix('.depth')}.conf"
-            sure = plane(beside, "u1") if beside in archive.namelist() else None
-            yield _frame(f"{path.name} {name}", plane(name, "<f4"), sure, scale_m)
+            sure = _plane(path, archive, beside, "u1", size) if beside in archive.namelist() else None
+            yield _frame(f"{path.name} {name}", _plane(path, archive, name, "<f4", size), sure, scale_m)
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
@@ -337,15 +330,13 @@ def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         return stream.read(TEXT_BYTES)
 
 
-def _lzfse(name: str, packed: bytes, expected: int) -> bytes:
-    """Unpack Apple's LZFSE. Raises UserError where it does not unpack to as many bytes as expected."""
+def _plane(path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
+    """Unpack an entry by Apple's LZFSE as (h, w) numbers. Raises UserError where it does not unpack to as many."""
+    packed = _content(path, archive, name)
     try:
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
-        what = f"{name}: is compressed by LZFSE, and the package that unpacks it is not installed"
+        what = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
         raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
-    with damage_told(f"{name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
-        unpacked: bytes = liblzfse.decompress(packed)
-        if len(unpacked) != expected:
-            raise ValueError(f"{len(unpacked)} bytes, not {expected}")
-    return unpacked
+    with damage_told(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
+        return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

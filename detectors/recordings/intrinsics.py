@@ -23,14 +23,7 @@ DEPTH_MODES: dict[str, Mode] = {
     "WFOV_2X2BINNED": ((512, 512), (0, 0), (512, 512)),
     "WFOV_UNBINNED": ((1024, 1024), (0, 0), (1024, 1024)),
 }
-COLOUR_MODES: tuple[Mode, ...] = (
-    ((1280, 960), (0, 120), (1280, 720)),
-    ((1920, 1440), (0, 180), (1920, 1080)),
-    ((2560, 1920), (0, 240), (2560, 1440)),
-    ((2048, 1536), (0, 0), (2048, 1536)),
-    ((3840, 2880), (0, 360), (3840, 2160)),
-    ((4096, 3072), (0, 0), (4096, 3072)),
-)
+COLOUR_SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (2048, 1536), (3840, 2160), (4096, 3072))
 MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
 OWN_LENS = "record again, or give a lens with --intrinsics FILE"
 
@@ -68,9 +61,9 @@ def depth_mode_of_size(width: int, height: int) -> str | None:
 
 def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
     """Return the colour camera in the mode of this image's size, None without. Raises UserError without a lens."""
-    mode = next((mode for mode in COLOUR_MODES if mode[2] == (width, height)), None)
-    if mode is None:
+    if (width, height) not in COLOUR_SIZES:
         return None
+    rows = width * 3 // 4  # the sensor is 4 : 3, and wider images are its middle
     camera, parameters = _camera(name, cameras, "PhotoVideo")
     if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
         # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
@@ -80,6 +73,7 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
     with damage_told(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
+    mode = ((width, rows), (0, (rows - height) // 2), (width, height))
     return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
 
 
