@@ -6,7 +6,6 @@ import errno
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import FrameSource, Lens, invert
+from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, invert, slopes_of
 
 START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
@@ -26,11 +25,12 @@ BOARD_FRAME = "board"
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_camera_board`` (4, 4) is the true pose."""
+    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4): where the camera stands in
+    the board's frame."""
 
     name: str
     source: FrameSource
-    T_camera_board: np.ndarray
+    T_board_camera: np.ndarray
     n_frames: int
     frames_per_second: float
     start_ns: int
@@ -42,17 +42,13 @@ class ExportedView:
         assert lens is not None, "only simulated cameras are exported, and they have a lens"
         return lens
 
-    @property
-    def T_board_camera(self) -> np.ndarray:
-        """(4, 4): where the camera stands in the board's frame."""
-        return invert(self.T_camera_board)
-
     def stamp_ns(self, frame: int) -> int:
         """Return the time of a frame."""
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
-    def exposures(self) -> Iterator[Exposure]:
-        """Yield the frames, each on the whole sensor: no range, black and no amplitude outside the simulated region."""
+    def exposures(self) -> Iterator[tuple[int, Frame]]:
+        """Yield the time of each frame and the frame on the whole sensor, as float32: no range, black and no amplitude
+        outside the simulated region."""
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
@@ -63,23 +59,9 @@ class ExportedView:
         for number, frame in enumerate(self.source.frames()):
             rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
             amplitude = frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
-            yield Exposure(
-                stamp_ns=self.stamp_ns(number),
-                z_m=on_sensor(frame.z_m.astype(np.float32), np.nan),
-                rgb=on_sensor(rgb, 0),
-                amplitude=on_sensor(amplitude.astype(np.float32), np.nan),
-            )
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One frame on the whole sensor: ``z_m`` (h, w) float32, NaN where invalid; ``rgb`` (h, w, 3) uint8; ``amplitude``
-    (h, w) float32; ``stamp_ns`` since the epoch."""
-
-    stamp_ns: int
-    z_m: np.ndarray
-    rgb: np.ndarray
-    amplitude: np.ndarray
+            z_m, amplitude = (on_sensor(each.astype(np.float32), np.nan) for each in (frame.z_m, amplitude))
+            reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
+            yield self.stamp_ns(number), Frame(frame.name, z_m, reason, rgb=on_sensor(rgb, 0), amplitude=amplitude)
 
 
 def in_turn(
@@ -88,11 +70,10 @@ def in_turn(
     """Place views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
+    starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
     return tuple(
-        ExportedView(
-            f"view_{number:0{digits}d}", source, pose, n_frames, frames_per_second, START_NS + number * length_ns
-        )
-        for number, (source, pose) in enumerate(zip(sources, poses, strict=True))
+        ExportedView(f"view_{number:0{digits}d}", source, invert(pose), n_frames, frames_per_second, start_ns)
+        for number, (source, pose, start_ns) in enumerate(zip(sources, poses, starts_ns, strict=True))
     )
 
 
@@ -131,9 +112,10 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
     for view in views:
         pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
         place = " ".join(f"{value:.9g}" for value in pose)
-        for exposure in view.exposures():
-            time = seconds_text(exposure.stamp_ns)
-            for name, picture in (("rgb", exposure.rgb[..., ::-1]), ("depth", depth_units(exposure.z_m))):
+        for stamp_ns, frame in view.exposures():
+            assert frame.rgb is not None
+            time = seconds_text(stamp_ns)
+            for name, picture in (("rgb", frame.rgb[..., ::-1]), ("depth", depth_units(frame.z_m))):
                 coded, content = cv2.imencode(".png", undistorted(lens, np.ascontiguousarray(picture)))
                 assert coded
                 (folder / name / f"{time}.png").write_bytes(content.tobytes())
@@ -189,7 +171,6 @@ def calibration_text(lens: Lens) -> str:
 # ---------------------------------------------------------------- ROS 2 bags
 
 
-Storage = Literal["sqlite3", "mcap"]
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
@@ -201,15 +182,16 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("in
 FOREVER = (9223372036, 854775807)  # seconds and nanoseconds that ROS 2 writes for an unlimited duration
 
 
-def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
-    """Write one view's bag into ``folder``, which must not exist. MCAP is compressed. Raises OSError as files do."""
+def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
+    """Write one view's bag into ``folder``, which must not exist, as compressed MCAP or as SQLite. Raises OSError as
+    files do."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
     types = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(folder, version=BAG_VERSION, storage_plugin=plugin)
-    if storage == "mcap":
+    if is_mcap:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
     def write(topic: str, stamp_ns: int, message: Any) -> None:
@@ -225,36 +207,20 @@ def write_bag(folder: Path, view: ExportedView, storage: Storage) -> None:
                     (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
                 )
             }
-            slopes = _slopes_of(view.lens)
+            slopes = slopes_of(view.lens, view.lens.whole)
             write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
-            for exposure in view.exposures():
-                write(INFO_TOPIC, exposure.stamp_ns, _info_message(types.types, view, exposure.stamp_ns))
-                write(POINTS_TOPIC, exposure.stamp_ns, _cloud_message(types.types, view, exposure, slopes))
+            for stamp_ns, frame in view.exposures():
+                header = _header(types.types, frame_name(view), stamp_ns)
+                write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
+                write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
         # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
 
 
-@lru_cache(maxsize=1)
-def _slopes_of(lens: Lens) -> np.ndarray:
-    """Return (h, w, 2) of the whole sensor: the views of an export share their lens."""
-    return lens.region_slopes(lens.whole)
-
-
 def frame_name(view: ExportedView) -> str:
     """Return the name of a camera's optical frame; each view has its own, so that bags can be played together."""
     return f"{view.name}_depth_optical_frame"
-
-
-def packed_points(exposure: Exposure, slopes: np.ndarray) -> np.ndarray:
-    """Return (h, w) of `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
-    points = np.zeros(exposure.z_m.shape, POINT)
-    x_y = slopes * exposure.z_m[..., None].astype(np.float64)
-    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], exposure.z_m
-    red, green, blue = np.moveaxis(exposure.rgb.astype(np.uint32), -1, 0)
-    points["rgb"] = red << 16 | green << 8 | blue
-    points["intensity"] = exposure.amplitude
-    return points
 
 
 # ---- messages --------------------------------------------------------------------------------------------------------
@@ -265,12 +231,19 @@ def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
     return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
-def _cloud_message(types: dict[str, Any], view: ExportedView, exposure: Exposure, slopes: np.ndarray) -> Any:
-    points = packed_points(exposure, slopes)
+def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, header: Any) -> Any:
+    """The frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
+    assert frame.rgb is not None
+    points = np.zeros(frame.z_m.shape, POINT)
+    x_y = slopes * frame.z_m[..., None].astype(np.float64)
+    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], frame.z_m
+    red, green, blue = np.moveaxis(frame.rgb.astype(np.uint32), -1, 0)
+    points["rgb"] = red << 16 | green << 8 | blue
+    points["intensity"] = frame.amplitude
     field = types["sensor_msgs/msg/PointField"]
-    height, width = points.shape
+    height, width = frame.z_m.shape
     return types["sensor_msgs/msg/PointCloud2"](
-        header=_header(types, frame_name(view), exposure.stamp_ns),
+        header=header,
         height=height,
         width=width,
         fields=[field(name=name, offset=i * 4, datatype=FLOAT32, count=1) for i, name in enumerate(POINT.names or ())],
@@ -282,13 +255,12 @@ def _cloud_message(types: dict[str, Any], view: ExportedView, exposure: Exposure
     )
 
 
-def _info_message(types: dict[str, Any], view: ExportedView, stamp_ns: int) -> Any:
+def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
     """The lens in ROS' terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as the cloud is not rectified."""
-    lens = view.lens
     distorted = any(lens.distortion)
     region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types["sensor_msgs/msg/CameraInfo"](
-        header=_header(types, frame_name(view), stamp_ns),
+        header=header,
         height=lens.height,
         width=lens.width,
         distortion_model="rational_polynomial" if distorted else "plumb_bob",

@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace, given: list[str]) -> int:
         if arguments.format == "tum":
             write_tum(folder, views)
         for view in () if arguments.format == "tum" else views:
-            write_bag(folder / view.name, view, "mcap" if arguments.format == "mcap" else "sqlite3")
+            write_bag(folder / view.name, view, arguments.format == "mcap")
         _write_beside(folder, arguments, experiment, source, targets, views, given)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
@@ -142,7 +142,7 @@ def _write_beside(
                 "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
                 "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
             },
-            "damages": [damage.to_row() for damage in truth_of(targets[0], views[0].T_camera_board)],
+            "damages": [damage.to_row() for damage in truth_of(targets[0], targets[0].pose.T_camera_board)],
             "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
         "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},

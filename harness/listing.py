@@ -346,19 +346,14 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
     return []
 
 
-def files_below(path: Path) -> Iterator[os.DirEntry[str]]:
+def files_below(folder: Path) -> Iterator[Path]:
     """Yield everything below a folder that is no folder; links are not followed."""
-    with contextlib.suppress(OSError), os.scandir(path) as entries:
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                yield from files_below(Path(entry.path))
-            else:
-                yield entry
+    return (Path(inner, name) for inner, _, names in os.walk(folder) for name in names)
 
 
-def _disk_bytes(entry: os.DirEntry[str]) -> int:
+def _disk_bytes(path: Path) -> int:
     with contextlib.suppress(OSError):
-        file = entry.stat(follow_symlinks=False)
+        file = path.lstat()
         return int(getattr(file, "st_blocks", -(-file.st_size // 512)) * 512)
     return 0
 
@@ -456,9 +451,9 @@ def chosen_results(out: Path, name: str) -> list[Path]:
 def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
     """Return the files of a folder of results that tofpod wrote, locks last; with ``journal_only`` the records."""
     found = []
-    for entry in files_below(folder):
+    for path in files_below(folder):
         with contextlib.suppress(OSError):
-            path, file = Path(entry.path), entry.stat(follow_symlinks=False)
+            file = path.lstat()
             *above, name = path.relative_to(folder).parts
             unfinished = UNFINISHED_NAME.fullmatch(name)
             name = name if unfinished is None else unfinished["stem"] + unfinished["suffix"]

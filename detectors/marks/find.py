@@ -71,19 +71,25 @@ class Patch:
 
 @dataclass(frozen=True)
 class Spot:
-    """A mark's place: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``length_m`` and ``breadth_m`` of
-    the rectangle with its second moments, ``pitch_m`` between pixels there, and ``behind_m``: how far its mean lies
-    behind its surroundings, with the standard deviation ``behind_sigma_m``."""
+    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``pitch_m`` between pixels
+    there, and ``behind_m``: how far its mean lies behind its surroundings, with the standard deviation
+    ``behind_sigma_m``. ``sizes_m`` (3,): length and breadth of the rectangle with its second moments, and the mean
+    breadth over the length, which gaps lessen."""
 
+    blob: Blob
     centre_m: np.ndarray
     covariance_m2: np.ndarray
     normal: np.ndarray
     area_m2: float
-    length_m: float
-    breadth_m: float
+    sizes_m: np.ndarray
     pitch_m: float
     behind_m: float
     behind_sigma_m: float
+
+    @property
+    def is_hole(self) -> bool:
+        """True where it lies behind the surface."""
+        return self.behind_m > max(BEHIND_M, BEHIND_SIGMAS * self.behind_sigma_m)
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
@@ -113,11 +119,9 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
     return Patch(a, b, middle[2] + c - a * middle[0] - b * middle[1], max(sigma, LEAST_SCALE_M))
 
 
-def place_spot(
-    cloud: Cloud, pixels: np.ndarray, weights: np.ndarray, grid: np.ndarray, grid_covariance: np.ndarray, patch: Patch
-) -> Spot:
-    """Return a mark's place from its pixels (n,) flat indices of points, ``weights`` (n,) 0..1 of its colour, their
-    positions ``grid`` (n, 2) on a grid of unit step, and the covariance (2, 2) of their centroid there."""
+def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
+    """Return the place of a blob whose surroundings lie on a plane."""
+    pixels, weights = blob.pixels, blob.weights
     points = cloud.points_m.reshape(-1, 3)[pixels]
     own = weights > 0.5
     # the mean height of those points within four scales of the median
@@ -130,16 +134,16 @@ def place_spot(
     on_plane = settled.cut(points, cloud.projection)
     covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
     centre = np.average(on_plane, axis=0, weights=covers)
-    jacobian = np.linalg.lstsq(grid - grid.mean(axis=0), on_plane - centre, rcond=None)[0].T
-    covariance = settled.range_covariance_m2(centre, cloud, pixels[own]) + jacobian @ grid_covariance @ jacobian.T
+    jacobian = np.linalg.lstsq(blob.grid - blob.grid.mean(axis=0), on_plane - centre, rcond=None)[0].T
+    covariance = settled.range_covariance_m2(centre, cloud, pixels[own]) + jacobian @ blob.grid_covariance @ jacobian.T
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
     _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
     # of a flat mark: a hole's own depths differ, which must not excuse it
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
     area, pitch = pixel_area * float(weights.sum()), float(np.sqrt(pixel_area))
-    covariance = (covariance + covariance.T) / 2
-    return Spot(centre, covariance, settled.normal, area, float(major), float(minor), pitch, behind, behind_sigma)
+    covariance, sizes = (covariance + covariance.T) / 2, np.array([major, minor, area / major])
+    return Spot(blob, centre, covariance, settled.normal, area, sizes, pitch, behind, behind_sigma)
 
 
 CORNER_PX = 0.25
@@ -273,50 +277,33 @@ def _standing_out(
     return replace(found, points=own), median
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    """A spot with its pixels. ``share``: of the target's. ``behind``: True where it lies behind the surface.
-    ``sizes_m`` (3,): length, breadth, and the mean breadth over the length, which gaps lessen."""
-
-    blob: Blob
-    spot: Spot
-    share: float
-    behind: bool
-    sizes_m: np.ndarray
-
-
 def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
     """The marks among coloured pixels, in the order of their pixels; ``missing`` says why there are not more."""
-    candidates = []
-    for blob in find_blobs(cloud, inside, coloured):
-        patch = fit_patch(cloud.points_m.reshape(-1, 3)[blob.surroundings])
-        if patch is not None:
-            spot = place_spot(cloud, blob.pixels, blob.weights, blob.grid, blob.grid_covariance, patch)
-            share = float((blob.weights > 0.5).sum()) / int(inside.sum())
-            behind = spot.behind_m > max(BEHIND_M, BEHIND_SIGMAS * spot.behind_sigma_m)
-            sizes_m = np.array([spot.length_m, spot.breadth_m, spot.area_m2 / spot.length_m])
-            candidates.append(_Candidate(blob, spot, share, behind, sizes_m))
-    # groups of one colour, each candidate compared with the first of its group
-    colours: list[list[_Candidate]] = []
-    for candidate in sorted(candidates, key=lambda c: (-c.spot.area_m2, int(c.blob.pixels[0]))):
+    points_m, n_target = cloud.points_m.reshape(-1, 3), int(inside.sum())
+    blobs = find_blobs(cloud, inside, coloured)
+    patches = [fit_patch(points_m[blob.surroundings]) for blob in blobs]
+    spots = [place_spot(cloud, blob, patch) for blob, patch in zip(blobs, patches, strict=True) if patch is not None]
+    # groups of one colour, each spot compared with the first of its group
+    colours: list[list[Spot]] = []
+    for spot in sorted(spots, key=lambda s: (-s.area_m2, int(s.blob.pixels[0]))):
         for group in colours:
             contrast = group[0].blob.contrast
-            if np.linalg.norm(candidate.blob.contrast - contrast) < SAME_COLOUR * np.linalg.norm(contrast):
-                group.append(candidate)
+            if np.linalg.norm(spot.blob.contrast - contrast) < SAME_COLOUR * np.linalg.norm(contrast):
+                group.append(spot)
                 break
         else:
-            colours.append([candidate])
+            colours.append([spot])
     groups = []
     for colour in colours:
         # where most of a colour's area lies behind, holes too small to look deep share the colour of those that do
-        flat = [c for c in colour if not c.behind]
-        if flat and 2.0 * sum(c.spot.area_m2 for c in colour if c.behind) <= sum(c.spot.area_m2 for c in colour):
-            whole, usual_m = [c for c in flat if not c.blob.doubt], None
+        flat = [s for s in colour if not s.is_hole]
+        if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(s.area_m2 for s in colour):
+            whole, usual_m = [s for s in flat if not s.blob.doubt], None
             if len(whole) >= 3:
                 # half of the spots' area is in larger ones, so that chips do not count much
-                sizes, areas = np.array([c.sizes_m for c in whole]), [c.spot.area_m2 for c in whole]
+                sizes, areas = np.array([s.sizes_m for s in whole]), [s.area_m2 for s in whole]
                 usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
-            groups.append((float(np.linalg.norm(flat[0].blob.contrast)), [_mark(c, usual_m) for c in flat]))
+            groups.append((float(np.linalg.norm(flat[0].blob.contrast)), [_mark(s, usual_m, n_target) for s in flat]))
     enough = [vivid for vivid, found in groups if sum(not mark.doubt for mark in found) >= LEAST_MARKS]
     marks = []
     for vivid, found in groups:
@@ -328,27 +315,26 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     notes = []
-    if holes := len(candidates) - len(marks):
+    if holes := len(spots) - len(marks):
         notes.append(f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks")
     if not cloud.organised:
         notes.append("a cloud without a pixel grid does not tell whether a mark is cut")
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), tuple(notes))
 
 
-def _mark(candidate: _Candidate, usual_m: np.ndarray | None) -> Mark:
-    """The candidate as a mark, with its doubt; ``usual_m`` (3,): the sizes of its like."""
-    spot, blob, sizes_m = candidate.spot, candidate.blob, candidate.sizes_m
-    doubt = blob.doubt
+def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
+    """The spot as a mark, with its doubt; ``usual_m`` (3,): sizes of its like; ``n_target``: pixels of the target."""
+    doubt, sizes_m = spot.blob.doubt, spot.sizes_m
+    pixels = spot.blob.pixels[spot.blob.weights > 0.5]
     if doubt:
         pass
-    elif candidate.share > LARGEST_SHARE:
-        doubt = f"{100 * candidate.share:.0f} % of the target: a part of it rather than a mark"
-    elif -spot.behind_m > max(RAISED_SHARE * spot.breadth_m, BEHIND_SIGMAS * spot.behind_sigma_m):
+    elif (share := len(pixels) / n_target) > LARGEST_SHARE:
+        doubt = f"{100 * share:.0f} % of the target: a part of it rather than a mark"
+    elif -spot.behind_m > max(RAISED_SHARE * sizes_m[1], BEHIND_SIGMAS * spot.behind_sigma_m):
         doubt = f"it stands {-spot.behind_m / MM:.0f} mm before the surface"
     elif usual_m is not None:
         unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
         (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
         if unlike.any():
             doubt = f"unlike the others: {length:.0f} x {breadth:.0f} mm, they {usual_length:.0f} x {usual_breadth:.0f}"
-    pixels = blob.pixels[blob.weights > 0.5]
     return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)

@@ -18,7 +18,7 @@ from itertools import combinations
 
 import numpy as np
 
-from detectors.marks.mark import Mark
+from detectors.marks.mark import LEAST_MARKS, Mark
 from detectors.registration.registered import displacement_jacobian, moved_by
 from harness.vocabulary.geometry import MM, invert, transform_points
 
@@ -94,7 +94,6 @@ DISTANCE_SIGMAS = 4.0
 """A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
 """Limit of chi^2 of a matched mark's place, three degrees of freedom: a true one is lost once in 10,000."""
-LEAST_PAIRS = 3
 GUESS_SIGMA_M = 50 * MM
 """Error of the guess at marks, root mean square: five degrees over half a metre, and some centimetres."""
 PAIR_WORTH = 3.0
@@ -119,15 +118,15 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     """Match the marks of two views; the guess is used only to choose between placements that fit. The placement is
     chosen that the number of its pairs, their fit and the guess favour, if clearly."""
     counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
-    if min(len(reference), len(view)) < LEAST_PAIRS:
-        return Pairing(NO_PAIRS, f"{counts}, {LEAST_PAIRS} needed in each")
+    if min(len(reference), len(view)) < LEAST_MARKS:
+        return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
     if all(mark.code is not None for mark in (*reference, *view)):
         return _by_code(reference, view)
-    ours, theirs = _side(reference), _side(view)
+    ours, theirs = _Side(reference), _Side(view)
     swapped = len(view) < len(reference)
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
-        least = max(LEAST_PAIRS, min(len(reference), len(view)) // 2 + 1)
+        least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
         return Pairing(
             NO_PAIRS,
             f"the distances between the marks fit nowhere: of {counts} no {least} lie alike; other targets, or other"
@@ -162,22 +161,26 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
     problem = ""
-    if len(common) < LEAST_PAIRS:
-        problem = f"{len(common)} codes in common, {LEAST_PAIRS} needed: the reference shows {shown[0]}, the view "
-        problem += shown[1]
+    if len(common) < LEAST_MARKS:
+        problem = (
+            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+        )
     return Pairing(pairs, problem, notes)
 
 
-@dataclass(frozen=True)
 class _Side:
     """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n), the ``variances`` (n, n) of
     these, and ``worst`` (n,), each place's variance in its worst direction."""
 
-    places: np.ndarray
-    normals: np.ndarray
-    distances: np.ndarray
-    variances: np.ndarray
-    worst: np.ndarray
+    def __init__(self, marks: Sequence[Mark]) -> None:
+        self.places = np.stack([mark.centre_m for mark in marks])
+        self.normals = np.stack([mark.normal for mark in marks])
+        covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
+        apart = self.places[:, None] - self.places[None]
+        self.distances = np.linalg.norm(apart, axis=-1)
+        along = apart / np.maximum(self.distances, 1e-12)[..., None]
+        own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
+        self.variances, self.worst = own + own.T, np.linalg.eigvalsh(covariances)[:, -1]
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of pairs of marks."""
@@ -190,17 +193,6 @@ class _Side:
         return axes, (self.places[i] + self.places[j]) / 2
 
 
-def _side(marks: Sequence[Mark]) -> _Side:
-    places = np.stack([mark.centre_m for mark in marks])
-    covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
-    apart = places[:, None] - places[None]
-    distances = np.linalg.norm(apart, axis=-1)
-    along = apart / np.maximum(distances, 1e-12)[..., None]
-    own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
-    worst = np.linalg.eigvalsh(covariances)[:, -1]
-    return _Side(places, np.stack([mark.normal for mark in marks]), distances, own + own.T, worst)
-
-
 Solution = tuple[tuple[int, ...], np.ndarray, float]
 """The mark in the larger set of each in the smaller, -1 for none; (4, 4) larger from smaller; and the mean square
 of the pairs' distances, in units of their worst variance."""
@@ -210,7 +202,7 @@ def _solutions(few: _Side, many: _Side) -> list[Solution]:
     """All placements that bring more than half of the smaller set's marks together and at most `FEWER` less than the
     best, which comes first."""
     n = len(few.places)
-    least = max(LEAST_PAIRS, n // 2 + 1)
+    least = max(LEAST_MARKS, n // 2 + 1)
     # pairs of which every set of more than half of the marks holds one: disjoint ones, the longest first, and of an odd
     # number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
-from detectors.recordings.intrinsics import lens_beside, lens_for
+from detectors.recordings.intrinsics import lens_for
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
@@ -204,9 +204,8 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
-        own = partial(lens_beside, [path.parent], width, height)
         hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(str(path), asked, width, height, own, hint)
+        lens, files = lens_for(str(path), asked, width, height, beside=[path.parent], hint=hint)
     scale_m = asked.scale_m or default_metres(distances.dtype)
     read = partial(_frames, path, load, asked, scale_m)
     is_whole = distances.dtype.kind in "iu"

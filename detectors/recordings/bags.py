@@ -10,21 +10,21 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
-from functools import partial
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told, slopes_of
+from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Frame, Lens
+from harness.vocabulary.geometry import Frame, Lens, slopes_of
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Ros1Reader
@@ -37,14 +37,17 @@ LEGAL_BAG = "a ROS 2 bag (its folder with metadata.yaml, one .db3 or one .mcap) 
 MAX_MESSAGE_BYTES = 2**28  # 256 MiB: a cloud of four million points with 64 bytes each
 
 
-class Bag(NamedTuple):
-    """``files`` hold the messages, in order; ``packed``: each message is compressed by itself (zstd)."""
+@dataclass(frozen=True)
+class Bag:
+    """The bag that ``path`` names. ``files`` hold the messages, in order; ``packed``: each message is compressed by
+    itself (zstd)."""
 
-    name: str
+    path: Path
     files: tuple[Path, ...]
     metadata: Path | None = None
     packed: bool = False
 
+    @cached_property
     def topics(self) -> dict[str, str]:
         """Return topic to message type, sorted; of a topic with several types the last."""
         found: dict[str, str] = {}
@@ -76,7 +79,7 @@ class Bag(NamedTuple):
                 wanted = [connection for connection in reader.connections if connection.topic == topic]
                 found = reader.messages(wanted) if wanted else iter(())
                 while True:
-                    name = f"{self.name} {topic} message {number}"
+                    name = f"{self.path.name} {topic} message {number}"
                     with _readable(file):
                         item = next(found, None)
                         if item is None:
@@ -106,7 +109,7 @@ def is_bag(path: Path) -> bool:
 def find_bag(path: Path) -> Bag:
     """Return a folder or file as a bag. Raises UserError where its description or one of its files is missing."""
     if path.is_file():
-        return Bag(path.name, (path,))
+        return Bag(path, (path,))
     metadata = path / METADATA
     if not metadata.is_file():
         held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
@@ -127,7 +130,7 @@ def find_bag(path: Path) -> Bag:
     if absent or not files:
         what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is not there, or of no kind that is read"
         raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
-    return Bag(path.name, files, metadata, packed=mode == "message")
+    return Bag(path, files, metadata, packed=mode == "message")
 
 
 def _holds_messages(path: Path) -> bool:
@@ -148,10 +151,8 @@ def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
     with _readable(file):
         reader = Ros1Reader(file) if file.suffix.lower() == ROS1_SUFFIX else Reader(file)
         reader.open()
-    try:
+    with closing(reader):
         yield reader
-    finally:
-        reader.close()
 
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -164,18 +165,14 @@ NOT_DEPTH = re.compile(r"(^|[/_])(ir|infra\w*|confidence|amplitude|intensity|ref
 RAY_TOLERANCE_PX = 0.01
 """A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
 
-Topics = dict[str, str]  # topic to message type
-
 
 def open_bag(path: Path, asked: Asked) -> Recording:
     """Open a bag's depth images or clouds. Raises UserError where it is broken or empty, or a lens does not fit."""
     bag = find_bag(path)
-    topics = bag.topics()
-    chosen, note = _chosen_topic(path, bag, topics, asked)
+    chosen, note = _chosen_topic(bag, asked)
     if bag.first(chosen) is None:
         raise UserError(f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again")
-    opened = _open_clouds if topics[chosen] == CLOUD_TYPE else _open_images
-    recording = opened(path, bag, topics, chosen, asked)
+    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(bag, chosen, asked)
     files = (*bag.files, *filter(None, (bag.metadata, asked.intrinsics)))
     return replace(recording, files=files, notes=(note, *recording.notes))
 
@@ -187,7 +184,7 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
         yield replace(frame, xy_m=None) if by_lens else frame
 
 
-def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
+def _open_clouds(bag: Bag, topic: str, asked: Asked) -> Recording:
     scale_m = asked.scale_m or UNITS_M["m"]
     first = next(_frames(bag, topic, scale_m, by_lens=False))
     height, width = first.z_m.shape
@@ -196,16 +193,15 @@ def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
     if lens is not None:
         if (lens.height, lens.width) != (height, width):
             what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
-            raise UserError(f"{path}: {what}")
+            raise UserError(f"{bag.path}: {what}")
         if (off := _off_ray_px(lens, first)) > RAY_TOLERANCE_PX:
-            raise UserError(
-                f"{path}: the named lens is not that of these points: they lie up to {off:.2g} pixels beside its rays",
-                fix="leave --intrinsics out: the points are used as they stand",
-            )
+            what = f"the named lens is not that of these points: they lie up to {off:.2g} pixels beside its rays"
+            fix = "leave --intrinsics out: the points are used as they stand"
+            raise UserError(f"{bag.path}: {what}", fix=fix)
     elif height == 1:
         note = NO_GRID
     else:
-        messages = (bag.first(name) for name, kind in topics.items() if kind == INFO_TYPE)
+        messages = (bag.first(name) for name, kind in bag.topics.items() if kind == INFO_TYPE)
         found = (lens_of_info(message, (height, width)) for message in messages if message is not None)
         fitting = (each for each in found if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX)
         lens = next(fitting, None)
@@ -213,22 +209,19 @@ def _open_clouds(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
             note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
     read, unit_from = partial(_frames, bag, topic, scale_m, lens is not None), "ROS, whose clouds are in metres"
     more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
-    return Recording.begun(bag.name, read, scale_m, **more)
+    return Recording.begun(bag.path.name, read, scale_m, **more)
 
 
-def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked) -> Recording:
+def _open_images(bag: Bag, topic: str, asked: Asked) -> Recording:
     name, message = next(bag.messages(topic))
     stored = stored_depth(name, message)
     height, width = stored.shape
     is_whole = stored.dtype.kind == "u"
-
-    def own() -> tuple[Lens, None]:
-        return _lens_of_images(path, bag, topics, topic, (height, width)), None
-
-    lens, _ = lens_for(str(path), asked, width, height, own)
+    own = partial(_lens_of_images, bag, topic, (height, width))
+    lens, _ = lens_for(str(bag.path), asked, width, height, own)
     scale_m = asked.scale_m
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
-    for name, kind in topics.items():
+    for name, kind in bag.topics.items():
         # RealSense's viewer states the unit beside a sensor's streams
         sensor, _, option = name.partition("/option/")
         is_stated = kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/")
@@ -239,13 +232,14 @@ def _open_images(path: Path, bag: Bag, topics: Topics, topic: str, asked: Asked)
                 scale_m, unit_from = float(f"{message.data:.6g}"), name
     scale_m = scale_m or default_metres(stored.dtype)
     read = partial(_frames, bag, topic, scale_m, by_lens=False)
-    return Recording.begun(bag.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
+    return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
 
 
-def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[str, str]:
+def _chosen_topic(bag: Bag, asked: Asked) -> tuple[str, str]:
     """Return the topic to read, and what the user should know of the others."""
+    path, topics = bag.path, bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
-    images = _depth_topics(bag, topics)
+    images = _depth_topics(bag)
     both = ", ".join([*clouds, *images])
     held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
@@ -258,7 +252,7 @@ def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[s
         return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
     has_lens = bool(asked.intrinsics or asked.lens)
-    if len(images) == 1 and (not clouds or has_lens or _infos_of(topics, images[0])):
+    if len(images) == 1 and (not clouds or has_lens or _infos_of(bag, images[0])):
         others = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
         return images[0], f"the depth images on {images[0]} are read{others}" if clouds else ""
     if len(usual) == 1:
@@ -270,16 +264,16 @@ def _chosen_topic(path: Path, bag: Bag, topics: Topics, asked: Asked) -> tuple[s
             legal=kinds,
             fix="record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info",
         )
-    own = next((topic for topic in images if _infos_of(topics, topic)), "")
+    own = next((topic for topic in images if _infos_of(bag, topic)), "")
     found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
     fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
     raise UserError(f"{path}: {found}", legal=both, fix=fix)
 
 
-def _depth_topics(bag: Bag, topics: Topics) -> list[str]:
+def _depth_topics(bag: Bag) -> list[str]:
     """Return the topics whose first picture may be depth; 16-bit grey only under such a name, no copies."""
     found = []
-    for topic in (name for name, kind in topics.items() if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)):
+    for topic in (name for name, kind in bag.topics.items() if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)):
         message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
@@ -291,19 +285,19 @@ def _of_pictures(topic: str) -> str:
     return topic.removesuffix("/compressedDepth").removesuffix("/compressed")
 
 
-def _infos_of(topics: Topics, topic: str) -> list[str]:
+def _infos_of(bag: Bag, topic: str) -> list[str]:
     """Return the CameraInfo topics that belong to a picture by name."""
     folder = _of_pictures(topic).rpartition("/")[0]
     names = (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info", f"{topic}/camera_info")
-    return [name for name in names if topics.get(name) == INFO_TYPE]
+    return [name for name in names if bag.topics.get(name) == INFO_TYPE]
 
 
-def _lens_of_images(path: Path, bag: Bag, topics: Topics, topic: str, shape: tuple[int, ...]) -> Lens:
+def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
     """Return the lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
-    every = [name for name, kind in topics.items() if kind == INFO_TYPE]
+    every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
-    for info in _infos_of(topics, topic) or (every if len(every) == 1 else []):
+    for info in _infos_of(bag, topic) or (every if len(every) == 1 else []):
         message = bag.first(info)
         lens = "is empty" if message is None else lens_of_info(message, shape, is_rectified)
         if isinstance(lens, Lens):
@@ -311,7 +305,7 @@ def _lens_of_images(path: Path, bag: Bag, topics: Topics, topic: str, shape: tup
         why.append(f"{info} {lens}")
     told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
     raise UserError(
-        f"{path}: {told}: nothing says which lens took these depth images, and without it they are no points",
+        f"{bag.path}: {told}: nothing says which lens took these depth images, and without it they are no points",
         legal=LEGAL_LENS,
         fix=f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}",
     )

@@ -12,15 +12,17 @@ import io
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
-from detectors.recordings.distances import UNITS_M, frame_of, rounding_step_m
-from detectors.recordings.intrinsics import lens_beside, lens_for
+from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.intrinsics import lens_for
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
@@ -88,7 +90,7 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
-    is_tum = (folder / "depth.txt").is_file() or (folder.parent / "depth.txt").is_file()
+    is_tum = any((place / "depth.txt").is_file() for place in (folder, folder.parent))
 
     colour_folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
     beside = (path for path in root.iterdir() if re.search("colou?r|rgb", path.stem.lower()) and path not in depths)
@@ -105,53 +107,41 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     if pictures and (None in colours or len(pictures) != len(depths)):
         without = f"{colours.count(None)} depth pictures have no colour"
         note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
-    return _open(folder.name, depths, asked, root, colours, is_tum, note)
+    return open_depth_list(depths, asked, folder.name, root, colours, is_tum, note)
 
 
-def open_depth_list(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
-    """Open depth PNGs in the order given. Raises UserError where their lens is not known."""
-    return _open(name, tuple(paths), asked, paths[0].parent, [None] * len(paths), False, "")
-
-
-def _open(
-    name: str,
-    depths: tuple[Path, ...],
+def open_depth_list(
+    depths: Sequence[Path],
     asked: Asked,
-    root: Path,
-    colours: Sequence[Path | None],
-    is_tum: bool,
-    note: str,
+    name: str,
+    root: Path | None = None,
+    colours: Sequence[Path | None] = (),
+    is_tum: bool = False,
+    note: str = "",
 ) -> Recording:
+    """Open depth PNGs in the order given. ``root``: folder of the capture, beside or in which their lens is looked for;
+    ``colours``: the colour picture of each, if any. Raises UserError where their lens is not known."""
+    root = root or depths[0].parent
     width, height = _depth_size(depths[0])
-    own = partial(lens_beside, (root, depths[0].parent, root.parent), width, height)
-    lens, lens_files = lens_for(str(root), asked, width, height, own)
+    lens, lens_files = lens_for(str(root), asked, width, height, beside=(root, depths[0].parent, root.parent))
     notes = [note]
     first = next((path for path in colours if path), None)
     if first is not None and (found := _colour(first).shape)[:2] != (height, width):
-        colours = [None] * len(colours)
+        colours = ()
         notes = [f"colour pictures of {found[1]} x {found[0]} pixels do not lie on the depth pixels and are not used"]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are taken as undistorted")
     scale_m = asked.scale_m or UNITS_M["tum" if is_tum else "mm"]
-    step_m = scale_m
-    if scale_m == UNITS_M["tum"]:  # its unit of 0.2 mm is finer than the steps of most cameras
-        step_m = rounding_step_m(next(_frames(depths, (None,), scale_m)).z_m) or scale_m
-    return Recording(
-        name=name,
-        read=partial(_frames, depths, tuple(colours), scale_m),
-        shape=(height, width),
-        scale_m=scale_m,
-        z_step_m=step_m,
-        files=(*depths, *filter(None, colours), *lens_files),
-        lens=lens,
-        notes=tuple(notes),
-        unit_from="depth.txt, which marks TUM RGB-D" if is_tum else "",
-    )
+    is_whole = scale_m != UNITS_M["tum"]  # its unit of 0.2 mm is finer than the steps of most cameras
+    files, unit_from = (*depths, *filter(None, colours), *lens_files), "depth.txt, which marks TUM RGB-D" * is_tum
+    more = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}
+    recording = Recording.begun(name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **more)
+    return replace(recording, z_step_m=recording.z_step_m or scale_m)
 
 
-def _frames(depths: tuple[Path, ...], colours: tuple[Path | None, ...], scale_m: float) -> Iterator[Frame]:
+def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float) -> Iterator[Frame]:
     """Yield a frame a file. Raises UserError where a file is missing, truncated or not 16-bit grey."""
-    for depth, colour in zip(depths, colours, strict=False):
+    for depth, colour in zip_longest(depths, colours):
         rgb = _colour(colour) if colour else None
         yield frame_of(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), scale_m, rgb)
 

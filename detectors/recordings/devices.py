@@ -29,10 +29,10 @@ from detectors.recordings.intrinsics import (
     lens_for,
     parse_calibration,
 )
-from detectors.recordings.recording import Asked, Recording, damage_told, slopes_of
+from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import FRAME_PIXELS, TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels, strict_json
-from harness.vocabulary.geometry import Frame, Lens, transform_points
+from harness.vocabulary.geometry import Frame, Lens, slopes_of, transform_points
 
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
@@ -59,9 +59,9 @@ def open_mkv(path: Path, asked: Asked) -> Recording:
         calibration = bytes(attached[0].data) if attached else None
     cameras = None if calibration is None else parse_calibration(f"{path} (calibration.json)", calibration)
 
-    def own() -> tuple[Lens | None, None]:
+    def own() -> Lens | None:
         mode = stated or depth_mode_of_size(width, height) or "(not stated)"
-        return None if cameras is None else depth_lens(str(path), cameras, mode), None
+        return None if cameras is None else depth_lens(str(path), cameras, mode)
 
     lens, lens_files = lens_for(str(path), asked, width, height, own)
     colour = colour_camera(str(path), cameras, *sizes["COLOR"]) if cameras is not None and "COLOR" in sizes else None
@@ -177,7 +177,7 @@ def _recording(
     asked: Asked,
     read: Callable[[], Iterator[Frame]],
     size: tuple[int, int],
-    scaled_lens: Callable[[], tuple[Lens, None]],
+    scaled_lens: Callable[[], Lens],
     files: tuple[Path, ...],
     poses: tuple[np.ndarray, np.ndarray, str],
     scale_m: float,
@@ -201,7 +201,7 @@ def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m
     return frame_of(name, stored, scale_m)
 
 
-def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> tuple[Lens, None]:
+def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> Lens:
     """Scale the lens of a colour picture to the depth picture of the same view."""
     across, down = size[0] / max(colour[0], 1), size[1] / max(colour[1], 1)
     fx, fy, cx, cy = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
@@ -210,7 +210,7 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
         what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is no lens of {size} pixels"
         raise UserError(f"{name}: {what}", fix="pass --intrinsics FILE with the lens of the depth pictures")
     # positions count from the first pixel's centre
-    return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5), None
+    return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
 
 
 def _motion_warnings(
@@ -248,7 +248,7 @@ def open_stray(folder: Path, asked: Asked) -> Recording:
     scale_m = asked.scale_m or UNITS_M["mm"]
     matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
 
-    def scaled_lens() -> tuple[Lens, None]:
+    def scaled_lens() -> Lens:
         k = _table(matrix)
         if k.shape != (3, 3):
             raise UserError(f"{matrix}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
@@ -306,18 +306,11 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
 
 def _r3d_frames(path: Path, size: tuple[int, int], scale_m: float) -> Iterator[Frame]:
     """Yield the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
-    width, height = size
     with _archive(path) as archive:
-
-        def plane(name: str, kind: str) -> np.ndarray:
-            expected = np.dtype(kind).itemsize * width * height
-            unpacked = _lzfse(f"{path}: {name}", _content(path, archive, name), expected)
-            return np.frombuffer(unpacked, kind).reshape(height, width)
-
         for name in _depth_names(archive):
             beside = f"{name.removesuffix('.depth')}.conf"
-            sure = plane(beside, "u1") if beside in archive.namelist() else None
-            yield _frame(f"{path.name} {name}", plane(name, "<f4"), sure, scale_m)
+            sure = _plane(path, archive, beside, "u1", size) if beside in archive.namelist() else None
+            yield _frame(f"{path.name} {name}", _plane(path, archive, name, "<f4", size), sure, scale_m)
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
@@ -337,15 +330,13 @@ def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         return stream.read(TEXT_BYTES)
 
 
-def _lzfse(name: str, packed: bytes, expected: int) -> bytes:
-    """Unpack Apple's LZFSE. Raises UserError where it does not unpack to as many bytes as expected."""
+def _plane(path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
+    """Unpack an entry by Apple's LZFSE as (h, w) numbers. Raises UserError where it does not unpack to as many."""
+    packed = _content(path, archive, name)
     try:
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
-        what = f"{name}: is compressed by LZFSE, and the package that unpacks it is not installed"
+        what = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
         raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
-    with damage_told(f"{name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
-        unpacked: bytes = liblzfse.decompress(packed)
-        if len(unpacked) != expected:
-            raise ValueError(f"{len(unpacked)} bytes, not {expected}")
-    return unpacked
+    with damage_told(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
+        return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

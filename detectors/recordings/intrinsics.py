@@ -23,14 +23,7 @@ DEPTH_MODES: dict[str, Mode] = {
     "WFOV_2X2BINNED": ((512, 512), (0, 0), (512, 512)),
     "WFOV_UNBINNED": ((1024, 1024), (0, 0), (1024, 1024)),
 }
-COLOUR_MODES: tuple[Mode, ...] = (
-    ((1280, 960), (0, 120), (1280, 720)),
-    ((1920, 1440), (0, 180), (1920, 1080)),
-    ((2560, 1920), (0, 240), (2560, 1440)),
-    ((2048, 1536), (0, 0), (2048, 1536)),
-    ((3840, 2880), (0, 360), (3840, 2160)),
-    ((4096, 3072), (0, 0), (4096, 3072)),
-)
+COLOUR_SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (2048, 1536), (3840, 2160), (4096, 3072))
 MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
 OWN_LENS = "record again, or give a lens with --intrinsics FILE"
 
@@ -68,9 +61,9 @@ def depth_mode_of_size(width: int, height: int) -> str | None:
 
 def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
     """Return the colour camera in the mode of this image's size, None without. Raises UserError without a lens."""
-    mode = next((mode for mode in COLOUR_MODES if mode[2] == (width, height)), None)
-    if mode is None:
+    if (width, height) not in COLOUR_SIZES:
         return None
+    rows = width * 3 // 4  # the sensor is 4 : 3, and wider images are its middle
     camera, parameters = _camera(name, cameras, "PhotoVideo")
     if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
         # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
@@ -80,6 +73,7 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
     with damage_told(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
+    mode = ((width, rows), (0, (rows - height) // 2), (width, height))
     return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
 
 
@@ -120,20 +114,27 @@ DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
 
-Own = Callable[[], tuple[Lens | None, Path | None]]
-"""Finds the lens that comes with a capture, and the file that it was read from, where it has one of its own."""
-
 
 def lens_for(
-    name: str, asked: Asked, width: int, height: int, own: Own, hint: str = ""
+    name: str,
+    asked: Asked,
+    width: int,
+    height: int,
+    own: Callable[[], Lens | None] = lambda: None,
+    beside: Sequence[Path] = (),
+    hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
-    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, or ``own``. Raises
-    UserError where nobody states a lens (``hint`` ends its advice), or the one stated is of other images."""
+    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
+    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
+    (``hint`` ends its advice), or the one stated is of other images."""
     lens, file = asked.lens, asked.intrinsics
+    if lens is None and file is None:
+        lens = own()
+        suffixes = (".json", ".yaml", ".yml")
+        named = (folder / f"{stem}{suffix}" for folder in beside for stem in FOUND_BESIDE for suffix in suffixes)
+        file = next(filter(Path.is_file, named), None)
     if file is not None:
         lens = read_lens(file, width, height)
-    elif lens is None:
-        lens, file = own()
     if lens is None:
         raise UserError(
             f"{name}: nothing says which lens took these depth images, and without it they are no points",
@@ -152,15 +153,6 @@ def lens_for(
         fix="pass --intrinsics FILE with the lens of these images"
         + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
     )
-
-
-def lens_beside(folders: Sequence[Path], width: int, height: int) -> tuple[Lens | None, Path | None]:
-    """Read the first file in ``folders`` that is named like a lens. Raises UserError as `read_lens` does."""
-    for folder in folders:
-        for path in (folder / f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")):
-            if path.is_file():
-                return read_lens(path, width, height), path
-    return None, None
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:

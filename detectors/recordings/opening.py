@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from detectors.recordings.arrays import LOADERS, open_arrays, raw_layout_of
-from detectors.recordings.bags import ROS1_SUFFIX, is_bag, open_bag
+from detectors.recordings.bags import BAG_SUFFIXES, ROS1_SUFFIX, is_bag, open_bag
 from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
 from detectors.recordings.depth_images import open_depth_folder, open_depth_list, png_kind, png_texts
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
@@ -27,8 +27,16 @@ LEGAL_FORMATS = (
     ".db3, .bag); one .npy, .npz, .mat, .mkv or .r3d file; a Stray Scanner folder; with --pitch a height map; with "
     "--raw a file of bare numbers"
 )
-LISTS = {(".png",): open_depth_list, CLOUDS: open_clouds, POINT_LISTS: open_clouds}
-"""Suffixes of files of which several, all of one suffix, are one capture."""
+FILES: dict[str, Callable[[Path, Asked], Recording]] = {
+    **dict.fromkeys(LOADERS, open_arrays),
+    **dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag),
+    ".mkv": open_mkv,
+    ".r3d": open_r3d,
+}  # suffixes of files of which each is a capture
+LISTS: dict[str, Callable[[Sequence[Path], Asked, str], Recording]] = {
+    ".png": open_depth_list,
+    **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds),
+}  # suffixes of files of which several, all of one suffix, are one capture
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
@@ -48,10 +56,8 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         raise UserError("no capture named", legal=LEGAL_FORMATS)
     for path in paths:
         if not path.is_file() and not path.is_dir():
-            what = (
-                "is neither a file nor a folder, but a device or a pipe" if path.exists() else "no such file or folder"
-            )
-            raise UserError(f"{path}: {what}", legal=LEGAL_FORMATS)
+            odd = path.exists() and "is neither a file nor a folder, but a device or a pipe"
+            raise UserError(f"{path}: {odd or 'no such file or folder'}", legal=LEGAL_FORMATS)
     asked = Asked(metres_per_unit(unit) if unit else None, **statements)
     recording = replace(_opened(paths, asked), selection=asked.frames)
     said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
@@ -103,31 +109,26 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
 def _opened(paths: list[Path], asked: Asked) -> Recording:
     """Open a capture by the first format that its paths fit."""
     path, is_single = paths[0], len(paths) == 1
-    suffixes = {each.suffix.lower() for each in paths if each.is_file()}
-    is_ros = is_single and is_bag(path) and asked.raw is None
-    if asked.topic is not None and not is_ros:
+    suffix, *others = {each.suffix.lower() for each in paths}
+    opener: Callable[[Path, Asked], Recording] | None = None
+    if is_single and path.is_dir():
+        opener = open_bag if is_bag(path) and asked.raw is None else _open_folder
+    elif is_single:
+        opener = open_arrays if asked.raw is not None else FILES.get(suffix)
+    if asked.topic is not None and opener is not open_bag:
         raise UserError(f"{path}: is no ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
-    if not is_ros and is_single and path.is_file() and (asked.raw is not None or suffixes <= set(LOADERS)):
-        return open_arrays(path, asked)
     unused = next((name for name in ("array", "pitch", "raw") if getattr(asked, name) is not None), None)
-    if unused:
+    if unused and opener is not open_arrays:
         legal = f"{', '.join(LOADERS)}, or bare numbers with --raw"
         raise UserError(f"{path}: --{unused} is for files of arrays", legal=legal, fix=f"leave out --{unused}")
-    if is_ros:
-        return open_bag(path, asked)
-    if is_single and path.is_dir():
-        return _open_folder(path, asked)
+    if opener is not None:
+        return opener(path, asked)
     if any(each.is_dir() for each in paths):
         raise UserError(f"{len(paths)} paths with folders among them", legal=LEGAL_FORMATS, fix="name one folder alone")
-    name = path.name if is_single else f"{path.name} .. {paths[-1].name}"
-    for kind, opener in LISTS.items():
-        if len(suffixes) == 1 and suffixes <= set(kind):
-            return opener(paths, asked, name)
+    if suffix in LISTS and not others:
+        return LISTS[suffix](paths, asked, path.name if is_single else f"{path.name} .. {paths[-1].name}")
     if not is_single:
-        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted(suffixes))}", legal=LEGAL_FORMATS)
-    (suffix,) = suffixes
-    if suffix in (".mkv", ".r3d"):
-        return (open_mkv if suffix == ".mkv" else open_r3d)(path, asked)
+        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *others)))}", legal=LEGAL_FORMATS)
     if suffix in (".bin", ".raw", ".dat"):
         raise raw_layout_of(path)
     fix = CONVERT.get(suffix, "").replace("FILE", str(path)) or None
@@ -149,8 +150,7 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
     if is_depth or (folder / "depth").is_dir():
         return open_depth_folder(folder, asked)
     held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
-    files = (*LOADERS, ".mkv", ".r3d", ROS1_SUFFIX)
-    known = (p.suffix.lower() in files if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
+    known = (p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
     captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]
     what = f"no capture in it; it holds {held}" if held else "is empty"
     fix = f"name {'one of ' * (len(captures) > 1)}{', '.join(map(str, captures[:HELD]))}" if captures else None

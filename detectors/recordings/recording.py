@@ -15,7 +15,7 @@ import numpy as np
 from detectors.recordings.distances import refuse_implausible, rounding_step_m
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import limited_memory
-from harness.vocabulary.geometry import Frame, Lens, Reason, Region
+from harness.vocabulary.geometry import Frame, Lens, Reason, Region, slopes_of
 
 ROUND_TRIP_PX = 0.1
 """A pixel whose ray does not come back to it within this has no direction that the lens model can give."""
@@ -138,14 +138,8 @@ class Recording:
 
 
 @lru_cache(maxsize=2)
-def slopes_of(lens: Lens, region: Region) -> np.ndarray:
-    """Return (h, w, 2) x/z and y/z per pixel, not to be written to: kept, as views of one target share their lens."""
-    return lens.region_slopes(region)
-
-
-@lru_cache(maxsize=2)
 def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
-    """Return the same with NaN where the ray does not come back to its pixel."""
+    """Return `slopes_of` with NaN where the ray does not come back to its pixel."""
     slopes = slopes_of(lens, region)
     if not any(lens.distortion):
         return slopes

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 from typing import Literal, Protocol
 
 import numpy as np
@@ -157,6 +158,12 @@ class OtherLens(Lens):
     def plain(self) -> Lens:
         """The lens alone."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+
+@lru_cache(maxsize=2)
+def slopes_of(lens: Lens, region: Region) -> np.ndarray:
+    """Return (h, w, 2) x/z and y/z per pixel, not to be written to: kept, as views of one target share their lens."""
+    return lens.region_slopes(region)
 
 
 class Reason(IntEnum):

@@ -23,7 +23,7 @@ NO_PEAK = -1e9  # stand-in for the height of a peak that does not exist
 
 
 class Peaks(NamedTuple):
-    """The two strongest peaks of n correlations, the stronger first; all (2, n) float64. ``delay``: in periods, 0..1.
+    """The two strongest peaks of correlations, the stronger first; all (2, ...) float64. ``delay``: in periods, 0..1.
     ``height``: `NO_PEAK` where there is none. ``curvature``: minus the second derivative by angle 2 pi t / T."""
 
     delay: np.ndarray
@@ -32,19 +32,18 @@ class Peaks(NamedTuple):
 
 
 def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
-    """Find peaks of correlations with phasors (K, n) on lines 1..K of the comb and the pulse's ``weights`` (K,)."""
-    lines, n = phasor.shape
-    spectrum = np.empty((n, 2 * lines), np.float32)
-    scaled = (phasor * (weights / weights.sum())[:, None].astype(np.float32)).T
-    spectrum[:, :lines] = scaled.real
-    spectrum[:, lines:] = scaled.imag
+    """Find peaks of correlations with phasors (K, ...) on lines 1..K of the comb and the pulse's ``weights`` (K,)."""
+    lines, *shape = phasor.shape
+    scaled = (phasor.reshape(lines, -1) * (weights / weights.sum())[:, None].astype(np.float32)).T
+    spectrum = np.empty((len(scaled), 2 * lines), np.float32)
+    spectrum[:, :lines], spectrum[:, lines:] = scaled.real, scaled.imag
     # cosines and sines of the lines at the samples of one period, (2 K, M)
     samples = SAMPLES_PER_LINE * lines
     angle = 2 * np.pi * np.outer(np.arange(1, lines + 1), np.arange(samples)) / samples
     waves = np.concatenate([np.cos(angle), np.sin(angle)]).astype(np.float32)
-    out = np.empty((3, 2, n))
+    out = np.empty((3, 2, len(spectrum)))
     _peaks(spectrum @ waves, spectrum, *out)
-    return Peaks(*out)
+    return Peaks(*out.reshape(3, 2, *shape))
 
 
 @numba.njit(**IN_DOUBLE)

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+from scipy import interpolate, linalg
 
 from harness.vocabulary.geometry import MM, Region
 from harness.vocabulary.seeds import random_stream
@@ -107,28 +107,22 @@ class LidarScanner:
         height, half_m, deviation_m = (np.empty((2, h, w)) for _ in range(3))
         metres_per_radian = camera.unambiguous_m / (2 * np.pi)
         for row in range(0, h, BLOCK_ROWS):
-            rows = slice(row, min(row + BLOCK_ROWS, h))
-            block = self._along_sweeps(phasor, rows)
-            peaks = strongest_peaks(block.reshape(len(block), -1), camera.weights)
-            shape = (2, *block.shape[1:])
-            height[:, rows] = peaks.height.reshape(shape) * self.gathered[rows]
-            half_m[:, rows] = peaks.delay.reshape(shape) * camera.unambiguous_m
-            curvature = peaks.curvature.reshape(shape) * self.gathered[rows]
+            rows = slice(row, row + BLOCK_ROWS)
+            peaks = strongest_peaks(self._along_sweeps(phasor, rows), camera.weights)
+            half_m[:, rows] = peaks.delay * camera.unambiguous_m
+            height[:, rows], curvature = (each * self.gathered[rows] for each in (peaks.height, peaks.curvature))
             with np.errstate(divide="ignore", invalid="ignore"):
                 deviation_m[:, rows] = metres_per_radian * self.slope * noise[rows] / curvature
         # where two pulses are about to part the peak is flat; it still lies within their width
         width_m = camera.unambiguous_m * camera.code.correlation_fwhm_ns.value / camera.code.period_ns.value
         return height, half_m, np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
 
-    def _along_sweeps(self, light: np.ndarray, rows: slice | None = None) -> np.ndarray:
+    def _along_sweeps(self, light: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Return light (..., h, w) integrated over the points of a column that one point's time spans."""
-        h = light.shape[-2]
-        first, last = (0, h) if rows is None else (rows.start, rows.stop)
-        reach = len(self.smear) // 2
+        every = np.arange(light.shape[-2])
         total = np.zeros((), light.dtype)
-        for j, weight in enumerate(self.smear):
-            at = np.clip(np.arange(first, last) + j - reach, 0, h - 1)
-            total = total + light.real.dtype.type(weight) * light[..., at, :]
+        for ahead, weight in enumerate(self.smear.astype(light.real.dtype), -(len(self.smear) // 2)):
+            total = total + weight * light[..., np.clip(every[rows] + ahead, 0, every[-1]), :]
         return total
 
     def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
@@ -166,12 +160,8 @@ def smear_weights(points: float) -> np.ndarray:
     """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time:
     the light is taken as linear between points."""
     reach = int(np.ceil(points / 2))
-
-    def integral(x: float) -> float:  # of the hat max(0, 1 - |x|) from -1 to x
-        x = min(max(x, -1.0), 1.0)
-        return float(0.5 + x - np.sign(x) * x**2 / 2)
-
-    weights = [integral(points / 2 - k) - integral(-points / 2 - k) for k in range(-reach, reach + 1)]
+    hat, half = interpolate.BSpline.basis_element([-1, 0, 1]), points / 2
+    weights = [hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)]
     return np.array(weights) / points
 
 
