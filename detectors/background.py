@@ -17,6 +17,7 @@ import cv2
 import numba
 import numpy as np
 
+from detectors.free_form import free_form, picture_places
 from detectors.masks import grown, on_grid
 from detectors.noise import median_of, sigma_of
 from detectors.surface import (
@@ -25,8 +26,6 @@ from detectors.surface import (
     SurfaceConfig,
     bisquare_weights,
     fit_surface,
-    free_form,
-    picture_places,
     polynomial,
     quadric,
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
 import cv2
@@ -41,24 +42,95 @@ CUT_OFF = 0.15
 ENCLOSED, MOST_SAMPLES = 0.9, 20_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
-    """A surface that may be the target. ``outline`` (h, w) bool on the choice's grid: its pixels and what they enclose,
-    but for other candidates before it. ``distance_m``, ``nearest_m``, ``farthest_m``: median, 1st and 99th percentile
-    of z. ``extent_m``: sides of the smallest rectangle around it in its mean plane, longer first. ``share``: part of
-    all pixels. ``weight``: the same, weighted towards the centre, less at a grazing angle. ``cut_off``: part of its
-    outline on the picture's edge."""
+    """A surface that may be the target. ``own``, ``filled`` (h, w) bool on the choice's ``grid``: its pixels, and what
+    they enclose too; ``outline``: the same but for other candidates before it. What describes it is found when asked
+    for."""
 
+    own: np.ndarray
+    filled: np.ndarray
     outline: np.ndarray
-    pixels: int
-    distance_m: float
-    nearest_m: float
-    farthest_m: float
-    extent_m: tuple[float, float]
-    share: float
-    weight: float
-    tilt_deg: float
-    cut_off: float
+    grid: Cloud
+
+    @property
+    def pixels(self) -> int:
+        """Number of its pixels."""
+        return int(np.count_nonzero(self.own))
+
+    @property
+    def share(self) -> float:
+        """Part of all pixels."""
+        return self.pixels / self.own.size
+
+    @property
+    def distance_m(self) -> float:
+        """Median of z."""
+        return float(self._depths_m[1])
+
+    @property
+    def nearest_m(self) -> float:
+        """First percentile of z."""
+        return float(self._depths_m[0])
+
+    @property
+    def farthest_m(self) -> float:
+        """99th percentile of z."""
+        return float(self._depths_m[2])
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between its mean plane and the picture's."""
+        return math.degrees(math.acos(self._facing))
+
+    @cached_property
+    def extent_m(self) -> tuple[float, float]:
+        """Sides of the smallest rectangle around it in its mean plane, longer first, without the outermost
+        hundredth."""
+        plan = self._plane[0] @ self._plane[1][:, 1:]
+        turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
+        along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        low, high = np.quantile(along, (0.005, 0.995), axis=0)
+        short, long = sorted(((high - low) / 0.99).tolist())
+        return long, short
+
+    @cached_property
+    def weight(self) -> float:
+        """Share of pixels weighted by a Gaussian about the picture's centre, less at a grazing angle."""
+        row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in self.own.shape)
+        weighted = float(row @ self.own @ column / (row.sum() * column.sum()))
+        return weighted * min(1.0, (self._facing / GRAZING) ** 2)
+
+    @cached_property
+    def cut_off(self) -> float:
+        """Part of its outline on the picture's edge; without a pixel grid, on what no point lies beyond."""
+        outline = self.filled & ~(cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
+        if self.grid.organised:
+            edge = np.ones(self.filled.shape, dtype=bool)
+            edge[1:-1, 1:-1] = False
+        else:
+            edge = grown(~holes_filled(grown(self.grid.valid, 2)), 3)
+        return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
+
+    @property
+    def _facing(self) -> float:
+        return min(abs(float(self._plane[1][2, 0])), 1.0)
+
+    @cached_property
+    def _some(self) -> np.ndarray:
+        """An even sample (n, 3) of its points."""
+        places = np.flatnonzero(self.own)
+        return np.asarray(self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]])
+
+    @cached_property
+    def _depths_m(self) -> np.ndarray:
+        return np.quantile(self._some[:, 2], (0.01, 0.5, 0.99))
+
+    @cached_property
+    def _plane(self) -> tuple[np.ndarray, np.ndarray]:
+        """The sample about its middle, and its principal axes (3, 3), the normal first."""
+        centred = self._some - self._some.mean(axis=0)
+        return centred, np.linalg.eigh(centred.T @ centred)[1]
 
 
 @dataclass(frozen=True)
@@ -121,8 +193,9 @@ def described_text(candidate: Candidate) -> str:
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
     """Return the candidates, best odds first, and what makes the first doubtful."""
     numbers = range(len(surfaces.own))
-    described = [_described(surfaces, grid, number) for number in numbers]
-    borders = [_borders(surfaces, grid, number) for number in numbers]
+    outlines = zip(surfaces.own, surfaces.filled, strict=True)
+    described = [Candidate(own, filled, filled, grid) for own, filled in outlines]
+    borders = [_borders(surfaces, grid, number) if len(numbers) > 1 else {} for number in numbers]
 
     def encloses(outer: int, inner: int) -> bool:
         own = surfaces.own[inner]
@@ -187,35 +260,6 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
 def _probability(odds_base: float) -> float:
     odds = max(odds_base, 1e-9) ** STEEPNESS
     return min(max(odds / (1.0 + odds), 1e-4), 1.0 - 1e-4)
-
-
-def _described(surfaces: Surfaces, grid: Cloud, number: int) -> Candidate:
-    own, filled = surfaces.own[number], surfaces.filled[number]
-    places = np.flatnonzero(own)
-    some = grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
-    near, median, far = np.quantile(some[:, 2], (0.01, 0.5, 0.99)).tolist()
-    centred = some - some.mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    facing = min(abs(float(axes[2, 0])), 1.0)
-    # the smallest rectangle around it in its own plane, without the outermost hundredth
-    plan = centred @ axes[:, 1:]
-    turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
-    along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    low, high = np.quantile(along, (0.005, 0.995), axis=0)
-    short, long = sorted(((high - low) / 0.99).tolist())
-    # pixels weighted by a Gaussian about the picture's centre
-    row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in own.shape)
-    weight = float(row @ own @ column / (row.sum() * column.sum())) * min(1.0, (facing / GRAZING) ** 2)
-    # the picture's edge; without a pixel grid, what no point lies beyond
-    outline = filled & ~(cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
-    if grid.organised:
-        edge = np.ones(filled.shape, dtype=bool)
-        edge[1:-1, 1:-1] = False
-    else:
-        edge = grown(~holes_filled(grown(grid.valid, 2)), 3)
-    cut_off = int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
-    share, tilt_deg = len(places) / own.size, math.degrees(math.acos(facing))
-    return Candidate(filled, len(places), median, near, far, (long, short), share, weight, tilt_deg, cut_off)
 
 
 def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
+
+from detectors.clusters import PLAIN
 
 
 def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -15,10 +18,10 @@ def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def holes_filled(mask: np.ndarray) -> np.ndarray:
     """Return the mask with everything that it encloses."""
-    outside = np.pad(~mask, 1, constant_values=True).astype(np.uint8)
-    _, labels = cv2.connectedComponents(outside, connectivity=4)
-    filled: np.ndarray = (labels != labels[0, 0])[1:-1, 1:-1]
-    return filled
+    image = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), np.uint8)
+    image[1:-1, 1:-1] = mask
+    cv2.floodFill(image, None, (0, 0), 2)
+    return np.asarray(image[1:-1, 1:-1] != 2)
 
 
 def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
@@ -66,15 +69,47 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Number the sets of nodes (h, w) that links to the right and downwards join, largest first; return each pixel's
     number (h, w), 0 for none, and the sizes."""
-    h, w = nodes.shape
-    # links are pixels between the nodes of a picture twice as fine
-    fine = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)
-    fine[::2, ::2] = nodes
-    fine[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
-    fine[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
-    labels = np.ascontiguousarray(cv2.connectedComponents(fine, connectivity=4)[1][::2, ::2])
+    labels = _labelled(nodes, right, down)
     sizes = np.bincount(labels.ravel())[1:]
     order = np.argsort(-sizes, kind="stable")
     number = np.zeros(len(sizes) + 1, dtype=np.int32)
     number[order + 1] = np.arange(1, len(sizes) + 1)
     return number[labels], sizes[order]
+
+
+@numba.njit(**PLAIN)
+def _root(parent: np.ndarray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@numba.njit(**PLAIN)
+def _labelled(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Return the sets' numbers (h, w), 0 for none, in the order of their first pixels, by union and find."""
+    h, w = nodes.shape
+    labels, parent = np.zeros((h, w), np.int32), np.zeros(h * w + 1, np.int32)
+    for i in range(h):
+        for j in range(w):
+            if not nodes[i, j]:
+                continue
+            here = i * w + j
+            parent[here] = here
+            if j and nodes[i, j - 1] and right[i, j - 1]:
+                parent[here] = here = _root(parent, here - 1)
+            if i and nodes[i - 1, j] and down[i - 1, j]:
+                above = _root(parent, i * w + j - w)
+                parent[max(above, here)] = here = min(above, here)
+                parent[i * w + j] = here
+    count = 0
+    for i in range(h):
+        for j in range(w):
+            if nodes[i, j]:
+                root = _root(parent, i * w + j)
+                if root == i * w + j:
+                    count += 1
+                    labels[i, j] = count
+                else:
+                    labels[i, j] = labels[root // w, root % w]
+    return labels

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 
+from detectors.clusters import PLAIN
 from detectors.masks import components, grown, holes_filled, nearest_pixel, parts_with, shrunk
 from harness.vocabulary.geometry import MM, Cloud, Region
 
@@ -115,42 +117,61 @@ def sees_from_origin(cloud: Cloud) -> bool:
     return bool(len(z)) and bool(z.min() > 0) and float(max(np.abs(x / z).max(), np.abs(y / z).max())) < WIDEST_SLOPE
 
 
+@numba.njit(error_model="numpy", **PLAIN)
 def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h,
     w). ``central``: the way across is measured between the two rays at the nearer depth."""
-    x, y, z = (np.ascontiguousarray(points_m[..., k]) for k in range(3))
-    if central:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            x, y = x / z, y / z
-    right, down = np.zeros(z.shape, dtype=bool), np.zeros(z.shape, dtype=bool)
-    for axis, linked in ((1, right[:, :-1]), (0, down[:-1])):
-        a, b = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
-        dx, dy = x[b] - x[a], y[b] - y[a]
-        if central:
-            nearer = np.minimum(z[a], z[b])
-            dx *= nearer
-            dy *= nearer
-        linked[:] = np.abs(z[b] - z[a]) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
-    return right, down
+    h, w, _ = points_m.shape
+    plan = np.empty((h, w, 2))
+    for i in range(h):
+        for j in range(w):
+            for k in range(2):
+                plan[i, j, k] = points_m[i, j, k] / points_m[i, j, 2] if central else points_m[i, j, k]
+    linked = np.zeros((2, h, w), dtype=np.bool_)
+    for axis in range(2):
+        for i in range(h - axis):
+            for j in range(w - 1 + axis):
+                a, b = (i, j), (i + axis, j + 1 - axis)
+                near = min(points_m[a][2], points_m[b][2]) if central else 1.0
+                dx, dy = (plan[b][0] - plan[a][0]) * near, (plan[b][1] - plan[a][1]) * near
+                step = abs(points_m[b][2] - points_m[a][2])
+                linked[axis, i, j] = step <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
+    return linked[0], linked[1]
 
 
+@numba.njit(**PLAIN)
 def unit_normals(surface_m: np.ndarray) -> np.ndarray:
     """Return the normals (h, w, 3) of a surface's points (h, w, 3), by central differences; 0 where it has no area."""
-    if min(surface_m.shape[:2]) < 2:
-        return np.zeros_like(surface_m)
-    across, downwards = (np.moveaxis(np.gradient(surface_m, axis=axis), -1, 0) for axis in (1, 0))
-    (ux, uy, uz), (vx, vy, vz) = across, downwards
-    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    length = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-15)
-    return np.stack([x / length, y / length, z / length], axis=-1)
+    h, w, _ = surface_m.shape
+    normals, u, v = np.zeros((h, w, 3)), np.empty(3), np.empty(3)
+    if min(h, w) < 2:
+        return normals
+    for i in range(h):
+        up, low = max(i - 1, 0), min(i + 1, h - 1)
+        for j in range(w):
+            left, right = max(j - 1, 0), min(j + 1, w - 1)
+            for k in range(3):
+                u[k] = (surface_m[i, right, k] - surface_m[i, left, k]) / (right - left)
+                v[k] = (surface_m[low, j, k] - surface_m[up, j, k]) / (low - up)
+            x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+            length = max(np.sqrt(x * x + y * y + z * z), 1e-15)
+            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = x / length, y / length, z / length
+    return normals
 
 
+@numba.njit(**PLAIN)
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
     """Return (h, w) bool: unit normals ``half`` pixels to either side enclose a wider angle."""
-    turned = np.zeros(normals.shape[:2], dtype=bool)
-    for n, out in ((normals, turned), (normals.swapaxes(0, 1), turned.T)):
-        cosine = (n[2 * half :] * n[: max(len(n) - 2 * half, 0)]).sum(axis=-1)
-        out[half : half + len(cosine)] |= cosine < least_cosine
+    h, w, _ = normals.shape
+    turned = np.zeros((h, w), dtype=np.bool_)
+    for i in range(h):
+        for j in range(w):
+            for down, right in ((half, 0), (0, half)):
+                if down <= i < h - down and right <= j < w - right:
+                    cosine = 0.0
+                    for k in range(3):
+                        cosine += normals[i + down, j + right, k] * normals[i - down, j - right, k]
+                    turned[i, j] |= cosine < least_cosine
     return turned
 
 
@@ -227,7 +248,6 @@ def _trim_rims(
     own: np.ndarray, cores: np.ndarray, valid: np.ndarray, smooth: _Smooth, window: int, reach: int, apart_m: float
 ) -> None:
     """Take off each surface's rim what leaves the surface inside it, and what hangs on that alone."""
-    height, width = valid.shape
     points, means, normals, _ = smooth
     for number in range(len(own)):
         # the picture's edge is a rim too: what is cut off there may be a strip of background
@@ -239,21 +259,46 @@ def _trim_rims(
         apart, nearest = nearest_pixel(inner)
         pixels = np.flatnonzero(rim & (apart <= 3 * reach))
         seeds = nearest.reshape(-1)[pixels]
-        way = points[pixels] - means[seeds]
-        distance = np.linalg.norm(way, axis=1)
-        off = np.abs((way * normals[seeds]).sum(axis=1))
-        # the bend of the surface over as many pixels inwards, radians per metre
-        rows, columns = np.divmod(seeds, width)
-        down, across = rows - pixels // width, columns - pixels % width
-        steps = reach / np.maximum(np.hypot(down, across), 1.0)
-        inwards = np.clip(np.rint(rows + steps * down), 0, height - 1).astype(np.int64) * width
-        inwards += np.clip(np.rint(columns + steps * across), 0, width - 1).astype(np.int64)
-        cosine = np.clip((normals[seeds] * normals[inwards]).sum(axis=1), 0.0, 1.0)
-        bend = np.arccos(cosine) / np.maximum(np.linalg.norm(means[seeds] - means[inwards], axis=1), 1e-9)
-        turn = math.radians(RIM_TURN_DEG) + bend * distance / 2.0
-        allowed = np.maximum(apart_m, np.sin(np.minimum(turn, np.pi / 2)) * distance)
-        own[number].reshape(-1)[pixels[off > allowed]] = False
+        leaves = _leaves(points, means, normals, pixels, seeds, valid.shape, reach, apart_m)
+        own[number].reshape(-1)[pixels[leaves]] = False
         own[number] = parts_with(own[number], inner, connectivity=4)
+
+
+@numba.njit(**PLAIN)
+def _leaves(
+    points: np.ndarray,
+    means: np.ndarray,
+    normals: np.ndarray,
+    pixels: np.ndarray,
+    seeds: np.ndarray,
+    shape: tuple[int, int],
+    reach: int,
+    apart_m: float,
+) -> np.ndarray:
+    """Return (n,) bool: points at ``pixels`` depart from the surface at ``seeds`` farther than it may bend."""
+    leaves = np.zeros(len(pixels), dtype=np.bool_)
+    for i in range(len(pixels)):
+        seed = seeds[i]
+        off, distance = 0.0, 0.0
+        for k in range(3):
+            way = points[pixels[i], k] - means[seed, k]
+            off += way * normals[seed, k]
+            distance += way**2
+        off, distance = abs(off), np.sqrt(distance)
+        if off <= apart_m:
+            continue
+        # the bend of the surface over as many pixels inwards, radians per metre
+        row, column = seed // shape[1], seed % shape[1]
+        down, across = row - pixels[i] // shape[1], column - pixels[i] % shape[1]
+        step = reach / max(np.hypot(down, across), 1.0)
+        inner_row = min(max(np.rint(row + step * down), 0), shape[0] - 1)
+        inner_column = min(max(np.rint(column + step * across), 0), shape[1] - 1)
+        inwards = int(inner_row) * shape[1] + int(inner_column)
+        cosine = min(max((normals[seed] * normals[inwards]).sum(), 0.0), 1.0)
+        bend = np.arccos(cosine) / max(np.sqrt(((means[seed] - means[inwards]) ** 2).sum()), 1e-9)
+        turn = math.radians(RIM_TURN_DEG) + bend * distance / 2.0
+        leaves[i] = off > np.sin(min(turn, np.pi / 2)) * distance
+    return leaves
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:

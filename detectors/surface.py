@@ -1,5 +1,5 @@
 """The shapes that a target may have, fitted to points of which some are damage: polynomials z(x, y) (the thesis'
-"robust cubic" and others), quadrics (sphere, cylinder, cone, ...), and a smooth free form added to either.
+"robust cubic" and others), quadrics (sphere, cylinder, cone, ...).
 
 Scaled co-ordinates (x and y to [-1, 1]) and Chebyshev products keep the normal equations well conditioned. Large clouds
 are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated noise,
@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
+import numba
 import numpy as np
-from numpy.polynomial.chebyshev import chebval2d, chebvander
 from pydantic import Field
-from scipy import sparse
-from scipy.linalg import cho_solve, eigh, solveh_banded
+from scipy.linalg import cho_solve, eigh
 
+from detectors.clusters import PLAIN
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 
@@ -65,25 +64,59 @@ class Chebyshev:
     def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
         """Return the products up to a total degree over places (n, 2), of which no two need differ."""
         orders = [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
-        low, high = xy_m.min(axis=0), xy_m.max(axis=0)
+        low, high = (np.array([end(xy_m[:, 0]), end(xy_m[:, 1])]) for end in (np.min, np.max))
         # separable polynomials f(x) + g(y) stay separable under scaling of each axis
         powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
         return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
-        u, v = (chebvander(each, self.powers.max()).T for each in self._scaled(xy_m))
-        return np.stack([u[a] * v[b] for a, b in self.powers])
+        return _products(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, self.powers)
 
     def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the products' sum (n,) by coefficients (p,)."""
         table = np.zeros((self.powers.max() + 1,) * 2)
         table[self.powers[:, 0], self.powers[:, 1]] = coefficients
-        u, v = self._scaled(xy_m)
-        return np.asarray(chebval2d(u, v, table))
+        return _sums(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, table)
 
-    def _scaled(self, xy_m: np.ndarray) -> list[np.ndarray]:
-        return [(xy_m[:, k] - self.middle_m[k]) / self.half_m[k] for k in (0, 1)]
+
+@numba.njit(**PLAIN)
+def _chebyshev(x: float, out: np.ndarray) -> None:
+    """Fill (d + 1,) with T_0(x) to T_d(x)."""
+    out[0] = 1.0
+    if len(out) > 1:
+        out[1] = x
+    for k in range(2, len(out)):
+        out[k] = 2.0 * x * out[k - 1] - out[k - 2]
+
+
+@numba.njit(**PLAIN)
+def _products(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, powers: np.ndarray) -> np.ndarray:
+    n, terms = len(xy), len(powers)
+    out, table = np.empty((terms, n)), np.empty((2, powers.max() + 1))
+    for i in range(n):
+        for k in range(2):
+            _chebyshev((xy[i, k] - middle[k]) / half[k], table[k])
+        for j in range(terms):
+            out[j, i] = table[0, powers[j, 0]] * table[1, powers[j, 1]]
+    return out
+
+
+@numba.njit(**PLAIN)
+def _sums(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    side = len(coefficients)
+    out, u, v = np.empty(len(xy)), np.empty(side), np.empty(side)
+    for i in range(len(xy)):
+        _chebyshev((xy[i, 0] - middle[0]) / half[0], u)
+        _chebyshev((xy[i, 1] - middle[1]) / half[1], v)
+        total = 0.0
+        for a in range(side):
+            inner = 0.0
+            for b in range(side - a):  # the total degree is below the side
+                inner += coefficients[a, b] * v[b]
+            total += inner * u[a]
+        out[i] = total
+    return out
 
 
 @dataclass(frozen=True)
@@ -165,59 +198,110 @@ def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray,
     return np.ascontiguousarray(basis[:, ::stride]), np.ascontiguousarray(z[::stride])
 
 
-def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray) -> Solution:
+def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray = KNEES) -> Solution:
     """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
-    c, margin, knees = start, np.inf, KNEES
+    c, margin = start, np.inf
     few_basis, few_z = _thinned(basis, z, max(SAMPLE_POINTS, len(z) // LAR_THINNING))
     if len(few_z) < len(z):
-        c, knees = _lar(few_basis, few_z, start)[0], KNEES[2:]
+        c, knees = _lar(few_basis, few_z, start, KNEES[:3])[0], knees[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
-    r = z - c @ basis
-    scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
-    steps, gap = 0, np.inf
+    rows = np.ascontiguousarray(basis.T)
+    sizes = np.abs(z - rows @ c)
+    scale = max(float(np.median(sizes[:: max(1, len(sizes) // SAMPLE_POINTS)])), TINY_M)
+    steps, gap, total = 0, np.inf, float(sizes.sum())
     for knee in scale * knees:
-        enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
-        reach = max(margin * scale, 10.0 * knee)
+        enough, reach = 0.001 * GAP_CONVERGED * total, max(margin * scale, 10.0 * knee)
         while True:
-            near = np.abs(r) < reach
-            far_pull = basis @ np.where(near, 0.0, np.sign(r))
-            new, spent = _smoothed_descent(basis[:, near], z[near], far_pull, c, knee, enough)
-            after, steps = z - new @ basis, steps + spent
-            # a far point may have crossed the surface, or come within the knee of it
-            if not (~near & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
+            near_rows, near_z, far_pull = _parted(rows, z, c, reach)
+            new, spent = _smoothed_descent(near_rows, near_z, far_pull, c, knee, enough)
+            crossed, total, excess = _judged(rows, z, c, new, reach, knee)
+            steps += spent
+            if not crossed:
                 break
             reach *= 3.0
-        c, r, margin = new, after, min(margin, 5.0 * knee / scale)
-        sizes = np.abs(r)
-        inside = sizes[sizes <= knee]
-        gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
+        c, margin, gap = new, min(margin, 5.0 * knee / scale), excess / max(total, TINY_M)
         if gap <= GAP_CONVERGED:
             break
     return c, steps, gap <= GAP_CONVERGED, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
 
 
+@numba.njit(**PLAIN)
+def _off(row: np.ndarray, z: float, c: np.ndarray) -> float:
+    for j in range(len(c)):
+        z -= row[j] * c[j]
+    return z
+
+
+@numba.njit(**PLAIN)
+def _parted(rows: np.ndarray, z: np.ndarray, c: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows (m, p) and z (m,) of the points nearer than ``reach``, and the pull (p,) of the others."""
+    near_rows, near_z, pull, count = np.empty_like(rows), np.empty_like(z), np.zeros(len(c)), 0
+    for i in range(len(z)):
+        r = _off(rows[i], z[i], c)
+        if abs(r) < reach:
+            near_rows[count], near_z[count] = rows[i], z[i]
+            count += 1
+        else:
+            for j in range(len(c)):
+                pull[j] += rows[i, j] if r > 0.0 else -rows[i, j]
+    return near_rows[:count], near_z[:count], pull
+
+
+@numba.njit(**PLAIN)
+def _judged(
+    rows: np.ndarray, z: np.ndarray, before: np.ndarray, after: np.ndarray, reach: float, knee: float
+) -> tuple[bool, float, float]:
+    """Return whether a far point has crossed the surface, or come within the knee of it, the sum of |r|, and by how
+    much it may exceed the least."""
+    crossed, total, excess = False, 0.0, 0.0
+    for i in range(len(z)):
+        was, r = _off(rows[i], z[i], before), _off(rows[i], z[i], after)
+        size = abs(r)
+        crossed |= abs(was) >= reach and (size < knee or (was > 0.0) != (r > 0.0))
+        total += size
+        if size <= knee:
+            excess += size - size**2 / knee
+    return crossed, total, excess
+
+
+@numba.njit(**PLAIN)
+def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the normal matrix (p, p), lower
+    half, of the points inside the knee."""
+    terms = len(c)
+    value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
+    for i in range(len(z)):
+        r = _off(rows[i], z[i], c)
+        capped = min(abs(r), knee)
+        value += capped * (abs(r) - 0.5 * capped) / knee
+        slope = min(max(r / knee, -1.0), 1.0)
+        for j in range(terms):
+            pull[j] += slope * rows[i, j]
+        if abs(r) <= knee:
+            for j in range(terms):
+                for k in range(j + 1):
+                    inside[j, k] += rows[i, j] * rows[i, k]
+    return value, pull, inside
+
+
 def _smoothed_descent(
-    basis: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
+    rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
 ) -> tuple[np.ndarray, int]:
     """Minimise sum huber(r, knee) - c' far_pull: Newton, or where it fails a majorising step, which always descends."""
 
-    def state(c: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        r = z - c @ basis
-        sizes = np.abs(r)
-        capped = np.minimum(sizes, knee)
-        return c, r, float(capped @ (sizes - 0.5 * capped)) / knee - float(c @ far_pull)
+    def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        value, pull, inside = _huber(rows, z, c, knee)
+        return value - float(c @ far_pull), c, pull + far_pull, inside
 
-    def lower(way: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    def lower(way: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
         """Return the first of the full, half, quarter ... step that lowers the value."""
         trials = (state(c + way * 0.5**halvings) for halvings in range(HALVINGS))
-        return next((trial for trial in trials if trial[2] < value), None)
+        return next((trial for trial in trials if trial[0] < value), None)
 
-    c, r, value = state(start)
+    value, c, pull, inside = state(start)
     for step in range(1, LAR_STEPS + 1):
-        pull = basis @ np.clip(r / knee, -1.0, 1.0) + far_pull
-        inside = basis[:, np.abs(r) <= knee]
-        factor, moved = _factor(inside @ inside.T), None
+        factor, moved = _factor(inside), None
         if factor is not None:
             way = knee * cho_solve((factor, True), pull, check_finite=False)
             if way @ pull < enough:
@@ -225,11 +309,11 @@ def _smoothed_descent(
             moved = lower(way)
         if moved is None:
             # reweighted least squares: each |r| beyond the knee under its tangent parabola
-            weighted = basis / np.maximum(np.abs(r), knee)
-            moved = lower(np.linalg.lstsq(weighted @ basis.T, pull, rcond=1e-12)[0])
-        if moved is None or value - moved[2] < enough:
+            weighted = rows / np.maximum(np.abs(z - rows @ c), knee)[:, None]
+            moved = lower(np.linalg.lstsq(weighted.T @ rows, pull, rcond=1e-12)[0])
+        if moved is None or value - moved[0] < enough:
             return c, step
-        c, r, value = moved
+        value, c, pull, inside = moved
     return c, LAR_STEPS
 
 
@@ -298,9 +382,6 @@ def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
 Fit = Callable[[np.ndarray], np.ndarray]
 """Measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
 RIDGE = 1e-9  # share of the largest diagonal element that is added to each: keeps normal equations regular
-KNOTS_PER_WAVELENGTH = 4.0
-"""Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the penalty in charge."""
-MOST_KNOTS = 64  # most knots along one side: a limit to time and memory; the free form is then smoother than asked for
 
 
 def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
@@ -370,66 +451,3 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
             return np.where(b * sheet > 0, 2 * k / (-b - root), (-b + root) / (2 * a))
 
     return z_at
-
-
-def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: float, cell: float, central: bool) -> Fit:
-    """Fit a base shape plus tensor-product cubic B-splines in the picture's plane, penalised on third derivatives
-    (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones less (as its sixth power); in units of
-    x/z (central) or metres, as ``cell``, the spacing of the points."""
-    places = picture_places(points, central)
-    low, extent = places.min(axis=0), np.ptp(places, axis=0)
-    spacing = max(wavelength / KNOTS_PER_WAVELENGTH, float(extent.max()) / MOST_KNOTS)
-    counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 3
-    residual = points[:, 2] - base(points)
-    w = np.where(np.isfinite(residual), weights, 0.0)
-    values, numbers = _splines((places - low) / spacing, counts)
-    starts = np.arange(0, values.size + 1, 16)
-    design = sparse.csr_array((values.ravel(), numbers.ravel(), starts), shape=(len(points), int(counts.prod())))
-    # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the factor
-    stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
-    weighted = sparse.diags_array(w) @ design
-    gram = sparse.coo_array(sparse.triu(design.T @ weighted + stiffness * _penalty(int(counts[0]), int(counts[1]))))
-    # LAPACK's upper bands
-    width = int(3 * counts[1] + 3)
-    banded = np.zeros((width + 1, design.shape[1]))
-    banded[width + gram.row - gram.col, gram.col] = gram.data
-    banded[-1] += RIDGE * float(banded[-1].max())
-    coefficients = solveh_banded(banded, weighted.T @ np.where(w > 0, residual, 0.0), check_finite=False)
-
-    def z_at(q: np.ndarray) -> np.ndarray:
-        values, numbers = _splines((picture_places(q, central) - low) / spacing, counts)
-        return base(q) + np.einsum("nk,nk->n", values, coefficients[numbers])
-
-    return z_at
-
-
-def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
-    """Return (n, 2) x/z and y/z, or x and y where rays are parallel."""
-    return points[:, :2] / points[:, 2:] if central else points[:, :2]
-
-
-def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 16 products of cubic splines that reach each place (n, 2)."""
-    x = np.clip(np.nan_to_num(places), 0.0, counts - 3.0)
-    first = np.minimum(x.astype(np.int64), counts - 4)
-    t = x - first
-    s = 1.0 - t
-    each = np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6.0
-    rows, columns = np.moveaxis(first[..., None] + np.arange(4), 1, 0)
-    values = each[:, 0, :, None] * each[:, 1, None, :]
-    numbers = rows[:, :, None] * counts[1] + columns[:, None, :]
-    return values.reshape(-1, 16), numbers.reshape(-1, 16)
-
-
-@lru_cache(maxsize=32)
-def _penalty(rows: int, columns: int) -> sparse.csr_array:
-    """Return the sum of squared third differences of (rows, columns) coefficients, mixed ones three times."""
-
-    def squared(count: int, order: int) -> np.ndarray:
-        differences = np.diff(np.eye(count), order, axis=0)
-        return np.asarray(differences.T @ differences)
-
-    return sum(
-        factor * sparse.csr_array(sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr"))
-        for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
-    )
