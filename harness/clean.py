@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from functools import partial
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError, exit_code_of
-
-if TYPE_CHECKING:
-    from scenes.render.cache import StoredFile
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -53,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _clean_cache(options: argparse.Namespace) -> int:
-    from harness.listing import bytes_of, cache_removal, refuse_links, seconds_of
+    from harness.listing import bytes_of, cache_removal, refuse_links, seconds_of, size_text
     from harness.tables.text import many
     from scenes.render.cache import alone, removed
 
@@ -70,75 +64,71 @@ def _clean_cache(options: argparse.Namespace) -> int:
         with alone(folder):  # a sweep that runs is told before anything is asked
             pass
     wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
-    return _remove(options, many(len(wanted), "stored render"), wanted, partial(alone, folder), removed)
+    size = size_text(sum(file.size_bytes for file in wanted))
+    if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size}", len(wanted)):
+        return 0 if options.dry_run or not wanted else 1
+    with alone(folder):  # not while the question waits for its answer: that would block every sweep
+        gone = removed(wanted)
+    return _concluded(len(gone), len(wanted), sum(file.size_bytes for file in gone))
 
 
 def _clean_results(options: argparse.Namespace) -> int:
-    from harness.listing import chosen_results, removable, remove_results
+    from harness.listing import chosen_results, removable, remove_results, size_text
     from harness.tables.text import many
 
     folders = chosen_results(options.out, options.name)
     if not options.dry_run:
-        with _held(folders):  # a sweep that runs is told before anything is asked
-            pass
+        with ExitStack() as held:  # a sweep that runs is told before anything is asked
+            _hold(held, folders)
     files = [file for folder in folders for file in removable(folder, journal_only=options.journal_only)]
     print("\n".join(map(str, folders)))
     what = "files of journals" if options.journal_only else "files"
-
-    def remove(files: list[StoredFile]) -> list[StoredFile]:
+    size = size_text(sum(file.size_bytes for file in files))
+    if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size}", len(files)):
+        return 0 if options.dry_run or not files else 1
+    with ExitStack() as held:  # not while the question waits for its answer: that would block every sweep
+        _hold(held, folders)
         gone = remove_results(folders, files)
-        for folder in folders:
-            if not options.journal_only and folder.exists():
-                print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
-        return gone
-
-    said = f"{len(files)} {what} in {many(len(folders), 'folder')}"
-    return _remove(options, said, files, partial(_held, folders), remove)
+    for folder in folders:
+        if not options.journal_only and folder.exists():
+            print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
+    return _concluded(len(gone), len(files), sum(file.size_bytes for file in gone))
 
 
-@contextmanager
-def _held(folders: list[Path]) -> Iterator[None]:
+def _hold(held: ExitStack, folders: list[Path]) -> None:
     """Hold folders of results. Raises UserError where a sweep holds one, or where it cannot be written."""
     from harness.engine.work import locked
 
-    with ExitStack() as held:
-        for folder in folders:
-            try:
-                held.enter_context(locked(folder))
-            except OSError as error:
-                raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
-        yield
+    for folder in folders:
+        try:
+            held.enter_context(locked(folder))
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
 
 
-def _remove(
-    options: argparse.Namespace,
-    what: str,
-    files: list[StoredFile],
-    held: Callable[[], AbstractContextManager[None]],
-    remove: Callable[[list[StoredFile]], list[StoredFile]],
-) -> int:
-    """Ask whether to go on, then remove files while ``held``: not while the question waits for its answer, as that
-    would block every sweep. Raises UserError where nobody can be asked."""
+def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
+    """Ask whether to go on. Raises UserError where nobody can be asked."""
+    if options.dry_run or not count:
+        print(f"would remove {what}" if count else "nothing to remove")
+        return False
+    if options.yes:
+        return True
+    if not sys.stdin.isatty():
+        raise UserError(f"this would remove {what}", fix="say --yes where nobody can be asked, or --dry-run to look")
+    try:
+        return input(f"remove {what}? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
+
+
+def _concluded(gone: int, wanted: int, freed_bytes: int) -> int:
     from harness.listing import size_text
     from harness.tables.text import many
 
-    what += f", {size_text(sum(file.size_bytes for file in files))}"
-    if options.dry_run or not files:
-        print(f"would remove {what}" if files else "nothing to remove")
-        return 0
-    if not options.yes and not sys.stdin.isatty():
-        raise UserError(f"this would remove {what}", fix="say --yes where nobody can be asked, or --dry-run to look")
-    answer = "y" if options.yes else ""
-    with suppress(EOFError):
-        answer = answer or input(f"remove {what}? [y/N] ")
-    if answer.strip().lower() not in ("y", "yes"):
-        return 1
-    with held():
-        gone = remove(files)
-    print(f"removed {many(len(gone), 'file')}, {size_text(sum(file.size_bytes for file in gone))}")
-    if len(gone) < len(files):
-        print(f"{many(len(files) - len(gone), 'file')} could not be removed", file=sys.stderr)
-    return int(len(gone) < len(files))
+    print(f"removed {many(gone, 'file')}, {size_text(freed_bytes)}")
+    if gone < wanted:
+        print(f"{many(wanted - gone, 'file')} could not be removed", file=sys.stderr)
+    return 0 if gone == wanted else 1
 
 
 if __name__ == "__main__":

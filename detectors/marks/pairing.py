@@ -160,12 +160,8 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     pairs = np.array([(ours.index(code), theirs.index(code)) for code in common], dtype=np.int64).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    problem = ""
-    if len(common) < LEAST_MARKS:
-        problem = (
-            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
-        )
-    return Pairing(pairs, problem, notes)
+    few = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+    return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
 
 
 class _Side:

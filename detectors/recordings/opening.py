@@ -27,16 +27,12 @@ LEGAL_FORMATS = (
     ".db3, .bag); one .npy, .npz, .mat, .mkv or .r3d file; a Stray Scanner folder; with --pitch a height map; with "
     "--raw a file of bare numbers"
 )
-FILES: dict[str, Callable[[Path, Asked], Recording]] = {
-    **dict.fromkeys(LOADERS, open_arrays),
-    **dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag),
-    ".mkv": open_mkv,
-    ".r3d": open_r3d,
-}  # suffixes of files of which each is a capture
-LISTS: dict[str, Callable[[Sequence[Path], Asked, str], Recording]] = {
-    ".png": open_depth_list,
-    **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds),
-}  # suffixes of files of which several, all of one suffix, are one capture
+FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
+FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
+"""Suffixes of files of which each is a capture, and what opens it."""
+ListOpener = Callable[[Sequence[Path], Asked, str], Recording]
+LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
+"""Suffixes of files of which several, all of one suffix, are one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
@@ -110,11 +106,11 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
     """Open a capture by the first format that its paths fit."""
     path, is_single = paths[0], len(paths) == 1
     suffix, *others = {each.suffix.lower() for each in paths}
-    opener: Callable[[Path, Asked], Recording] | None = None
+    opener: Callable[[Path, Asked], Recording] | None = FILES.get(suffix) if is_single else None
     if is_single and path.is_dir():
         opener = open_bag if is_bag(path) and asked.raw is None else _open_folder
-    elif is_single:
-        opener = open_arrays if asked.raw is not None else FILES.get(suffix)
+    elif is_single and asked.raw is not None:
+        opener = open_arrays
     if asked.topic is not None and opener is not open_bag:
         raise UserError(f"{path}: is no ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
     unused = next((name for name in ("array", "pitch", "raw") if getattr(asked, name) is not None), None)

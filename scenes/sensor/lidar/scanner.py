@@ -23,7 +23,7 @@ from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.facts import ScannedLidar
-from scenes.sensor.lidar.kernels import strongest_peaks
+from scenes.sensor.lidar.kernels import Peaks, strongest_peaks
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, unit_error_m
 
@@ -103,19 +103,16 @@ class LidarScanner:
     def _peaks(self, phasor: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights in electrons, half paths and their deviations in metres, each (2, h, w)."""
         camera = self.camera
-        h, w = noise.shape
-        height, half_m, deviation_m = (np.empty((2, h, w)) for _ in range(3))
-        metres_per_radian = camera.unambiguous_m / (2 * np.pi)
-        for row in range(0, h, BLOCK_ROWS):
-            rows = slice(row, row + BLOCK_ROWS)
-            peaks = strongest_peaks(self._along_sweeps(phasor, rows), camera.weights)
-            half_m[:, rows] = peaks.delay * camera.unambiguous_m
-            height[:, rows], curvature = (each * self.gathered[rows] for each in (peaks.height, peaks.curvature))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                deviation_m[:, rows] = metres_per_radian * self.slope * noise[rows] / curvature
+        blocks = (slice(row, row + BLOCK_ROWS) for row in range(0, len(noise), BLOCK_ROWS))
+        found = [strongest_peaks(self._along_sweeps(phasor, rows), camera.weights) for rows in blocks]
+        peaks = Peaks(*(np.concatenate(parts, axis=1) for parts in zip(*found, strict=True)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            metres_per_radian = camera.unambiguous_m / (2 * np.pi)
+            deviation_m = metres_per_radian * self.slope * noise / (peaks.curvature * self.gathered)
         # where two pulses are about to part the peak is flat; it still lies within their width
         width_m = camera.unambiguous_m * camera.code.correlation_fwhm_ns.value / camera.code.period_ns.value
-        return height, half_m, np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
+        deviation_m = np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
+        return peaks.height * self.gathered, peaks.delay * camera.unambiguous_m, deviation_m
 
     def _along_sweeps(self, light: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Return light (..., h, w) integrated over the points of a column that one point's time spans."""
