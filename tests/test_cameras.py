@@ -19,6 +19,7 @@ from scenes.sensor.camera import (
     CameraConfig,
     camera_names,
     camera_of,
+    guessed_precision,
     lens_named,
     load_camera,
     read_camera,
@@ -298,3 +299,10 @@ def test_the_camera_of_the_documentation_is_legal(tmp_path):
     changes = [f"source.camera.name={path}", f"source.target.other_wavelengths={albedos}"]
     (point, *_) = load_experiment("experiments/detection_limit.yaml", changes).points
     assert camera_of(point.config.source.camera) == camera
+
+
+def test_what_a_guessed_gain_means_is_told(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN + "photons: {signal_electrons: {value: 600.0, tag: G, range: [150.0, 2400.0], source: s}}\n")
+    assert guessed_precision(load_camera(str(path))).endswith("which may be 0.5 to 2 times as much")
+    assert guessed_precision(load_camera("azure_kinect_nfov")) == ""

@@ -39,6 +39,7 @@ from harness.vocabulary.geometry import INCH, MM
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
+from scenes.sensor.camera import camera_of, guessed_precision
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
 
@@ -94,7 +95,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
     point_to(folder)
-    show(shown)
+    show([*(f"warning: {text}" for text in provenance["guesses"]), *shown])
     _tell_failures(outcome)
     print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
@@ -233,6 +234,9 @@ def _provenance(
                 noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
                 noise[name] = max(noise.get(name, 0.0), noise_mm)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
+    sources = [cast("SimulatedSource", point.config.source).camera for point in experiment.points]
+    cameras = {source.name: camera_of(source) for source in sources}
+    guesses = map(guessed_precision, cameras.values())
     return {
         "results_version": RESULTS_VERSION,
         **origin,
@@ -249,6 +253,7 @@ def _provenance(
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
         "indirect_noise_mm": noise,
+        "guesses": [text for text in guesses if text],
         "failures": [
             {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
         ],

@@ -55,9 +55,12 @@ def template(name: str, folder: Path | None = None) -> Template:
     return environment.get_template(name)
 
 
-def page(title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = ()) -> str:
-    """A whole page: ``title``, the ``answer`` in large letters, what stands ``under`` it, the body."""
-    return template("page.html").render(title=title, answer=answer, body=joined(body), under=joined(under))
+def page(
+    title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = (), warnings: Iterable[str] = ()
+) -> str:
+    """A whole page: ``title``, ``warnings``, the ``answer`` in large letters, what stands ``under`` it, the body."""
+    parts = {"body": joined(body), "under": joined(under), "warnings": list(warnings)}
+    return template("page.html").render(title=title, answer=answer, **parts)
 
 
 def tag(name: str, *content: str | Markup, **attributes: str) -> Markup:

@@ -11,7 +11,6 @@ import numpy as np
 from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.efficiency import Efficiency
 from harness.evaluation.study.ideal import SHARES
-from harness.report import blocks
 from harness.report.blocks import COLOURS, GREY, INK, MARKERS, command_of, figure, heading, note, page, svg
 from harness.report.pod import hits_in_view, plain, plain_numbers
 from harness.tables.efficiency import EFFICIENCY
@@ -121,5 +120,4 @@ def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[s
         figure({"against-d": efficiency_figure(rows)}, "against-d", caption),
         *command_of(command),
     ]
-    under = [*(blocks.paragraph(f"Warning: {text}") for text in warnings), note(first)]
-    return page(f"Efficiency: {name}", answer(rows), body, under)
+    return page(f"Efficiency: {name}", answer(rows), body, [note(first)], warnings)

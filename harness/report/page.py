@@ -250,7 +250,8 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     body += blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs))
     rule = "Each set-up has hole-free runs and a threshold of its own."
     under = sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule)
-    return blocks.page(about.title, set_ups_answer(compared, layout, costs, verdict), body, [under])
+    guesses = about.provenance.get("guesses", ())
+    return blocks.page(about.title, set_ups_answer(compared, layout, costs, verdict), body, [under], guesses)
 
 
 def set_ups_answer(
@@ -399,7 +400,8 @@ def report_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: s
         *blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs)),
     ]
     repeats = int(main["n"].max()) if len(main) else 0
-    return blocks.page(about.title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)])
+    guesses = about.provenance.get("guesses", ())
+    return blocks.page(about.title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)], guesses)
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:

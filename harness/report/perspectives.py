@@ -112,7 +112,9 @@ def perspectives_html(tables: ResultTables, examples: Sequence[MappedExample], a
         "Each set-up has hole-free runs and a threshold of its own. The same frames feed every set-up; repeats vary "
         "the error of the nominal poses too. Of a single view all ways of registering are the same.",
     )
-    return blocks.page(about.title, answer_sentence(cases, verdicts), body, [under])
+    return blocks.page(
+        about.title, answer_sentence(cases, verdicts), body, [under], about.provenance.get("guesses", ())
+    )
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:

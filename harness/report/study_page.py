@@ -371,7 +371,7 @@ def study_html(
         chance=table(study.CHANCE),
         thresholds=table(study.THRESHOLDS),
         threshold_note=study.threshold_note(result.record),
-        warnings=[unbroken(text) for text in study.threshold_warnings(limits)],
+        warnings=[*provenance.get("guesses", ()), *map(unbroken, study.threshold_warnings(limits))],
         set_by=table(study.SET_BY),
         signals=table(study.SIGNALS),
         signal_notes=study.signal_notes(limits),

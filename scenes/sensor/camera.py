@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from harness.vocabulary.config import Config
@@ -152,6 +153,17 @@ def lens_named(name: str) -> OtherLens:
 def camera_of(config: CameraConfig) -> AnyCamera:
     """Return the camera that an experiment declares. Raises UserError where a replaced number is impossible."""
     return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
+
+
+def guessed_precision(camera: AnyCamera) -> str:
+    """Return a sentence on a camera whose precision nobody publishes; empty for others. Noise goes with the root of the
+    gain where shot noise rules."""
+    gain = camera.photons.signal_electrons
+    if gain.range is None:
+        return ""
+    low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
+    told = f"the precision of {camera.title} is not published: its noise is a guess"
+    return f"{told}, which may be {low:.2g} to {high:.2g} times as much"
 
 
 @lru_cache
