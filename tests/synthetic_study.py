@@ -275,10 +275,8 @@ def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
         for board, repeat in zip(*_runs(study, role), strict=True):
             of_run = (findings["role"] == role) & (findings["board"] == board) & (findings["repeat"] == repeat)
             score, hole = findings["score"][of_run].to_numpy(), findings["hole"][of_run].to_numpy(str)
-            rows += [
-                (role, board, repeat, at, int((score > at).sum()), int(((score > at) & (hole != "")).sum()))
-                for at in OPERATING
-            ]
+            above = score > OPERATING[:, None]
+            rows.append((role, board, repeat, OPERATING, above.sum(axis=1), (above & (hole != "")).sum(axis=1)))
     return pd.DataFrame(rows, columns=["role", "board", "repeat", "threshold", "findings", "hits"])
 
 
@@ -289,6 +287,5 @@ def _pixels(study: Study, one: SetUp, holes: pd.DataFrame) -> pd.DataFrame:
     tables = []
     for rows, pixels, mean in ((face, FACE_PIXELS, 0.0), (damaged, 1000, one.pixel_d)):
         above = np.round(pixels * stats.norm.sf(PIXEL_GRID - mean)).astype(int)
-        grid = pd.DataFrame({"threshold": PIXEL_GRID, "above": above, "pixels": pixels})
-        tables.append(rows.merge(grid, how="cross"))
+        tables.append(rows.assign(threshold=[PIXEL_GRID] * len(rows), above=[above] * len(rows), pixels=pixels))
     return pd.concat(tables, ignore_index=True)

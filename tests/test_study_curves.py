@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import special, stats
-from synthetic_study import RADIUS_MM, THRESHOLD, SetUp, Study, Tables, study_record, study_tables
+from synthetic_study import PIXEL_GRID, RADIUS_MM, THRESHOLD, SetUp, Study, Tables, study_record, study_tables
 
 from harness.evaluation.intervals import false_call_rate
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curves
@@ -127,17 +127,15 @@ class TestFreeResponse:
         runs = loud.runs[loud.runs["role"] == "hole_free"]
         assert curve.at[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
         more = loud.operating.copy()
-        more.loc[more["role"] == "damaged", "findings"] += 7
+        more.loc[more["role"] == "damaged", "findings"] = more["findings"] + 7
         again = free_response(more, loud.runs, loud.holes)
         assert np.array_equal(again.false_calls_per_m2, curve.false_calls_per_m2)
 
     def test_what_folds_back_is_left_out(self):
         """Calls 0, 2, 1, 2, 3, 1 as the threshold falls from 6 to 1: at 4 and at 1 there are fewer than before."""
-        grid, calls = [6.0, 5.0, 4.0, 3.0, 2.0, 1.0], [0, 2, 1, 2, 3, 1]
-        free = pd.DataFrame({"role": "hole_free", "board": 9, "threshold": grid, "findings": calls, "hits": 0})
-        hits = pd.DataFrame(
-            {"role": "damaged", "board": 0, "threshold": grid, "findings": 9, "hits": [0, 1, 1, 1, 2, 0]}
-        )
+        grid, calls, none = np.arange(1.0, 7.0), np.array([1, 3, 2, 1, 2, 0]), np.zeros(6, int)
+        free = pd.DataFrame({"role": "hole_free", "board": 9, "threshold": [grid], "findings": [calls], "hits": [none]})
+        hits = free.assign(role="damaged", board=0, hits=[np.array([0, 2, 1, 1, 1, 0])])
         runs = pd.DataFrame({"role": ["hole_free", "damaged"], "inspected_m2": 0.5, "false_calls": [2, 8]})
         holes = pd.DataFrame({"board": 0, "true_diameter_mm": 5.0, "signal": [7.0, 2.5], "detected": [True, False]})
         curve = free_response(pd.concat([free, hits]), runs, holes, draws=10)
@@ -169,11 +167,8 @@ class TestPixels:
 
     def test_by_hand(self):
         """Two damages of 1 and 9 pixels: at a rate of 0.1 the small one is covered, the large one not; then both."""
-        rows = [("", 100, 10), ("small", 1, 1), ("large", 9, 0)], [("", 100, 50), ("small", 1, 1), ("large", 9, 9)]
-        pixels = pd.DataFrame(
-            [(0, 0, 2.0 - k, *row) for k, part in enumerate(rows) for row in part],
-            columns=["board", "repeat", "threshold", "hole", "pixels", "above"],
-        )
+        rows = [("", 100, np.array([50, 10])), ("small", 1, np.array([1, 1])), ("large", 9, np.array([9, 0]))]
+        pixels = pd.DataFrame(rows, columns=["hole", "pixels", "above"]).assign(board=0)
         curves = pixel_curves(pixels)
         # overlap: 0 -> 0.5 over 0.1, then 0.5 -> 1 over 0.4, cut at 0.3 where it is 0.75
         assert curves.pro == pytest.approx((0.1 * 0.25 + 0.2 * 0.625) / 0.3)
@@ -182,8 +177,8 @@ class TestPixels:
         assert not curves.pro_interval.known
 
     def test_thresholds_that_end_early_give_no_overlap_score(self, loud):
-        high = loud.pixels[loud.pixels["threshold"] > 1.0]
-        curves = pixel_curves(high)
+        above = [counts[PIXEL_GRID > 1.0] for counts in loud.pixels["above"]]
+        curves = pixel_curves(loud.pixels.assign(above=above))
         assert np.isnan(curves.pro) and "0.1" in curves.why
 
     def test_none_without_damage(self, loud):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from synthetic_study import SetUp, Study, study_record
 
 from harness.evaluation.intervals import percentiles
-from harness.evaluation.pod.curve import LINKS, PodCurve
+from harness.evaluation.pod.curve import CELLS, LINKS, PodCurve
 from harness.evaluation.pod.hit_miss import bound, choose_model, fit_hit_miss
 from harness.evaluation.study.limit import (
     ALL_FOUND,
@@ -23,6 +24,7 @@ from harness.evaluation.study.limit import (
     refitted_sizes,
     row_weights,
     targets_of,
+    weights_in_blocks,
 )
 from harness.evaluation.study.record import Inspected, SetUpRecord
 from harness.tables.limits import limit_sentence
@@ -242,6 +244,25 @@ class TestBoardsDrawnAgain:
         assert not np.array_equal(board_weights(7, 20), board_weights(7, 20, "hole-free"))
         rows = row_weights(np.array([9, 4, 9]), 20)
         assert np.array_equal(rows[:, 0], rows[:, 2]) and np.array_equal(rows[:, 1], board_weights(2, 20)[:, 0])
+
+    def test_weights_come_in_blocks(self):
+        boards = np.arange(CELLS // 30) % 50, np.arange(40) % 9
+        blocks = list(weights_in_blocks(100, (boards[0], "damaged"), (boards[1], "hole-free")))
+        assert len(blocks) == 4 and max(block[0].size for block in blocks) <= CELLS
+        for joined, board, of in zip(zip(*blocks, strict=True), boards, ("damaged", "hole-free"), strict=True):
+            assert np.array_equal(np.concatenate(joined), row_weights(board, 100, of))
+
+    def test_more_boards_need_little_more_memory(self):
+        """Sizes refitted on 250 boards, of 8 damages each, rather than on 100: less than 5 kB for each more."""
+        found = []
+        for boards in (100, 250):
+            seen = set_up(Study(boards=boards, hole_free_boards=0)).inspected
+            targets = targets_of(seen.board, seen.hole, seen.diameter_mm, seen.hit)
+            tracemalloc.start()
+            refitted_sizes(targets, PodCurve("logit", False, 6.0, 1.0, np.eye(2)), (0.5, 0.9))
+            found.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        assert found[1] - found[0] < 150 * 5000
 
     def test_a_median_over_boards_is_that_of_each_draws_values(self):
         rng = np.random.default_rng(5)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 
 from harness.engine.tables import tables_of
 from harness.experiment.load import load_experiment
+from harness.tables import trials
+from harness.tables.schema import write_table
+from harness.tables.trials import ResultTables
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -85,3 +91,58 @@ def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
     alone = tables_of([record], load_experiment(ROOT / "experiments" / "averaging.yaml"))
     assert alone.axes.empty
     assert set(alone.holes.columns) == {"variant", "frames", "repeat", "true_diameter_mm", "hole", "score"}
+
+
+def study_record(number: int) -> dict[str, list[dict[str, object]]]:
+    """A trial of a study at 1 and 50 frames: one in four on a damaged board, one hole-free, two that calibrate."""
+    role = ("damaged", "hole_free", "calibration", "calibration")[number % 4]
+    stream, numbers = np.random.default_rng(number), dict.fromkeys([f"measure_{k}_mm" for k in range(20)], 0.0)
+    record: dict[str, list[dict[str, object]]] = {}
+    for frames in (1, 50):
+        common = {"variant": "main", "frames": frames, "repeat": 0, "board": number, "role": role}
+        rows = {"runs": [common | numbers]}
+        if role != "calibration":
+            listed = {"threshold": [0.5 * frames * k for k in range(21)], "findings": [3] * 21, "hits": [1] * 21}
+            rows["operating"] = [common | listed]
+        if role == "damaged":
+            above = [stream.integers(0, 30_000, 41).tolist() for _ in range(9)]
+            grid = [0.25 * frames * k for k in range(41)]
+            rows["holes"] = [hole(0, str(k), 1.0) | common | numbers for k in range(8)]
+            rows["pixels"] = [
+                common | {"hole": str(k), "pixels": 30_000, "threshold": grid, "above": counts}
+                for k, counts in enumerate(above)
+            ]
+        for name, made in rows.items():
+            record.setdefault(name, []).extend(made)
+    return record
+
+
+def test_a_trial_costs_a_few_kilobytes_of_memory():
+    """Tables of 400 trials more need less than 5 kB for each, their making included."""
+    experiment = load_experiment(ROOT / "experiments" / "smoke.yaml")
+
+    def needed(trials: int) -> tuple[int, ResultTables]:
+        before = pa.total_allocated_bytes()
+        tracemalloc.start()
+        tables = tables_of(map(study_record, range(trials)), experiment)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return peak + pa.total_allocated_bytes() - before, tables
+
+    few, _ = needed(200)
+    many, tables = needed(600)
+    assert (many - few) / 400 < 5000
+    assert len(tables.pixels) == 150 * 2 * 9 and len(tables.holes) == 150 * 2 * 8
+
+
+def test_lists_are_rows_of_the_files(tmp_path):
+    records = [study_record(number) for number in (4, 1, 0)]
+    tables = tables_of(records, load_experiment(ROOT / "experiments" / "smoke.yaml"))
+    write_table(tmp_path, trials.PIXELS, tables.pixels)
+    stored = pd.read_parquet(tmp_path / "pixels.parquet")
+    rows = [row for record in records for row in record.get("pixels", ())]
+    rows.sort(key=lambda row: (row["frames"], row["board"]))
+    assert stored["above"].tolist() == [count for row in rows for count in row["above"]]
+    assert stored["threshold"].tolist() == [at for row in rows for at in row["threshold"]]
+    assert stored["hole"].tolist() == [row["hole"] for row in rows for _ in row["above"]]
+    assert stored["above"].dtype == np.int64

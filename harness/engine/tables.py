@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.profile import shadowed_shares
@@ -30,24 +30,26 @@ from scenes.target.truth import truth_of
 RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, "registrations": trials.REGISTRATIONS}
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
 OF_STUDY = {table.name: table for table in trials.STUDY_ONLY}
-RECORDS_AT_ONCE = 100  # records that are held as mappings before they become frames, which take a tenth of the memory
+RECORDS_AT_ONCE = 100  # records that are held as mappings before they become columns, which take a tenth of the memory
+COUNTS = pd.ArrowDtype(pa.list_(pa.int32()))
 UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that is not known
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
     """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
     every axis is a column of all tables but those of a study alone."""
-    frames: dict[str, list[pd.DataFrame]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
+    parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
+    grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[dict[str, Any]] = []
     waiting = iter(records)
     while chunk := list(islice(waiting, RECORDS_AT_ONCE)):
         for row in (row for record in chunk for row in record.get("probes", ())):
             errors = np.array([UNKNOWN if value is None else value for value in row["error_tenth_um"]], np.int32)
             probes.append({**row, "error_tenth_um": errors})
-        for name, made in frames.items():
+        for name, made in parts.items():
             rows = [row for record in chunk for row in record.get(name, ())]
             if rows:
-                made.append(_frame(rows))
+                made.append(_columns(rows, grids))
     paths = list(experiment.points[0].axes)
     names = names_of(paths)
     said = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
@@ -59,11 +61,24 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
     def ordered(name: str, declared: Table) -> pd.DataFrame:
-        if not frames[name]:
+        """Join a table's parts column by column, so that no more than one is held twice."""
+        own = parts.pop(name)
+        sizes = [len(next(iter(part.values()))) for part in own]
+        names = dict.fromkeys(column for part in own for column in part)
+
+        def joined(column: str) -> pd.DataFrame:
+            there = ({column: part.pop(column)} if column in part else {} for part in own)
+            return pd.concat(pd.DataFrame(one, range(size)) for one, size in zip(there, sizes, strict=True))
+
+        if not own:
             return pd.DataFrame()
-        table = pd.concat(frames.pop(name), ignore_index=True)
-        order = [column for column in declared.order if column in table]
-        return table.sort_values(order, kind="stable", ignore_index=True)
+        order = {column: joined(column)[column].array for column in declared.order if column in names}
+        places = pd.DataFrame(order).sort_values(list(order), kind="stable").index.to_numpy()
+        table = {
+            column: (order[column] if column in order else joined(column)[column].array).take(places)
+            for column in names
+        }
+        return pd.DataFrame(table, copy=False)
 
     walls = _walls(experiment) if experiment.config.study is None else pd.DataFrame()
     return trials.ResultTables(
@@ -76,24 +91,21 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
     )
 
 
-def _frame(rows: list[Mapping[str, Any]]) -> pd.DataFrame:
-    """Rows as a frame: those with lists over thresholds as one row for each threshold; columns that JSON filled with
-    None hold numbers with NaN."""
-    if isinstance(rows[0].get("threshold"), list):
-        lists = [name for name, value in rows[0].items() if isinstance(value, list)]
-        single = pd.DataFrame([{name: value for name, value in row.items() if name not in lists} for row in rows])
-        frame = single.loc[np.repeat(single.index, [len(row["threshold"]) for row in rows])].reset_index(drop=True)
-        frame = frame.assign(**{name: list(chain.from_iterable(row[name] for row in rows)) for name in lists})
-        frame = frame[list(rows[0])]
-    else:
-        frame = pd.DataFrame(rows)
-    for column in [name for name in frame if frame[name].dtype == object]:
-        if frame[column].map(lambda value: isinstance(value, str)).any():
-            # each word once: every record brings its own copy
-            frame[column] = [sys.intern(value) if type(value) is str else value for value in frame[column]]
-        else:
-            frame[column] = frame[column].astype(float)
-    return frame
+def _columns(rows: list[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]) -> dict[str, Any]:
+    """Rows as columns, each apart: those that JSON filled with None hold numbers with NaN; lists of counts are lists
+    still, and those of thresholds one of ``grids``, which takes in new ones."""
+    found = {}
+    for name, column in pd.DataFrame(rows).items():
+        if isinstance(column.iloc[0], list):
+            if name == "threshold":
+                kept = [grids.setdefault(tuple(grid), np.array(grid)) for grid in column]
+                column = pd.Series(kept, dtype=object)
+            else:
+                column = column.astype(COUNTS)
+        elif column.dtype == object and not column.map(lambda value: isinstance(value, str)).any():
+            column = column.astype(float)
+        found[str(name)] = column.array.copy()
+    return found
 
 
 def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
+MOST_MARKS = 2000
+"""Marks of inspections that a figure draws one by one; more of them are one picture within it."""
 STRIPE = 0.10
 """Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
 VALIDITY = (
@@ -215,6 +217,7 @@ def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) ->
     # multiples of the golden ratio keep apart without chance
     spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
     style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": strength, "clip_on": False}
+    style["rasterized"] = len(size) > MOST_MARKS
     axes.scatter(size[hit], 1.03 + spread[hit], **style)
     label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"
     axes.scatter(size[~hit], -0.03 - spread[~hit], label=label, **style)
@@ -243,10 +246,12 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
     left, right = -np.inf if model.left is None else model.left, np.inf if model.right is None else model.right
     kept = (statement.response > left) & (statement.response < right)
-    axes.scatter(statement.size[kept], statement.response[kept], s=14, color=INK, alpha=0.7, lw=0, label="signals")
+    many = len(kept) > MOST_MARKS
+    marks: dict[str, Any] = {"s": 14, "color": INK, "alpha": 0.7, "lw": 0, "label": "signals", "rasterized": many}
+    axes.scatter(statement.size[kept], statement.response[kept], **marks)
     if ends:
         censored: dict[str, Any] = {"marker": "x", "color": PURPLE, "label": f"censored, {' or '.join(ends)}"}
-        axes.scatter(statement.size[~kept], statement.response[~kept], s=18, lw=1, **censored)
+        axes.scatter(statement.size[~kept], statement.response[~kept], s=18, lw=1, rasterized=many, **censored)
     if model.log_signal:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)

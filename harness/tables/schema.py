@@ -24,6 +24,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,8 @@ from harness.vocabulary.seeds import canonical_json
 if TYPE_CHECKING:
     import pandas as pd
 
+LISTS_AT_ONCE = 2_000
+"""Rows with lists whose elements become rows of a file at a time, some 10 MB."""
 UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 
@@ -128,7 +131,8 @@ class Column:
 @dataclass(frozen=True)
 class Table:
     """A result table. ``note``: what a row is; ``order``: sorts rows; ``formats``: its files, ``digits`` those of CSV;
-    ``title``: above it at a terminal; ``always``: written without rows too; ``left``: columns of text on a page."""
+    ``title``: above it at a terminal; ``always``: written without rows too; ``left``: columns of text on a page;
+    ``lists``: columns whose values are lists in memory, of which each element is a row of the files."""
 
     name: str
     note: str
@@ -137,6 +141,7 @@ class Table:
     formats: tuple[str, ...] = ("csv", "parquet")
     title: str = ""
     always: bool = False
+    lists: tuple[str, ...] = ()
     left: int = 1
     digits: str = "%.6g"
     kind: str = "limits"
@@ -220,17 +225,33 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
         import pyarrow.parquet as pq
 
         noted = {name: column for column in table.stored for name in column.names}
-        stored = pa.Table.from_pandas(frame, preserve_index=False)
+        at_once = LISTS_AT_ONCE if table.lists and len(frame) else max(len(frame), 1)
+        starts = range(0, max(len(frame), 1), at_once)
+        parts = (_unfolded(frame.iloc[start : start + at_once], table.lists) for start in starts)
+        blocks = (pa.Table.from_pandas(part, preserve_index=False) for part in parts)
+        block = next(blocks)
         fields = []
-        for one in stored.schema:
+        for one in block.schema:
             column = noted.get(one.name)
             said = {} if column is None else {"unit": column.unit, "note": column.note}
             fields.append(one.with_metadata({key: value for key, value in said.items() if value}))
-        metadata = dict(stored.schema.metadata or {})
+        metadata = dict(block.schema.metadata or {})
         if about is not None:
             metadata[b"tofpod"] = json.dumps(about, sort_keys=True).encode()
-        with atomic_path(Path(folder) / name) as path:
-            pq.write_table(stored.cast(pa.schema(fields, metadata=metadata)), path)
+        schema = pa.schema(fields, metadata=metadata)
+        with atomic_path(Path(folder) / name) as path, pq.ParquetWriter(path, schema) as writer:
+            for stored in chain([block], blocks):
+                writer.write_table(stored.cast(schema))
+
+
+def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
+    """One row for each element of the rows' ``lists``."""
+    if not lists or frame.empty:
+        return frame
+    rows = np.repeat(np.arange(len(frame)), frame[lists[0]].map(len))
+    whole = np.zeros(0, int)  # makes counts whole numbers of 64 bits
+    elements = {name: np.concatenate([*frame[name].to_numpy(), whole]) for name in lists}
+    return frame.drop(columns=list(lists)).iloc[rows].assign(**elements)[list(frame.columns)]
 
 
 def jsonable(value: Any) -> Any:

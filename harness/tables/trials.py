@@ -236,6 +236,7 @@ OPERATING = Table(
     ),
     ("variant", "frames", "role", "board", "repeat"),
     ("parquet",),
+    lists=("threshold", "findings", "hits"),
 )
 PIXELS = Table(
     "pixels",
@@ -248,6 +249,7 @@ PIXELS = Table(
     ),
     ("variant", "frames", "board", "repeat"),
     ("parquet",),
+    lists=("threshold", "above"),
 )
 
 

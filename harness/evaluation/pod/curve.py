@@ -24,6 +24,8 @@ _F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np
     "loglog": (lambda t: np.exp(-np.exp(-t)), lambda p: -np.log(-np.log(p))),
 }
 LINKS = tuple(_F_AND_INVERSE)
+CELLS = 2**17
+"""Curves times targets at a time, or boards drawn again times theirs: 1 MB an array."""
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:

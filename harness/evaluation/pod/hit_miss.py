@@ -29,6 +29,7 @@ from scipy.optimize import elementwise
 from scipy.special import xlogy
 
 from harness.evaluation.pod.curve import (
+    CELLS,
     LINKS,
     Bound,
     HitsAndMisses,
@@ -488,7 +489,9 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     lowest, which = float(data.value(best)) - 0.5 * allowed, np.arange(DIRECTIONS)
 
     def excess(distance: np.ndarray, along: np.ndarray) -> np.ndarray:
-        return data.value(best + distance[..., None] * step[along]) - lowest
+        places, at_once = best + distance[..., None] * step[along], max(1, CELLS // len(data.z))
+        starts = range(0, max(len(places), 1), at_once)
+        return np.concatenate([data.value(places[first : first + at_once]) for first in starts]) - lowest
 
     inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 2.0)
     for _ in range(REACH):

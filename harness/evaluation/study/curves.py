@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, percentiles
-from harness.evaluation.study.limit import DRAWS, board_weights, row_weights
+from harness.evaluation.study.limit import DRAWS, weights_in_blocks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,35 +68,43 @@ def chance_hits(
 def _shuffled(
     places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float, draws: int
 ) -> tuple[float, int, np.ndarray]:
-    """The share of places with a finding near, the number of places laid, and the share of boards drawn again."""
+    """The share of places with a finding near, the number of places laid, and the share of boards drawn again. A
+    board's places are not laid over its own runs; damaged boards without places have no weight among boards drawn."""
+    from scipy.sparse import coo_array
+
     names, of_place, size = np.unique(places["board"].to_numpy(), return_inverse=True, return_counts=True)
     at = places[["true_x_mm", "true_y_mm"]].to_numpy(float)
-    w = board_weights(len(names), draws)
-    hits, laid, weights = [], [], []
+    near, runs_of, boards_of = [], [], []
     for role in ("damaged", "hole_free"):
-        boards, runs_of = np.unique(runs["board"][runs["role"] == role].to_numpy(), return_counts=True)
-        counts = np.zeros((len(names), len(boards)))  # places of board i that have a finding of board j near
+        boards, counted = np.unique(runs["board"][runs["role"] == role].to_numpy(), return_counts=True)
+        pairs = np.zeros((0, 2), int)  # of a place's board and a board with a finding near it
         if not findings.empty:
             unmatched = findings[(findings["role"] == role) & (findings["hole"] == "")]
             for _, here in unmatched.groupby(["board", "repeat"], sort=True):
+                board = here["board"].iloc[0]
                 offset = at[:, None] - here[["x_mm", "y_mm"]].to_numpy(float)
-                near = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
-                counts[:, np.searchsorted(boards, here["board"].iloc[0])] += np.bincount(of_place, near, len(names))
-        other = np.ones_like(counts)
-        if role == "damaged":  # a board's places are not laid over its own runs
-            other = (names[:, None] != boards).astype(float)
-            where = np.minimum(np.searchsorted(names, boards), len(names) - 1)
-            weights.append(np.where(names[where] == boards, w[:, where], 0.0))  # none without places
-        else:
-            weights.append(board_weights(len(boards), draws, "hole-free") if len(boards) else np.zeros((draws, 0)))
-        hits.append(counts * other)
-        laid.append(size[:, None] * runs_of * other)
-    all_hits, all_laid, of_runs = (np.column_stack(parts) for parts in (hits, laid, weights))
-    if not all_laid.sum():
+                hit = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
+                hit &= (names[of_place] != board) | (role != "damaged")
+                over = np.full(hit.sum(), np.searchsorted(boards, board))
+                pairs = np.vstack([pairs, np.column_stack([of_place[hit], over])])
+        near.append(coo_array((np.ones(len(pairs)), pairs.T), (len(names), len(boards))).tocsr())
+        runs_of.append(counted)
+        boards_of.append(boards)
+    _, own, there = np.intersect1d(names, boards_of[0], return_indices=True)
+    of_own = size[own] * runs_of[0][there]
+    laid = int(size.sum() * sum(map(np.sum, runs_of)) - of_own.sum())
+    if not laid:
         return np.nan, 0, np.full(draws, np.nan)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        drawn = ((w @ all_hits) * of_runs).sum(axis=1) / ((w @ all_laid) * of_runs).sum(axis=1)
-    return float(all_hits.sum() / all_laid.sum()), int(all_laid.sum()), drawn
+    drawn = []
+    for w, free in weights_in_blocks(draws, (names, "damaged"), (boards_of[1], "hole-free")):
+        damaged = np.zeros((len(w), len(boards_of[0])))
+        damaged[:, there] = w[:, own]
+        both = [(damaged, near[0], runs_of[0]), (free, near[1], runs_of[1])]
+        hits = sum(((pairs.T @ w.T).T * weights).sum(axis=1) for weights, pairs, _ in both)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            over = (w @ size) * sum(weights @ counted for weights, _, counted in both) - w[:, own] ** 2 @ of_own
+            drawn.append(hits / over)
+    return float(sum(pairs.sum() for pairs in near) / laid), laid, np.concatenate(drawn)
 
 
 PRO_LIMIT = 0.3
@@ -165,7 +173,6 @@ def roc_curves(
     if holes.empty or sites.empty:
         return ()
     size, negative, found = holes[f"true_{by}_mm"].to_numpy(float), _signal(sites), []
-    of_free = row_weights(sites["board"].to_numpy(), draws, "hole-free")
     for name, of in (
         ("all sizes", np.ones(len(size), bool)),
         ("below a50", size < a50_mm),
@@ -182,9 +189,9 @@ def roc_curves(
         area = _rank_area(positive, negative, np.ones((1, len(positive))), np.ones((1, len(negative))))
         interval = UNKNOWN
         if min(len(np.unique(table["board"])) for table in (damages, sites)) > 1:
-            of_damaged = row_weights(damages["board"].to_numpy(), draws)
-            parts = zip(*(np.array_split(of, 1 + draws // 50) for of in (of_damaged, of_free)), strict=True)
-            interval = percentiles(np.concatenate([_rank_area(positive, negative, *part) for part in parts]))
+            boards = (damages["board"].to_numpy(), "damaged"), (sites["board"].to_numpy(), "hole-free")
+            blocks = weights_in_blocks(draws, *boards)
+            interval = percentiles(np.concatenate([_rank_area(positive, negative, *weights) for weights in blocks]))
         at = (float((negative > threshold).mean()), float((positive > threshold).mean()))
         found.append(Roc(name, false, true, at, float(area[0]), interval, len(positive), len(negative)))
     return tuple(found)
@@ -200,20 +207,21 @@ def free_response(
     if operating.empty or holes.empty or free.empty:
         return None
     area_m2 = float(free["inspected_m2"].sum())
-    flawless = operating[operating["role"] == "hole_free"].groupby("threshold", sort=True)["findings"].sum().iloc[::-1]
-    calls = flawless.to_numpy(float)
+    thresholds = np.asarray(operating["threshold"].iloc[0], float)[::-1]
+    calls = _counts(operating.loc[operating["role"] == "hole_free", "findings"]).sum(axis=0)[::-1].astype(float)
     kept = calls >= np.maximum.accumulate(calls)
-    thresholds = flawless.index.to_numpy(float)[kept]
     damaged = operating[operating["role"] == "damaged"]
     of_board = holes.groupby("board", sort=True).size()
     # A board that was too full for any damage has runs, and no inspections.
-    counted = damaged.pivot_table("hits", "board", "threshold", "sum", sort=True).reindex(of_board.index, fill_value=0)
-    hits, inspections = counted[thresholds].to_numpy(float), of_board.to_numpy(float)
-    weights = board_weights(len(inspections), draws)
-    edges = [percentiles(column) for column in ((weights @ hits) / (weights @ inspections)[:, None]).T]
+    counted = _over_rows(damaged, _counts(damaged["hits"])).reindex(of_board.index, fill_value=0)
+    hits, inspections = counted.to_numpy(float)[:, ::-1][:, kept], of_board.to_numpy(float)
+    blocks = weights_in_blocks(draws, (of_board.index.to_numpy(), "damaged"))
+    drawn = np.concatenate([(weights @ hits) / (weights @ inspections)[:, None] for (weights,) in blocks])
+    edges = [percentiles(column) for column in drawn.T]
     low, high = np.array([(edge.low, edge.high) for edge in edges]).reshape(-1, 2).T
     at = (int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean()))
-    return FreeResponse(thresholds, calls[kept] / area_m2, hits.sum(axis=0) / inspections.sum(), low, high, at, area_m2)
+    found = hits.sum(axis=0) / inspections.sum()
+    return FreeResponse(thresholds[kept], calls[kept] / area_m2, found, low, high, at, area_m2)
 
 
 def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None:
@@ -221,18 +229,18 @@ def pixel_curves(pixels: pd.DataFrame, draws: int = DRAWS) -> PixelCurves | None
     if pixels.empty:
         return None
     of_damage = (pixels["hole"] != "") & (pixels["pixels"] > 0)
-    face, damage = pixels[pixels["hole"] == ""].assign(share=0.0), pixels[of_damage]
+    face, damage = pixels[pixels["hole"] == ""], pixels[of_damage]
     if face.empty or damage.empty:
         return None
-    one, two = _per_board(face), _per_board(damage.assign(share=damage["above"] / damage["pixels"]))
+    one, two = _per_board(face), _per_board(damage)
     boards = len(one[0]), len(two[0])
     false, overlap, true = _rates(one, two, np.ones((1, boards[0])), np.ones((1, boards[1])))
     why = ""
     if false[0, -2] < PRO_LIMIT and overlap[0, -2] != 1:
         why = f"the thresholds counted end at a false-positive rate of {false[0, -2]:.3g}"
-    of_damaged = board_weights(boards[1], draws)
-    of_face = of_damaged if np.array_equal(one[0], two[0]) else board_weights(boards[0], draws, "hole-free")
-    drawn = _rates(one, two, of_face, of_damaged)
+    of_face = "damaged" if np.array_equal(one[0], two[0]) else "hole-free"
+    blocks = weights_in_blocks(draws, (one[0], of_face), (two[0], "damaged"))
+    drawn = [np.concatenate(parts) for parts in zip(*(_rates(one, two, *weights) for weights in blocks), strict=True)]
     pro, areas = (_area(x, y, PRO_LIMIT) / PRO_LIMIT for x, y in ((false, overlap), drawn[:2]))
     of_pro = UNKNOWN if why or min(boards) < 2 else percentiles(areas)
     auroc = float(_area(false, true, 1.0)[0])
@@ -259,10 +267,24 @@ def _rank_area(positive: np.ndarray, negative: np.ndarray, weights: np.ndarray, 
 
 def _per_board(rows: pd.DataFrame) -> tuple[np.ndarray, ...]:
     """Boards (b,); ``above`` and ``share`` (b, k) per descending threshold; ``pixels`` and number of regions (b,)."""
-    table = rows.pivot_table(["above", "share", "pixels"], "board", "threshold", "sum", sort=True)
-    regions = rows.groupby(["board", "threshold"], sort=True).size().unstack().to_numpy(float)
-    above, share = (table[name].to_numpy(float)[:, ::-1] for name in ("above", "share"))
-    return table.index.to_numpy(), above, share, table["pixels"].to_numpy(float)[:, 0], regions[:, 0]
+    above, pixels = _counts(rows["above"]), rows["pixels"].to_numpy()
+    with np.errstate(invalid="ignore"):  # face of which no pixel was judged has no share, and none is asked for
+        tables = [_over_rows(rows, values) for values in (above, above / pixels[:, None], pixels[:, None])]
+    regions = rows.groupby("board", sort=True).size()
+    above, share, total = (table.to_numpy(float)[:, ::-1] for table in tables)
+    return regions.index.to_numpy(), above, share, total[:, 0], regions.to_numpy(float)
+
+
+def _counts(column: pd.Series) -> np.ndarray:
+    """Lists (n, k) over the thresholds, ascending, of one set-up."""
+    return np.stack(list(column.to_numpy()))
+
+
+def _over_rows(rows: pd.DataFrame, values: np.ndarray) -> pd.DataFrame:
+    """Sums of ``values`` (n, k), one row a board in ascending order."""
+    import pandas as pd
+
+    return pd.DataFrame(values).groupby(rows["board"].to_numpy(), sort=True).sum()
 
 
 def _rates(

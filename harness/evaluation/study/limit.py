@@ -11,7 +11,7 @@ Hinkley 1997, section 3.8)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, false_call_rate, percentiles
 from harness.evaluation.pod.curve import (
+    CELLS,
     Bound,
     HitsAndMisses,
     PodCurve,
@@ -69,7 +70,12 @@ def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np
 def board_weights(boards: int, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
     """Draw boards again: (draws, boards) how often each is in each draw; the same for the same number of boards of a
     population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
-    stream = random_stream(0, "boards drawn again", population, boards)
+    return _drawn(random_stream(0, "boards drawn again", population, boards), boards, draws)
+
+
+def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
+    if not boards:
+        return np.zeros((draws, 0))
     return stream.multinomial(boards, np.full(boards, 1.0 / boards), size=draws).astype(float)
 
 
@@ -79,23 +85,39 @@ def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damage
     return board_weights(len(names), draws, population)[:, which]
 
 
+def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yield the `row_weights` of one or several (board (n,), population) in blocks of draws, so that memory does not
+    grow with draws times rows."""
+    found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
+    streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
+    at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
+    for first in range(0, draws, at_once):
+        count = min(at_once, draws - first)
+        each = zip(streams, found, strict=True)
+        yield tuple(_drawn(stream, len(names), count)[:, which] for stream, (names, which, _) in each)
+
+
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
     """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm with these PODs, by Firth's
     likelihood where hits and misses do not overlap. Infinite where nothing is found or the chance does not grow with
     size; the smallest size inspected where everything is found."""
+    rows = [(targets.board, "damaged")] + ([] if targets.unit is None else [(targets.unit, "units")])
+    blocks = (_refitted(targets, curve, pods, np.multiply.reduce(w)) for w in weights_in_blocks(draws, *rows))
+    return np.concatenate(list(blocks), axis=1)
+
+
+def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weights: np.ndarray) -> np.ndarray:
+    """Refit the curve to targets under ``weights`` (draws, n)."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre, spread = float(x.mean()), float(x.std()) or 1.0
     z = (x - centre) / spread
-    weights = row_weights(targets.board, draws)
-    if targets.unit is not None:
-        weights = weights * row_weights(targets.unit, draws, "units")
     hits, misses = weights * targets.hits, weights * (targets.inspections - targets.hits)
     largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
     smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
     repeats = (weights @ targets.inspections) / weights.sum(axis=1)
     data = HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, curve.link)
     start = np.array([(centre - curve.mu) / curve.sigma, spread / curve.sigma])
-    b = np.full((draws, 2), np.nan)
+    b = np.full((len(weights), 2), np.nan)
     overlap = largest_miss > smallest_hit
     b[overlap] = maxima(data.of(overlap), start)
     apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & ~overlap
@@ -221,8 +243,9 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
             deviance, b, terms = least, bent, 4
         elif p < 0.05:
             note += f"{'; ' if note else ''}diameter and depth interact (p = {p:.2g}), which the surface leaves out"
-    weights, level = row_weights(seen.board, draws), float(link_ppf(link, np.array(POD)))
-    again = _coefficients(crossed[:, :terms], weights * hit, weights * ~hit, link, b[:terms])
+    level, columns = float(link_ppf(link, np.array(POD))), crossed[:, :terms]
+    blocks = weights_in_blocks(draws, (seen.board, "damaged"))
+    again = np.concatenate([_coefficients(columns, w * hit, w * ~hit, link, b[:terms]) for (w,) in blocks])
     b0, b1, b2, b3 = np.vstack([b, np.pad(again, ((0, 0), (0, 4 - terms)))]).T[..., None]
     many = len(np.unique(seen.board)) > 1
 
@@ -415,8 +438,9 @@ def median_over_boards(board: np.ndarray, values: np.ndarray, draws: int = DRAWS
     if not len(values):
         return np.nan, UNKNOWN
     order = np.argsort(values, kind="stable")
-    below = np.cumsum(row_weights(board, draws)[:, order], axis=1)
-    drawn = values[order][(2.0 * below >= below[:, -1:]).argmax(axis=1)]
+    blocks = weights_in_blocks(draws, (board[order], "damaged"))
+    sums = (np.cumsum(weights, axis=1) for (weights,) in blocks)
+    drawn = values[order][np.concatenate([(2.0 * below >= below[:, -1:]).argmax(axis=1) for below in sums])]
     return float(np.median(values)), percentiles(drawn) if len(np.unique(board)) > 1 else UNKNOWN
 
 
@@ -437,8 +461,8 @@ def _over_boards(board: np.ndarray, count: np.ndarray, of: np.ndarray, draws: in
     """95 % percentiles of sum(count) / sum(of) over boards drawn again; unknown of a single board."""
     if len(np.unique(board)) < 2:
         return UNKNOWN
-    weights = row_weights(board, draws, population)
-    return percentiles((weights @ count) / (weights @ of))
+    blocks = weights_in_blocks(draws, (board, population))
+    return percentiles(np.concatenate([(weights @ count) / (weights @ of) for (weights,) in blocks]))
 
 
 def _rows(record: SetUpRecord, response: np.ndarray, kept: np.ndarray) -> Inspections:
