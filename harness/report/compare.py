@@ -109,7 +109,7 @@ def rule(comparison: Comparison) -> str:
         f"{100 * (MARGIN - 1):.0f} %, and a test "
         f"says that it is not by chance (p < {comparison.alpha:g} by Holm over all set-ups and questions). Better "
         "(-): likewise for a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed "
-        "trials. *: a limit for the first time. x: not comparable: other damage or another rule. < and >: in the first, in the second "
+        "trials. *: a limit for the first time. x: not comparable. < and >: in the first, in the second "
         "study only."
     )
 
