@@ -277,9 +277,11 @@ def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
     return np.asarray((covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)).astype(np.float32))
 
 
-def local_sigma(values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0) -> np.ndarray:
-    """Return the robust standard deviation (r, c) of the values' finite neighbours, interpolated between nodes ``half``
-    apart."""
+def local_sigma(
+    values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0, samples: int = SAMPLES_SIDE
+) -> np.ndarray:
+    """Return the robust standard deviation (r, c) of the values' finite neighbours, so many ``samples`` of them from
+    the window's middle to its edge, interpolated between nodes ``half`` apart."""
 
     def nodes_of(length: int) -> np.ndarray:
         """Return the middles of equal parts, where `cv2.resize` takes its samples to lie, moved to pixels such that
@@ -293,7 +295,7 @@ def local_sigma(values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0
 
     rows, columns = (nodes_of(length) for length in values.shape)
     sizes = np.abs(values).astype(np.float32)
-    nodes = _local_medians(sizes, rows, columns, half, max(1, half // SAMPLES_SIDE)) / 0.6745
+    nodes = _local_medians(sizes, rows, columns, half, max(1, half // samples)) / 0.6745
     known = np.isfinite(nodes)
     everywhere = float(np.median(nodes[known])) if known.any() else float(np.nanmedian(sizes)) / 0.6745
     nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)

@@ -2,7 +2,8 @@
 
 The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the capture itself, off what
 stands out, or learned from hole-free clouds. Each template t (discs of several radii through a camera's window or lens,
-and dents) is then compared with the residuals r under that covariance C, restricted to the pixels that are known:
+slots at several angles, dents) is then compared with the residuals r under that covariance C, restricted to the pixels
+that are known:
 
     score = t' C^-1 r / sqrt(t' C^-1 t)
 
@@ -14,11 +15,12 @@ What stands out strongly is taken out (its pixels count as unknown) and the rest
 sees the shoulder of a neighbour's hole. What pixels along the target's outline share is subtracted: what lies behind
 the edge, and light from beside, have a part in them.
 
-Not modelled: slots and scratches, missing returns (`detectors.missing` finds them), templates' distortion where a
-surface is steep. Tails that are heavier than Gaussian scale the narrow templates' scores as a whole. The denominator
-takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely,
-which is exact where all of the template is seen; places where less than `LEAST_SEEN` of it is seen are not judged by
-that template.
+Not modelled: slots that no template fits, but for what they have in common with one; slots within `RIM_PX` of outlines
+and of what was taken out; missing returns (`detectors.missing` finds them); templates' distortion where a surface is
+steep. Tails that are heavier than Gaussian scale the narrow templates' scores as a whole. The denominator takes the
+share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely, which is
+exact where all of the template is seen; places where less than `LEAST_SEEN` of it is seen are not judged by that
+template. Scores of wide templates and of slots are taken on every second pixel.
 """
 
 from __future__ import annotations
@@ -27,23 +29,28 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import cv2
+import numba
 import numpy as np
 import scipy.fft
 from pydantic import model_validator
 
+from detectors.clusters import PLAIN
 from detectors.interface import Evidence
 from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, local_sigma
 from detectors.masks import grown
 from detectors.whitening import (
     ALL_RADII_PX,
+    CONVERGED,
+    FIRST_SLOT,
     GRID,
     LONGEST_LAG_PX,
     ROUGHLY_CONVERGED,
+    coarse,
     grid_of,
+    halved,
     inverse_times,
     noise_covariance,
     response,
-    spectra,
     spectrum,
     worths,
 )
@@ -51,6 +58,8 @@ from harness.vocabulary.geometry import Cloud
 
 WINDOW_RADII, LEAST_WINDOW = 6, 32
 """Half of the window in which scores are set beside their own scatter: so many radii, and pixels at least."""
+SCATTER_SAMPLES = 7
+"""Samples from a window's middle to its edge: scores, which templates correlate, tell no more."""
 LEAST_SEEN = 0.5
 QUIET_SIGMAS = 4.0
 """Pixels beyond it, and their neighbours, do not count for the covariance."""
@@ -89,7 +98,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 2
+    version = 3
 
     def __init__(self, settings: LocalConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
@@ -174,30 +183,77 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
     clipped = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS)
 
     # what stands out strongly: its pixels count as unknown for the rest
-    rough = scipy.fft.rfft2(inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED), grid)
-    first = [response(rough, spectra(grid)[k], noise.shape) * worth_of[k].energy ** -0.5 for k in ROUGHLY]
-    size = np.abs(first)
-    core, taken, taken_by = _cores(size.max(axis=0), np.asarray(ROUGHLY)[size.argmax(axis=0)], noise, known)
+    roughly = inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED)
+    rough = _both(roughly, grid)
+    size, by = np.zeros_like(noise), np.zeros(noise.shape, np.int64)
+    for k in ROUGHLY:
+        first = _whole(response(rough[coarse(k)], k, noise.shape), noise.shape)
+        _keep_stronger(size, by, first / np.float32(worth_of[k].energy ** 0.5), k)
+    core, taken, taken_by = _cores(np.abs(size), by, noise, known)
     seen = known & ~grown(core, MARGIN_PX)
 
-    weighed = scipy.fft.rfft2(inverse_times(np.where(seen, clipped, np.float32(0.0)), seen, power, grid), grid)
-    there, divisors = seen.astype(np.float32), np.ones(len(ALL_RADII_PX))
-    signed, radius_px = np.zeros_like(noise), np.zeros_like(noise)
-    for k, (template, worth) in enumerate(zip(spectra(grid), worth_of, strict=True)):
-        share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-        score = response(weighed, template, noise.shape) / np.sqrt(worth.energy * np.maximum(share, LEAST_SEEN))
-        score = np.where(share > LEAST_SEEN, score, np.float32(0.0))
+    rest = np.where(seen, clipped, np.float32(0.0))
+    weighed = _both(inverse_times(rest, seen, power, grid, CONVERGED, roughly), grid)
+    there, divisors = [seen.astype(np.float32)], np.ones(len(ALL_RADII_PX))
+    even = np.pad(seen, ((0, seen.shape[0] % 2), (0, seen.shape[1] % 2)))
+    there.append(cv2.resize(even.astype(np.float32), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    # what light and flying pixels leave along outlines looks like a slot
+    inner = cv2.resize(_depth_px(even), None, fx=0.5, fy=0.5) > RIM_PX
+    best = [(np.zeros_like(each), np.zeros(each.shape, np.int64)) for each in there]
+    for k, worth in enumerate(worth_of):
+        step = coarse(k)
+        share = cv2.blur(there[step], worth.sides, borderType=cv2.BORDER_CONSTANT)
+        score = response(weighed[step], k, noise.shape)
+        _normalise(score, share, inner if k >= FIRST_SLOT else there[step], worth.energy)
         # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
-        window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW))
-        scatter = np.maximum(local_sigma(np.where(score != 0.0, score, np.nan), window), 1.0)
-        score = score / scatter
-        tail = _tail(score[seen]) if ALL_RADII_PX[k] <= TAIL_PX else 1.0
-        score, divisors[k] = score / tail, tail * np.median(scatter)
-        better = np.abs(score) > np.abs(signed)
-        signed, radius_px = np.where(better, score, signed), np.where(better, np.float32(ALL_RADII_PX[k]), radius_px)
+        window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW) / (1 + step))
+        scatter = np.maximum(local_sigma(score, window, 1.0, SCATTER_SAMPLES), 1.0)
+        if ALL_RADII_PX[k] <= TAIL_PX:
+            scatter *= _tail(np.nan_to_num(score / scatter)[seen])
+        divisors[k] = np.median(scatter[::4, ::4])
+        _keep_stronger(*best[step], score / scatter, k)
+    (signed, by), (wide, wide_by) = best
+    wide = _whole(wide, noise.shape)
+    wide_by = _whole(wide_by.astype(np.float32), noise.shape, cv2.INTER_NEAREST).astype(np.int64)
+    better = np.abs(wide) > np.abs(signed)
+    signed, by = np.where(better, wide, signed), np.where(better, wide_by, by)
+    radius_px = np.asarray(ALL_RADII_PX, np.float32)[by]
     _fill_discs(signed, radius_px)
     signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
     return signed.astype(np.float64), worth_of[0].energy ** -0.5
+
+
+def _both(image: np.ndarray, grid: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the spectrum of a picture, and that of its samples for coarse templates."""
+    whole = scipy.fft.rfft2(image, grid)
+    return whole, halved(whole)
+
+
+@numba.njit(**PLAIN)
+def _normalise(score: np.ndarray, share: np.ndarray, there: np.ndarray, energy: float) -> None:
+    """Turn responses (r, c) into scores, NaN where too little of a template is seen."""
+    for i in range(score.shape[0]):
+        for j in range(score.shape[1]):
+            if share[i, j] > LEAST_SEEN and there[i, j] > 0:
+                score[i, j] /= np.sqrt(energy * share[i, j])
+            else:
+                score[i, j] = np.nan
+
+
+@numba.njit(**PLAIN)
+def _keep_stronger(signed: np.ndarray, by: np.ndarray, score: np.ndarray, number: int) -> None:
+    """Keep of each pixel's scores (r, c) the larger in size, and the ``number`` of its template."""
+    for i in range(score.shape[0]):
+        for j in range(score.shape[1]):
+            if abs(score[i, j]) > abs(signed[i, j]):
+                signed[i, j], by[i, j] = score[i, j], number
+
+
+def _whole(image: np.ndarray, shape: tuple[int, ...], how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Return on every pixel (r, c) what was taken on every second one, or on every pixel already."""
+    if image.shape == shape:
+        return image
+    return np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=how)[: shape[0], : shape[1]])
 
 
 def _tail(scores: np.ndarray) -> float:

@@ -22,7 +22,13 @@ SHARP_RADII_PX = (0.6, 1.2, 2.0)
 """Radii of discs blurred by `LENS_BLUR_PX` only: cameras without such a window."""
 DENT_RADII_PX = (6.0, 9.0, 13.0, 18.0)
 """Radii of paraboloids."""
-ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX)
+SLOT_PX, SLOTS_DEG = (20.0, 2.0), (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)
+"""Length and width of slots, each seen with and without such a window, and the angle of each to the rows."""
+ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX, *(SLOT_PX[0] / 4.0,) * 2 * len(SLOTS_DEG))
+"""Radii of all templates: first discs, then paraboloids, then slots, by the radius of a disc as large."""
+FIRST_SLOT = len(ALL_RADII_PX) - 2 * len(SLOTS_DEG)
+COARSE_PX = 5.0
+"""Radius from which on a template's scores are taken on every second pixel: what is finer holds none of its signal."""
 WINDOW = (0.6, 1.0, 1.0, 1.0, 0.6)
 LENS_BLUR_PX = 0.6
 DENT_BLUR_PX = 1.0
@@ -35,13 +41,14 @@ signal either. 0.02 to 0.3 give the same limits with known cameras, 1.0 gives la
 MOST_WHITENED = 2000  # pixels whose dense covariance is factored: 0.2 s and 64 MB
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, ROUGHLY_CONVERGED, MOST_ITERATIONS = 0.01, 0.1, 30
+CONVERGED, ROUGHLY_CONVERGED, MOST_ITERATIONS = 0.01, 0.2, 30
 """Relative residuals at which C^-1 r counts as solved, and as solved well enough to tell what stands out strongly."""
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid on which a picture of this shape is transformed; it holds every template."""
-    return tuple(scipy.fft.next_fast_len(max(side, GRID) + 2 * LONGEST_LAG_PX, real=True) for side in shape)
+    """Return the grid on which a picture of this shape is transformed; it holds every template; half of it is even."""
+    quarters = (math.ceil((max(side, GRID) + 2 * LONGEST_LAG_PX) / 4) for side in shape)
+    return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -70,10 +77,15 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def inverse_times(
-    values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...], converged: float = CONVERGED
+    values: np.ndarray,
+    known: np.ndarray,
+    power: np.ndarray,
+    shape: tuple[int, ...],
+    converged: float = CONVERGED,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
-    conjugate gradients that start from the stationary inverse."""
+    conjugate gradients that start from the stationary inverse, or from ``start`` (r, c)."""
     h, w = values.shape
     mask = known.astype(np.float32)
 
@@ -81,7 +93,7 @@ def inverse_times(
         return mask * scipy.fft.irfft2(by * scipy.fft.rfft2(image, shape), shape)[:h, :w]
 
     inverse = 1.0 / power
-    solution = filtered(values, inverse)
+    solution = filtered(values, inverse) if start is None else mask * start
     rest = values * mask - filtered(solution, power)
     towards = direction = filtered(rest, inverse)
     product, enough = float((rest * towards).sum()), converged**2 * float((values * values * mask).sum())
@@ -98,15 +110,44 @@ def inverse_times(
     return np.asarray(solution)
 
 
-def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the correlation (r, c) of a picture, whose spectrum is given, with a template."""
-    size = (spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1))
-    return np.asarray(scipy.fft.irfft2(spectrum_of * template, size)[: shape[0], : shape[1]])
+def response(spectrum_of: np.ndarray, number: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the correlation (r, c) of a picture, whose spectrum is given, with a template; of a coarse template, for
+    which the spectrum is that of `halved`, in the middles of 2 x 2 pixels."""
+    grid = (spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1))
+    if coarse(number):
+        template = spectra((2 * grid[0], 2 * grid[1]))[number]
+        shape = (-(-shape[0] // 2), -(-shape[1] // 2))
+    else:
+        template = spectra(grid)[number]
+    return np.asarray(scipy.fft.irfft2(spectrum_of * template, grid)[: shape[0], : shape[1]])
+
+
+def coarse(number: int) -> bool:
+    """Return whether a template's scores are taken on every second pixel only."""
+    return ALL_RADII_PX[number] >= COARSE_PX
+
+
+def halved(spectrum_of: np.ndarray) -> np.ndarray:
+    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without its higher frequencies."""
+    return _low(spectrum_of) * _middles((spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1)))
+
+
+@lru_cache(maxsize=4)
+def _middles(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the factors that move a spectrum's lower half by half a pixel, and scale it to a quarter of the pixels."""
+    cycles = np.add.outer(np.fft.fftfreq(shape[0] // 2) / 2, np.arange(shape[1] // 4 + 1) / shape[1])
+    return np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
+
+
+def _low(spectrum_of: np.ndarray) -> np.ndarray:
+    """Return the lower half of a spectrum's frequencies along either axis, as `scipy.fft.rfft2` orders them."""
+    rows, columns = spectrum_of.shape[0] // 4, spectrum_of.shape[1] // 2 + 1
+    return np.concatenate((spectrum_of[:rows, :columns], spectrum_of[-rows:, :columns]))
 
 
 class Worth(NamedTuple):
-    """The whitened energy of a template, and the sides (along columns, along rows), in pixels, of the rectangle over
-    which it spreads as widely."""
+    """The whitened energy of a template, and the sides (along columns, along rows), in pixels of its scores' picture,
+    of the rectangle over which it spreads as widely."""
 
     energy: float
     sides: tuple[int, int]
@@ -114,37 +155,61 @@ class Worth(NamedTuple):
 
 def worths(power: np.ndarray) -> tuple[Worth, ...]:
     """Return what each template is worth under noise with this spectrum on `GRID`."""
-    found, lags = [], np.arange(GRID) - GRID // 2
-    for template in spectra((GRID, GRID)):
-        white = np.roll(scipy.fft.irfft2(template / np.sqrt(power), (GRID, GRID)) ** 2, (GRID // 2,) * 2, (0, 1))
-        energy = float(white.sum())
-        along, down = (math.sqrt(float(lags**2 @ white.sum(axis=axis)) / energy) for axis in (0, 1))
-        found.append(Worth(energy, (2 * round(math.sqrt(3.0) * along) + 1, 2 * round(math.sqrt(3.0) * down) + 1)))
+    found, white = [], 1.0 / np.sqrt(power)
+    low = _low(white)
+    for number, template in enumerate(spectra((GRID, GRID))):
+        values = template * (low if coarse(number) else white)
+        # by Parseval's theorem; a second moment over space is the energy of a derivative over frequency
+        half, side = np.full(values.shape[1], 2.0), len(values)
+        half[[0, -1]] = 1.0
+        energy = float((values**2).sum(axis=0) @ half)
+        down = float(((values - np.roll(values, 1, axis=0)) ** 2).sum(axis=0) @ half)
+        along = 2.0 * float((np.diff(values, axis=1) ** 2).sum())
+        sides = (2 * round(math.sqrt(3.0 * each / energy) * side / (2.0 * math.pi)) + 1 for each in (along, down))
+        found.append(Worth(energy / GRID**2, (next(sides), next(sides))))
     return tuple(found)
 
 
 @lru_cache(maxsize=4)
 def spectra(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Return the templates' conjugate spectra on a grid that holds them, each with its centre at pixel (0, 0) and the
-    height 1 of the undisturbed damage."""
-    return tuple(np.conj(scipy.fft.rfft2(_centred(template, shape))) for template in _templates())
+    """Return the templates' spectra on a grid that holds them, which are real as templates are symmetric, for the
+    height 1 of the undisturbed damage; of coarse templates the lower half."""
+    drawn = (scipy.fft.rfft2(_centred(template, shape)).real for template in _templates())
+    return tuple((_low(each) if coarse(number) else each).copy() for number, each in enumerate(drawn))
 
 
 @lru_cache(maxsize=1)
 def _templates() -> tuple[np.ndarray, ...]:
     """Return the templates, each on a square of an odd number of pixels."""
     window = np.outer(WINDOW, WINDOW) / np.sum(WINDOW) ** 2
-    windowed = [cv2.filter2D(_drawn(r, LENS_BLUR_PX), -1, window, borderType=cv2.BORDER_CONSTANT) for r in RADII_PX]
-    sharp = [_drawn(r, LENS_BLUR_PX) for r in SHARP_RADII_PX]
-    return (*windowed, *sharp, *(_drawn(r, DENT_BLUR_PX, dent=True) for r in DENT_RADII_PX))
+
+    def disc(radius_px: float) -> np.ndarray:
+        return _drawn(lambda x, y: np.hypot(x, y) < radius_px, radius_px, LENS_BLUR_PX)
+
+    def dent(radius_px: float) -> np.ndarray:
+        return _drawn(lambda x, y: np.maximum(1.0 - (x**2 + y**2) / radius_px**2, 0.0), radius_px, DENT_BLUR_PX)
+
+    def slot(angle_deg: float) -> np.ndarray:
+        turn = np.exp(-1j * math.radians(angle_deg))
+
+        def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+            along = (x + 1j * y) * turn
+            return (np.abs(along.real) < SLOT_PX[0] / 2) & (np.abs(along.imag) < SLOT_PX[1] / 2)
+
+        return _drawn(inside, SLOT_PX[0] / 2, LENS_BLUR_PX)
+
+    def windowed(image: np.ndarray) -> np.ndarray:
+        return cv2.filter2D(image, -1, window, borderType=cv2.BORDER_CONSTANT)
+
+    sharp, slots = map(disc, SHARP_RADII_PX), [slot(angle_deg) for angle_deg in SLOTS_DEG]
+    return (*map(windowed, map(disc, RADII_PX)), *sharp, *map(dent, DENT_RADII_PX), *map(windowed, slots), *slots)
 
 
-def _drawn(radius_px: float, blur_px: float, *, dent: bool = False) -> np.ndarray:
-    """Return a disc, or a paraboloid, of height 1, averaged over pixels and blurred by a Gaussian."""
-    finer, half = 4, int(radius_px + 5)
+def _drawn(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float, blur_px: float) -> np.ndarray:
+    """Return a shape of x and y in pixels, averaged over pixels and blurred by a Gaussian."""
+    finer, half = 4, int(reach_px + 5)
     places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
-    apart = np.hypot(places[:, None], places[None]) / radius_px
-    height = np.maximum(1.0 - apart**2, 0.0) if dent else (apart < 1.0).astype(float)
+    height = shape(places[None, :], places[:, None]).astype(float)
     pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
     return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
 

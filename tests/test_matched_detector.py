@@ -13,10 +13,15 @@ from detectors.interface import Detection
 from detectors.matched import MatchedDetector
 from detectors.measure import HoleFit, HolePatch, fit_hole, pictures, straight_sight
 from detectors.whitening import (
+    FIRST_SLOT,
     GRID,
     LONGEST_LAG_PX,
+    coarse,
+    grid_of,
+    halved,
     inverse_times,
     noise_covariance,
+    response,
     spectra,
     spectrum,
     whitener,
@@ -122,6 +127,31 @@ def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
     assert len(found(cloud_of(deep), 5.0)) == 1
     touching = hole(40, 45, 3.0, 0.03) + hole(50, 45, 3.0, 0.03) + 3e-4 * blurred(6)
     assert len(found(cloud_of(touching), 5.0)) == 2
+
+
+def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
+    """A slot 2 pixels wide and 20 long under white noise, at an angle that no template has: found at a score of 5 at a
+    depth at which the best disc or dent would have less."""
+    finer = 4
+    places = (np.indices((SHAPE[0] * finer, SHAPE[1] * finer)) + 0.5) / finer - 0.5
+    along = (places[1] - 60.4 + 1j * (places[0] - 45.2)) * np.exp(-1j * np.radians(50.0))
+    inside = (np.abs(along.real) < 10.0) & (np.abs(along.imag) < 1.0)
+    slot = inside.reshape(SHAPE[0], finer, SHAPE[1], finer).mean(axis=(1, 3))
+    grid = grid_of(SHAPE)
+    whole = np.fft.rfft2(slot, grid)
+    worth = worths(np.ones((GRID, GRID // 2 + 1), np.float32))
+    scores = [
+        float(response(halved(whole) if coarse(k) else whole, k, SHAPE).max()) / each.energy**0.5
+        for k, each in enumerate(worth)
+    ]
+    discs, slots = max(scores[:FIRST_SLOT]), max(scores[FIRST_SLOT:])
+    depth = 7.5 / slots
+    assert depth * discs < 5.0
+    for seed in (20, 21, 22):
+        noise = np.random.default_rng(seed).standard_normal(SHAPE)
+        places_found = found(cloud_of(3e-4 * (noise + depth * slot)), 5.0)
+        assert len(places_found) == 1
+        assert np.hypot(*(np.array(np.unravel_index(places_found[0].pixels[0], SHAPE)) - (45.2, 60.4))) < 8.0
 
 
 def test_light_along_the_rim_is_no_finding() -> None:
