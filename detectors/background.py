@@ -95,9 +95,9 @@ class _Cells:
         """Standard deviation of a pixel: about its cell's median, and of that median."""
         return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
 
-    def refreshed(self, points: np.ndarray, fit: Fit) -> _Cells:
-        """Return the cells with medians and deviations of the points' residuals; some then count no more."""
-        medians, deviations = _group_medians(points[:, 2] - fit(points), self.of, len(self.points))
+    def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
+        """Return the cells with medians and deviations of the points' residuals (n,); some then count no more."""
+        medians, deviations = _group_medians(residuals, self.of, len(self.points))
         z = fit(self.points) + medians
         known = np.isfinite(z)
         moved = self.points * (z / self.points[:, 2])[:, None] if self.central else self.points.copy()
@@ -135,11 +135,12 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     else:
         shape = _chosen(cells, config)
         for _ in range(2):
-            cells = cells.refreshed(points, shape.fit)
+            cells = cells.refreshed(points[:, 2] - shape.fit(points), shape.fit)
             shape = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
         name, fit, wavelength = shape.name, shape.fit, shape.wavelength
 
     fitted = fit(points)
+    residuals = points[:, 2] - fitted
     unseen = ~np.isfinite(fitted)
     if cells.central:
         # few pixels are near enough to the steepest incidence to be looked at each; a ray that misses the surface
@@ -148,7 +149,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         looked = np.flatnonzero((cells.of < 0) | near[cells.of])
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
     fitted[unseen] = np.nan
-    cells = cells.refreshed(points, fit)
+    cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
     text, scale_m = name, None
     if wavelength is not None:
@@ -192,13 +193,14 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
     central = cloud.projection == "central" and float(points[:, 2].min()) > 0
-    places = picture_places(points, central)
-    low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-12)
+    x, y = np.ascontiguousarray(picture_places(points, central).T)
+    extent = np.maximum([np.ptp(x), np.ptp(y)], 1e-12)
     wanted = max(min(max(CELL_POINTS, len(points) / ENOUGH_CELLS), EVEN_CELL_POINTS), len(points) / MOST_CELLS)
     side = float(np.sqrt(extent.prod() * wanted / len(points)))
     for _ in range(3):
-        where = np.floor((places - low) / side).astype(np.int64)
-        keys = where[:, 1] * (where[:, 0].max() + 1) + where[:, 0]
+        across, down = (((each - each.min()) / side).astype(np.int64) for each in (x, y))
+        columns = int(across.max()) + 1
+        keys = down * columns + across
         counts = np.bincount(keys)
         side *= float(np.sqrt(wanted / max(median_of(counts[counts > 0].astype(float)), 1.0)))
     held = np.flatnonzero(counts >= max(4, wanted / 4))
@@ -207,15 +209,15 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     number = np.full(len(counts), -1)
     number[held] = np.arange(len(held))
     of = number[keys]
-    row, column = np.divmod(held, where[:, 0].max() + 1)
-    inside = of >= 0
-    middle = np.stack([np.bincount(of[inside], places[inside, k]) / counts[held] for k in (0, 1)], axis=1)
+    row, column = np.divmod(held, columns)
+    middle = np.stack([np.bincount(keys, each)[held] / counts[held] for each in (x, y)], axis=1)
     _, start = _stated(points[:: max(1, len(points) // 8192)], SurfaceConfig(degree=2, method="bisquare"))
     side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
     z = _group_medians(points[:, 2], of, len(held))[0]
     first = np.column_stack([middle * (z[:, None] if central else 1.0), z])
     weights, none = np.minimum(counts[held] / wanted, 1.0), np.zeros(len(held))
-    return _Cells(first, weights, none, 0.0, of, row, column, side, side_m, central).refreshed(points, start)
+    cells = _Cells(first, weights, none, 0.0, of, row, column, side, side_m, central)
+    return cells.refreshed(points[:, 2] - start(points), start)
 
 
 @numba.njit(cache=True, nogil=True)

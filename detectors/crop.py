@@ -351,7 +351,8 @@ CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
 def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
     """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError where nothing is left, with the
     cloud's extent, and for a polygon on a cloud without a grid."""
-    if not cloud.valid.any():
+    valid = cloud.valid
+    if not valid.any():
         raise UserError("the cloud has no valid point to crop", fix="check the capture")
     if isinstance(config, AutoCrop):
         mask = choice_of(cloud, config).mask
@@ -360,12 +361,12 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
     elif isinstance(config, PolygonCrop):
         mask = _polygon(cloud, config)
     else:
-        mask = cloud.valid
+        mask = valid
     if cloud.organised and not isinstance(config, AutoCrop):
         mask = inset(mask, config.inset_px)
     if mask.any():
         return mask
-    points = cloud.points_m[cloud.valid]
+    points = cloud.points_m[valid]
     (x0, y0, z0), (x1, y1, z1) = points.min(axis=0) / MM, points.max(axis=0) / MM
     extent = f"x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f}, z {z0:.0f} to {z1:.0f} mm"
     if isinstance(config, BoxCrop):

@@ -28,22 +28,19 @@ def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: fl
     residual = points[:, 2] - base(points)
     w = np.where(np.isfinite(residual), weights, 0.0)
     values, numbers = _splines((places - low) / spacing, counts)
-    starts = np.arange(0, values.size + 1, 16)
-    design = sparse.csr_array((values.ravel(), numbers.ravel(), starts), shape=(len(points), int(counts.prod())))
     # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the factor
     stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
-    weighted = sparse.diags_array(w) @ design
-    gram = sparse.coo_array(sparse.triu(design.T @ weighted + stiffness * _penalty(int(counts[0]), int(counts[1]))))
     # LAPACK's upper bands
     width = int(3 * counts[1] + 3)
-    banded = np.zeros((width + 1, design.shape[1]))
-    banded[width + gram.row - gram.col, gram.col] = gram.data
+    banded, right = _normal_bands(values, numbers, w, np.where(w > 0, residual, 0.0), width, int(counts.prod()))
+    penalty = _penalty(int(counts[0]), int(counts[1]))
+    banded[width + penalty.row - penalty.col, penalty.col] += stiffness * penalty.data
     banded[-1] += RIDGE * float(banded[-1].max())
-    coefficients = solveh_banded(banded, weighted.T @ np.where(w > 0, residual, 0.0), check_finite=False)
+    coefficients = solveh_banded(banded, right, check_finite=False)
     table = coefficients.reshape(counts)
 
     def z_at(q: np.ndarray) -> np.ndarray:
-        return base(q) + _spline_sums((picture_places(q, central) - low) / spacing, table)
+        return base(q) + _spline_sums(q, central, low, spacing, table)
 
     return z_at
 
@@ -79,12 +76,32 @@ def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 @numba.njit(**PLAIN)
-def _spline_sums(places: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return the splines' sum (n,) by coefficients (rows, columns) at places (n, 2)."""
-    out, down, across = np.empty(len(places)), np.empty(4), np.empty(4)
+def _normal_bands(
+    values: np.ndarray, numbers: np.ndarray, weights: np.ndarray, z: np.ndarray, width: int, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted normal matrix of the splines as upper bands (width + 1, size), and the right side (size,)."""
+    banded, right = np.zeros((width + 1, size)), np.zeros(size)
+    for i in range(len(z)):
+        for a in range(16):
+            row, weighted = numbers[i, a], weights[i] * values[i, a]
+            right[row] += weighted * z[i]
+            for b in range(a, 16):
+                column = numbers[i, b]
+                banded[width + row - column, column] += weighted * values[i, b]
+    return banded, right
+
+
+@numba.njit(error_model="numpy", **PLAIN)
+def _spline_sums(
+    points: np.ndarray, central: bool, low: np.ndarray, spacing: float, coefficients: np.ndarray
+) -> np.ndarray:
+    """Return the splines' sum (n,) by coefficients (rows, columns) at points (n, 3)."""
+    out, down, across = np.empty(len(points)), np.empty(4), np.empty(4)
     rows, columns = coefficients.shape
-    for i in range(len(places)):
-        row, column = _spline(places[i, 0], rows, down), _spline(places[i, 1], columns, across)
+    for i in range(len(points)):
+        z = points[i, 2] if central else 1.0
+        row = _spline((points[i, 0] / z - low[0]) / spacing, rows, down)
+        column = _spline((points[i, 1] / z - low[1]) / spacing, columns, across)
         total = 0.0
         for k in range(4):
             part = coefficients[row + k, column : column + 4]
@@ -94,14 +111,16 @@ def _spline_sums(places: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _penalty(rows: int, columns: int) -> sparse.csr_array:
-    """Return the sum of squared third differences of (rows, columns) coefficients, mixed ones three times."""
+def _penalty(rows: int, columns: int) -> sparse.coo_array:
+    """Return the upper half of the sum of squared third differences of (rows, columns) coefficients, mixed ones three
+    times."""
 
     def squared(count: int, order: int) -> np.ndarray:
         differences = np.diff(np.eye(count), order, axis=0)
         return np.asarray(differences.T @ differences)
 
-    return sum(
+    whole = sum(
         factor * sparse.csr_array(sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr"))
         for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
     )
+    return sparse.coo_array(sparse.triu(whole))

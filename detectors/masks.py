@@ -60,8 +60,8 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     apart, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
-    flat = np.zeros(labels.max() + 1, dtype=np.int64)
     inside = np.flatnonzero(mask)
+    flat = np.zeros(len(inside) + 1, dtype=np.int64)
     flat[labels.reshape(-1)[inside]] = inside
     return apart, flat[labels]
 

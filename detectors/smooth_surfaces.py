@@ -113,8 +113,21 @@ def sees_from_origin(cloud: Cloud) -> bool:
     """Return whether the cloud's grid samples rays through the origin, as a camera does."""
     if cloud.projection != "central":
         return False
-    x, y, z = (cloud.points_m[..., k][cloud.valid] for k in range(3))
-    return bool(len(z)) and bool(z.min() > 0) and float(max(np.abs(x / z).max(), np.abs(y / z).max())) < WIDEST_SLOPE
+    return _widest_slope(cloud.points_m) < WIDEST_SLOPE
+
+
+@numba.njit(error_model="numpy", **PLAIN)
+def _widest_slope(points_m: np.ndarray) -> float:
+    """Return the largest |x / z| or |y / z| of points (h, w, 3); infinite without a point, or with one behind z = 0."""
+    widest = -1.0
+    for i in range(points_m.shape[0]):
+        for j in range(points_m.shape[1]):
+            x, y, z = points_m[i, j, 0], points_m[i, j, 1], points_m[i, j, 2]
+            if z <= 0.0:
+                return np.inf
+            if np.isfinite(z):
+                widest = max(widest, abs(x / z), abs(y / z))
+    return widest if widest >= 0.0 else np.inf
 
 
 @numba.njit(error_model="numpy", **PLAIN)
@@ -196,7 +209,9 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
     large = int((sizes >= max(LEAST_PX, int(LEAST_SHARE * cores.size))).sum())
     kept = []
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
-        whole = np.pad(holes_filled(cores == number), 1)
+        core = cores == number
+        u, v, width, height = cv2.boundingRect(core.view(np.uint8))
+        whole = np.pad(holes_filled(core[v : v + height, u : u + width]), 1)
         if np.count_nonzero(shrunk(whole, window)) >= WIDE_PART * np.count_nonzero(whole):
             kept.append(number)
     if not kept and len(sizes):

@@ -151,7 +151,7 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     basis = chebyshev.basis(xy)
     middle = float(np.median(z_m[:: max(1, len(z_m) // SAMPLE_POINTS)]))
     z = np.asarray(z_m, dtype=np.float64) - middle
-    plain = _solved(basis, z)
+    plain = _solved(basis, z) if config.method == "least_squares" else _solved(*_thinned(basis, z, SAMPLE_POINTS))
     if plain is None:
         raise UserError(
             f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
@@ -206,73 +206,42 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         c, knees = _lar(few_basis, few_z, start, KNEES[:3])[0], knees[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
-    rows = np.ascontiguousarray(basis.T)
-    sizes = np.abs(z - rows @ c)
-    scale = max(float(np.median(sizes[:: max(1, len(sizes) // SAMPLE_POINTS)])), TINY_M)
-    steps, gap, total = 0, np.inf, float(sizes.sum())
+    r = z - c @ basis
+    scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
+    steps, gap = 0, np.inf
     for knee in scale * knees:
-        enough, reach = 0.001 * GAP_CONVERGED * total, max(margin * scale, 10.0 * knee)
+        enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
+        reach = max(margin * scale, 10.0 * knee)
         while True:
-            near_rows, near_z, far_pull = _parted(rows, z, c, reach)
-            new, spent = _smoothed_descent(near_rows, near_z, far_pull, c, knee, enough)
-            crossed, total, excess = _judged(rows, z, c, new, reach, knee)
-            steps += spent
-            if not crossed:
+            far = np.abs(r) >= reach
+            near = np.flatnonzero(~far)
+            far_pull = basis @ np.where(far, np.sign(r), 0.0)
+            rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
+            new, spent = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
+            after, steps = z - new @ basis, steps + spent
+            # a far point may have crossed the surface, or come within the knee of it
+            if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
                 break
             reach *= 3.0
-        c, margin, gap = new, min(margin, 5.0 * knee / scale), excess / max(total, TINY_M)
+        c, r, margin = new, after, min(margin, 5.0 * knee / scale)
+        sizes = np.abs(r)
+        inside = sizes[sizes <= knee]
+        gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
     return c, steps, gap <= GAP_CONVERGED, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
 
 
 @numba.njit(**PLAIN)
-def _off(row: np.ndarray, z: float, c: np.ndarray) -> float:
-    for j in range(len(c)):
-        z -= row[j] * c[j]
-    return z
-
-
-@numba.njit(**PLAIN)
-def _parted(rows: np.ndarray, z: np.ndarray, c: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows (m, p) and z (m,) of the points nearer than ``reach``, and the pull (p,) of the others."""
-    near_rows, near_z, pull, count = np.empty_like(rows), np.empty_like(z), np.zeros(len(c)), 0
-    for i in range(len(z)):
-        r = _off(rows[i], z[i], c)
-        if abs(r) < reach:
-            near_rows[count], near_z[count] = rows[i], z[i]
-            count += 1
-        else:
-            for j in range(len(c)):
-                pull[j] += rows[i, j] if r > 0.0 else -rows[i, j]
-    return near_rows[:count], near_z[:count], pull
-
-
-@numba.njit(**PLAIN)
-def _judged(
-    rows: np.ndarray, z: np.ndarray, before: np.ndarray, after: np.ndarray, reach: float, knee: float
-) -> tuple[bool, float, float]:
-    """Return whether a far point has crossed the surface, or come within the knee of it, the sum of |r|, and by how
-    much it may exceed the least."""
-    crossed, total, excess = False, 0.0, 0.0
-    for i in range(len(z)):
-        was, r = _off(rows[i], z[i], before), _off(rows[i], z[i], after)
-        size = abs(r)
-        crossed |= abs(was) >= reach and (size < knee or (was > 0.0) != (r > 0.0))
-        total += size
-        if size <= knee:
-            excess += size - size**2 / knee
-    return crossed, total, excess
-
-
-@numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the normal matrix (p, p), lower
-    half, of the points inside the knee."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the normal matrix (p, p) of the
+    points inside the knee."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
-        r = _off(rows[i], z[i], c)
+        r = z[i]
+        for j in range(terms):
+            r -= rows[i, j] * c[j]
         capped = min(abs(r), knee)
         value += capped * (abs(r) - 0.5 * capped) / knee
         slope = min(max(r / knee, -1.0), 1.0)
@@ -282,6 +251,7 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
             for j in range(terms):
                 for k in range(j + 1):
                     inside[j, k] += rows[i, j] * rows[i, k]
+                    inside[k, j] = inside[j, k]
     return value, pull, inside
 
 
@@ -303,7 +273,7 @@ def _smoothed_descent(
     for step in range(1, LAR_STEPS + 1):
         factor, moved = _factor(inside), None
         if factor is not None:
-            way = knee * cho_solve((factor, True), pull, check_finite=False)
+            way = knee * np.linalg.solve(inside, pull)
             if way @ pull < enough:
                 return c, step
             moved = lower(way)
