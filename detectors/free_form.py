@@ -104,8 +104,10 @@ def _spline_sums(
         column = _spline((points[i, 1] / z - low[1]) / spacing, columns, across)
         total = 0.0
         for k in range(4):
-            part = coefficients[row + k, column : column + 4]
-            total += down[k] * (part[0] * across[0] + part[1] * across[1] + part[2] * across[2] + part[3] * across[3])
+            part = 0.0
+            for m in range(4):
+                part += coefficients[row + k, column + m] * across[m]
+            total += down[k] * part
         out[i] = total
     return out
 

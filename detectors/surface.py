@@ -193,9 +193,10 @@ def _factor(gram: np.ndarray) -> np.ndarray | None:
 def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return about so many of the points, evenly strided; all where there are few or these would not determine it."""
     stride = len(z) // points
-    if stride < 2 or _solved(basis[:, ::stride], z[::stride]) is None:
+    if stride < 2:
         return basis, z
-    return np.ascontiguousarray(basis[:, ::stride]), np.ascontiguousarray(z[::stride])
+    few_basis, few_z = np.ascontiguousarray(basis[:, ::stride]), np.ascontiguousarray(z[::stride])
+    return (basis, z) if _solved(few_basis, few_z) is None else (few_basis, few_z)
 
 
 def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray = KNEES) -> Solution:

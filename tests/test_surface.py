@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.polynomial.chebyshev import chebvander2d
+from scipy.interpolate import BSpline
 from scipy.optimize import linprog
 
-from detectors.surface import Surface, SurfaceConfig, fit_surface
+from detectors.free_form import free_form
+from detectors.surface import Chebyshev, Surface, SurfaceConfig, fit_surface
 from harness.vocabulary.errors import UserError
 
 METHODS = ("lar", "bisquare", "lts", "least_squares")
@@ -173,3 +176,38 @@ def test_too_few_or_degenerate_points_are_a_clear_mistake() -> None:
         fit(x, y, z)
     with pytest.raises(UserError, match="lie on a line"):
         fit(np.linspace(0, 1, 50), np.linspace(0, 1, 50), np.ones(50))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 5])
+def test_products_and_their_sum_are_numpys(degree: int) -> None:
+    xy = np.random.default_rng(degree).uniform(-0.2, 0.3, (50, 2))
+    chebyshev = Chebyshev.over(xy, degree)
+    scaled = 2 * (xy - xy.min(axis=0)) / np.ptp(xy, axis=0) - 1
+    a, b = chebyshev.powers.T
+    expected = chebvander2d(*scaled.T, [degree, degree]).reshape(50, degree + 1, degree + 1)[:, a, b]
+    np.testing.assert_allclose(chebyshev.basis(xy).T, expected, atol=1e-13)
+    c = np.arange(1.0, 1.0 + len(chebyshev.powers))
+    np.testing.assert_allclose(chebyshev.summed(c, xy), expected @ c, atol=1e-11)
+
+
+def test_a_free_form_is_the_penalised_spline() -> None:
+    """The same knots and penalty, built densely from scipy's splines."""
+    random, spacing, wavelength, cell = np.random.default_rng(4), 0.05, 0.2, 0.01
+    points = np.column_stack([random.uniform(0, 0.3, (400, 2)), random.normal(0, 1e-3, 400)])
+    points[:2, :2] = [[0, 0], [0.3, 0.3]]
+    weights = random.uniform(0, 1, 400)
+    counts = np.ceil(np.ptp(points[:, :2], axis=0) / spacing).astype(int) + 3
+    designs = []
+    for k in (0, 1):
+        knots = spacing * (np.arange(counts[k] + 4) - 3.0)
+        designs.append(BSpline.design_matrix(np.minimum(points[:, k], 0.3 - 1e-12), knots, 3).toarray())
+    design = np.einsum("ni,nj->nij", *designs).reshape(400, -1)
+    squares = [[d.T @ d for d in (np.diff(np.eye(n), order, axis=0) for order in range(4))] for n in counts]
+    penalty = sum(f * np.kron(squares[0][k], squares[1][3 - k]) for k, f in enumerate((1, 3, 3, 1)))
+    stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
+    gram = design.T @ (weights[:, None] * design) + stiffness * penalty
+    gram += 1e-9 * gram.diagonal().max() * np.eye(len(gram))
+    expected = design @ np.linalg.solve(gram, design.T @ (weights * points[:, 2]))
+    fitted = free_form(points, weights, lambda p: np.zeros(len(p)), wavelength, cell, central=False)(points)
+    np.testing.assert_allclose(fitted, expected, atol=1e-9)
+    assert np.abs(expected).max() > 1e-4
