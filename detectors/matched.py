@@ -20,7 +20,7 @@ and of what was taken out; missing returns (`detectors.missing` finds them); tem
 steep. Tails that are heavier than Gaussian scale the narrow templates' scores as a whole. The denominator takes the
 share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely, which is
 exact where all of the template is seen; places where less than `LEAST_SEEN` of it is seen are not judged by that
-template. Scores of wide templates and of slots are taken on every second pixel.
+template. Scores of slots are taken on every second pixel.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ from detectors.masks import grown
 from detectors.whitening import (
     ALL_RADII_PX,
     CONVERGED,
-    FIRST_SLOT,
     GRID,
     LONGEST_LAG_PX,
     ROUGHLY_CONVERGED,
@@ -184,27 +183,27 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
 
     # what stands out strongly: its pixels count as unknown for the rest
     roughly = inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED)
-    rough = _both(roughly, grid)
+    rough = scipy.fft.rfft2(roughly, grid)
     size, by = np.zeros_like(noise), np.zeros(noise.shape, np.int64)
     for k in ROUGHLY:
-        first = _whole(response(rough[coarse(k)], k, noise.shape), noise.shape)
-        _keep_stronger(size, by, first / np.float32(worth_of[k].energy ** 0.5), k)
+        _keep_stronger(size, by, response(rough, k, noise.shape) * np.float32(worth_of[k].energy ** -0.5), k)
     core, taken, taken_by = _cores(np.abs(size), by, noise, known)
     seen = known & ~grown(core, MARGIN_PX)
 
     rest = np.where(seen, clipped, np.float32(0.0))
-    weighed = _both(inverse_times(rest, seen, power, grid, CONVERGED, roughly), grid)
+    whole = scipy.fft.rfft2(inverse_times(rest, seen, power, grid, CONVERGED, roughly), grid)
+    weighed = whole, halved(whole)
     there, divisors = [seen.astype(np.float32)], np.ones(len(ALL_RADII_PX))
     even = np.pad(seen, ((0, seen.shape[0] % 2), (0, seen.shape[1] % 2)))
     there.append(cv2.resize(even.astype(np.float32), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     # what light and flying pixels leave along outlines looks like a slot
     inner = cv2.resize(_depth_px(even), None, fx=0.5, fy=0.5) > RIM_PX
-    best = [(np.zeros_like(each), np.zeros(each.shape, np.int64)) for each in there]
+    (signed, by), slots = best = [(np.zeros_like(each), np.zeros(each.shape, np.int64)) for each in there]
     for k, worth in enumerate(worth_of):
         step = coarse(k)
         share = cv2.blur(there[step], worth.sides, borderType=cv2.BORDER_CONSTANT)
         score = response(weighed[step], k, noise.shape)
-        _normalise(score, share, inner if k >= FIRST_SLOT else there[step], worth.energy)
+        _normalise(score, share, inner if step else there[0], worth.energy)
         # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
         window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW) / (1 + step))
         scatter = np.maximum(local_sigma(score, window, 1.0, SCATTER_SAMPLES), 1.0)
@@ -212,21 +211,11 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
             scatter *= _tail(np.nan_to_num(score / scatter)[seen])
         divisors[k] = np.median(scatter[::4, ::4])
         _keep_stronger(*best[step], score / scatter, k)
-    (signed, by), (wide, wide_by) = best
-    wide = _whole(wide, noise.shape)
-    wide_by = _whole(wide_by.astype(np.float32), noise.shape, cv2.INTER_NEAREST).astype(np.int64)
-    better = np.abs(wide) > np.abs(signed)
-    signed, by = np.where(better, wide, signed), np.where(better, wide_by, by)
-    radius_px = np.asarray(ALL_RADII_PX, np.float32)[by]
-    _fill_discs(signed, radius_px)
+    _fill_discs(signed, np.asarray(ALL_RADII_PX, np.float32)[by])
+    slot = cv2.resize(slots[0], None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[: seen.shape[0], : seen.shape[1]]
+    signed = np.where(np.abs(slot) > np.abs(signed), slot, signed)
     signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
     return signed.astype(np.float64), worth_of[0].energy ** -0.5
-
-
-def _both(image: np.ndarray, grid: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spectrum of a picture, and that of its samples for coarse templates."""
-    whole = scipy.fft.rfft2(image, grid)
-    return whole, halved(whole)
 
 
 @numba.njit(**PLAIN)
@@ -247,13 +236,6 @@ def _keep_stronger(signed: np.ndarray, by: np.ndarray, score: np.ndarray, number
         for j in range(score.shape[1]):
             if abs(score[i, j]) > abs(signed[i, j]):
                 signed[i, j], by[i, j] = score[i, j], number
-
-
-def _whole(image: np.ndarray, shape: tuple[int, ...], how: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Return on every pixel (r, c) what was taken on every second one, or on every pixel already."""
-    if image.shape == shape:
-        return image
-    return np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=how)[: shape[0], : shape[1]])
 
 
 def _tail(scores: np.ndarray) -> float:

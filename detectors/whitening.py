@@ -27,8 +27,6 @@ SLOT_PX, SLOTS_DEG = (20.0, 2.0), (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)
 ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX, *(SLOT_PX[0] / 4.0,) * 2 * len(SLOTS_DEG))
 """Radii of all templates: first discs, then paraboloids, then slots, by the radius of a disc as large."""
 FIRST_SLOT = len(ALL_RADII_PX) - 2 * len(SLOTS_DEG)
-COARSE_PX = 5.0
-"""Radius from which on a template's scores are taken on every second pixel: what is finer holds none of its signal."""
 WINDOW = (0.6, 1.0, 1.0, 1.0, 0.6)
 LENS_BLUR_PX = 0.6
 DENT_BLUR_PX = 1.0
@@ -123,8 +121,9 @@ def response(spectrum_of: np.ndarray, number: int, shape: tuple[int, ...]) -> np
 
 
 def coarse(number: int) -> bool:
-    """Return whether a template's scores are taken on every second pixel only."""
-    return ALL_RADII_PX[number] >= COARSE_PX
+    """Return whether a template is a slot's: its scores are taken on every second pixel only, so that twelve cost as
+    much as three."""
+    return number >= FIRST_SLOT
 
 
 def halved(spectrum_of: np.ndarray) -> np.ndarray:
