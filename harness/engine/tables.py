@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.profile import shadowed_shares
@@ -31,7 +30,6 @@ RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, 
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
 OF_STUDY = {table.name: table for table in trials.STUDY_ONLY}
 RECORDS_AT_ONCE = 100  # records that are held as mappings before they become columns, which take a tenth of the memory
-COUNTS = pd.ArrowDtype(pa.list_(pa.int32()))
 UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that is not known
 
 
@@ -99,9 +97,9 @@ def _columns(rows: list[Mapping[str, Any]], grids: dict[tuple[float, ...], np.nd
         if isinstance(column.iloc[0], list):
             if name == "threshold":
                 kept = [grids.setdefault(tuple(grid), np.array(grid)) for grid in column]
-                column = pd.Series(kept, dtype=object)
             else:
-                column = column.astype(COUNTS)
+                kept = [np.array(counts, np.int32) for counts in column]
+            column = pd.Series(kept, dtype=object)
         elif column.dtype == object and not column.map(lambda value: isinstance(value, str)).any():
             column = column.astype(float)
         found[str(name)] = column.array.copy()

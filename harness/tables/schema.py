@@ -38,8 +38,8 @@ from harness.vocabulary.seeds import canonical_json
 if TYPE_CHECKING:
     import pandas as pd
 
-LISTS_AT_ONCE = 2_000
-"""Rows with lists whose elements become rows of a file at a time, some 10 MB."""
+LISTS_AT_ONCE = 1_000
+"""Rows with lists whose elements become rows of a file at a time, some 5 MB."""
 UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 
