@@ -37,8 +37,10 @@ def _prepare() -> int:
     began = time.perf_counter()
     print("compiling the cameras ..", flush=True)
     for name in camera_names():
-        view = plane_view(load_camera(name), Region(200, 240, 200, 260), 0.7, 0.6, 0.05, 0.02)
-        list(SimulatedUnit(load_camera(name), CameraConfig(name=name), view).capture(1, 1).frames())
+        camera = load_camera(name)
+        row, column = int(camera.nominal_lens.cy), int(camera.nominal_lens.cx)
+        view = plane_view(camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02)
+        list(SimulatedUnit(camera, CameraConfig(name=name), view).capture(1, 1).frames())
     print("compiling averages ..", flush=True)
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
