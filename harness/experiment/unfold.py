@@ -18,7 +18,7 @@ from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Place, Problem, Source, parse_yaml
-from harness.vocabulary.path_names import names_of, on_one_line, value_text
+from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json
 
 OPTION = "--set"
@@ -314,7 +314,8 @@ def _drafts(
     """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
     names = names_of(telling)
     told = {
-        id(one): one.name or f"{names[one.path]}={value_text(one.path, _differing(one.value, axis))}"
+        id(one): one.name
+        or f"{names[one.path]}={value_text(one.path, differing(one.value, (other.value for other in axis)))}"
         for axis in axes
         for one in axis
         if one.path in telling
@@ -328,14 +329,6 @@ def _drafts(
         for frames in variation.frames or common:
             label, settings = f"{variation.label}, {FRAMES}={frames.value}", (frames, *variation.settings)
             yield replace(variation, label=label, variant=variation.label, settings=settings)
-
-
-def _differing(value: Any, axis: Iterable[Setting]) -> Any:
-    """Leave out of a mapping what all mappings on the axis have in common."""
-    others = [other.value for other in axis]
-    if not all(isinstance(other, dict) for other in others):
-        return value
-    return {key: own for key, own in value.items() if any(other.get(key) != own for other in others)}
 
 
 def _points(

@@ -22,7 +22,6 @@ from harness.tables.outputs import REPORT
 from harness.tables.schema import Table
 from harness.tables.text import Grid, unbroken
 from harness.vocabulary.files import write_text
-from harness.vocabulary.path_names import value_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -269,7 +268,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
             axes.set_xscale("log")
             axes.minorticks_off()
         labels = [f"{value:g}" for value in axis.values] if axis.numeric else [
-            plain(fill(shorten(value_text(axis.path, value), 40, placeholder=" …"), 18, break_long_words=False))
+            plain(fill(shorten(axis.told(value), 60, placeholder=" …"), 18, break_long_words=False))
             for value in axis.values
         ]  # fmt: skip
         axes.set_xticks(places, labels)

@@ -100,7 +100,7 @@ def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
 
 def _found(limit: SetUpLimit) -> str:
     kinds = _kinds(limit)
-    beside = "" if kinds is None else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
+    beside = "" if kinds is None or not kinds[1] else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
     return f"{limit.hits} of {limit.inspections}{beside}"
 
 

@@ -29,7 +29,7 @@ from harness.tables.limits import (
 )
 from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import Grid
-from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text
+from harness.vocabulary.path_names import differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
 """Distance on the sensor up to which two highest scores are those of one blob: the window of a camera's filter."""
@@ -157,14 +157,17 @@ SET_BY = Table(
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return a sentence for each calibrated threshold that is too high for noise to have set it, or that the same
     pixels of the sensor set on half of the boards."""
-    said = []
-    for one in set_by(limits):
-        if (one.same_pixels or 0) > max(one.runs / 2, 1):
-            said.append(
-                f"{one.limit.record.label}: {one.same_pixels} of {one.runs} calibration boards are loudest on the same "
-                "pixels of the sensor: the threshold is that of one place of this unit's pattern, not of many "
-                "(study.units draws units)"
-            )
+    rows = set_by(limits)
+    said, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
+    if crowded:
+        counts = sorted({one.same_pixels or 0 for one in crowded})
+        where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
+        said.append(
+            f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
+            "are loudest on the same pixels of the sensor: the threshold is that of one place of this unit's pattern, "
+            "not of many (study.units draws units)"
+        )
+    for one in rows:
         threshold = one.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
             where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
@@ -271,6 +274,10 @@ class AxisGroup:
         """True where the values have places on a scale."""
         return all(line.numeric for line in self.lines.values())
 
+    def told(self, value: Any) -> str:
+        """Return one of the values in words, without what a mapping has in common with the others."""
+        return axis_value(self.path, differing(value, self.values))
+
     @property
     def title(self) -> str:
         """The axis with its unit."""
@@ -285,14 +292,17 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
     for path in dict.fromkeys(line.axis for line in lines):
         of_axis = [line for line in lines if line.axis == path]
         others = dict.fromkeys(other for line in of_axis for other in line.held)
-        varied = [other for other in others if len({on_one_line(line.held.get(other)) for line in of_axis}) > 1]
+        taken = {other: [line.held.get(other) for line in of_axis] for other in others}
+        varied = [other for other, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
-        def held(line: AxisLine, other: str) -> str:
+        def held(line: AxisLine, other: str, values: Sequence[Any]) -> str:
             """``kinect_v2`` says what it is, ``albedo=0.2`` has to."""
-            said = axis_value(other, line.held[other])
+            said = axis_value(other, differing(line.held[other], values))
             return said if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={said}"
 
-        labels = [", ".join(held(line, other) for other in varied if other in line.held) for line in of_axis]
+        labels = [
+            ", ".join(held(line, other, taken[other]) for other in varied if other in line.held) for line in of_axis
+        ]
         every = [value for line in of_axis for value in line.values]
         values = [value for at, value in enumerate(every) if value not in every[:at]]
         if all(line.numeric for line in of_axis):
@@ -344,7 +354,7 @@ AXES = Table(
         Column("axis", "", "group.path", "dotted path of the axis"),
         Column("line", "set-ups", "line", "what the line's other axes are at"),
         Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
-        Column("", "value", lambda one: axis_value(one.group.path, one.value)),
+        Column("", "value", lambda one: one.group.told(one.value)),
         replace(SET_UP_OF, label=""),
         Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
         Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, likewise", interval=True),

@@ -42,6 +42,14 @@ def value_text(path: str, value: Any) -> str:
     return f"{value:g} {unit}" if _is_number(value) and unit else text
 
 
+def differing(value: Any, others: Iterable[Any]) -> Any:
+    """Return a mapping without what it has in common with all ``others``; any other value as it is."""
+    held = list(others)
+    if not all(isinstance(other, dict) for other in (value, *held)):
+        return value
+    return {key: own for key, own in value.items() if any(other.get(key) != own for other in held)}
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
