@@ -62,10 +62,13 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 
 def _experiment_file(path: Path) -> Path:
     """Return the file that a path or name means: ``averaging`` is the one that comes with tofpod where there is no file
-    of that name."""
+    of that name. Raises UserError for a name that is neither."""
     if path.exists() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
+    if not own.is_file() and not path.suffix:
+        names = ", ".join(sorted(each.stem for each in own.parent.glob("*.yaml")))
+        raise UserError(f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}")
     return own if own.is_file() else path
 
 
