@@ -96,6 +96,22 @@ def test_thesis_blind_holes_leave_a_floor() -> None:
     assert {damage.depth_m for damage in built.truth} == {9.5e-3}
 
 
+@pytest.mark.parametrize(("kind", "depth_mm"), [("through", None), ("blind", 6.0)])
+def test_a_chamfer_takes_a_cone_off_the_edge(kind: Any, depth_mm: float | None) -> None:
+    hole = HoleConfig(id=1, diameter_mm=5, centre_mm=(0, 0), kind=kind, depth_mm=depth_mm, chamfer_mm=0.8)
+    config = target(holes=(hole,))
+    built = build_target(config)
+    cylinder, cone = math.pi * 2.5**2 * (depth_mm or 12.7), math.pi * 0.8 * (2.5**2 + 2.5 * 3.3 + 3.3**2) / 3
+    expected = (cylinder + cone - math.pi * 2.5**2 * 0.8) * 1e-9
+    assert built.truth[0].volume_m3 == pytest.approx(expected, rel=1e-12)
+    assert built.truth[0].diameter_m == 5e-3
+    assert removed_m3(config, 2e-6) == pytest.approx([expected], rel=1e-6)
+    # on the face the mouth is as wide as drill and chamfer
+    plan = built.parts[0].mesh.copy().apply_transform(invert(built.T_camera_board)).vertices
+    on_face = plan[(np.abs(plan[:, 2]) < 1e-6) & (np.abs(plan[:, 0]) < 0.02)]
+    assert np.linalg.norm(on_face[:, :2], axis=1) == pytest.approx(3.3e-3, rel=1e-3)
+
+
 @pytest.mark.parametrize(("diameter_mm", "depth_mm"), [(20, 0.04), (20, 1), (20, 10), (1, 0.3), (40, 12)])
 def test_dent_on_a_flat_board_is_a_spherical_cap(diameter_mm: float, depth_mm: float) -> None:
     config = target(dents=(DentConfig(id=1, diameter_mm=diameter_mm, depth_mm=depth_mm, centre_mm=(30, -10)),))

@@ -44,6 +44,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"dents": [dent(6, 60, 12)]}, r"dent 6 .* depth 12 mm is not less than the board's thickness 12 mm"),
     ({"dents": [dent(6, 10, 5.5)]}, r"dent 6 .* depth 5.5 mm is more than its radius 5 mm"),
     ({"dents": [dent(6, 40, 5, 140, 0)]}, r"dent 6 .* leaves the board .* by 10 mm"),
+    ({"holes": [{**hole(3, 10, 140, 0), "chamfer_mm": 6}]}, r"hole 3 .* leaves the board .* by 1 mm"),
+    (
+        {"holes": [{**hole(3, 10, 0, 0), "chamfer_mm": 12.7}]},
+        r"hole 3 .* chamfer of 12.7 mm must be less than the depth",
+    ),
     (
         {"tapes": [{"centre_mm": [140, 0], "size_mm": [40, 12]}]},
         r"tape 1 \(40 x 12 mm .*: leaves the board .* by 10 mm",

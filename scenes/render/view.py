@@ -390,11 +390,11 @@ def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
     """Find pixels (h, w) bool whose central ray goes through a hole's mouth, or HOLE_RIM_PX beside it."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     found = np.zeros(slopes.shape[:2], bool)
-    for hole in target.truth:
+    for hole, declared in zip(target.truth, target.config.damages, strict=True):
         if hole.kind != "dent":
             centre = hole.centre_camera_m
             rim_m = HOLE_RIM_PX * float(centre[2]) / min(optics.lens.fx, optics.lens.fy)
             with np.errstate(divide="ignore", invalid="ignore"):
                 on_plane = rays * ((centre @ hole.axis_camera) / (rays @ hole.axis_camera))[..., None]
-            found |= np.linalg.norm(on_plane - centre, axis=-1) < hole.diameter_m / 2 + rim_m
+            found |= np.linalg.norm(on_plane - centre, axis=-1) < declared.mouth_m + rim_m
     return found

@@ -94,6 +94,9 @@ def _damage_problems(damage: custom.HoleConfig | custom.DentConfig, board: custo
         problems.append(
             f"{name}: depth {depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
         )
+    deep_mm = board.thickness_mm if depth_mm is None else depth_mm
+    if isinstance(damage, custom.HoleConfig) and damage.chamfer_mm >= deep_mm:
+        problems.append(f"{name}: a chamfer of {damage.chamfer_mm:g} mm must be less than the depth, {deep_mm:g} mm")
     if isinstance(damage, custom.DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
         radius = f"its radius {damage.diameter_mm / 2:g} mm"
         problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, which no spherical cap has")
@@ -172,7 +175,7 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
         if over > 0:
             problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")
         for damage in config.damages:
-            gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.diameter_mm / 2
+            gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.mouth_m / MM
             if gap <= 0:
                 problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
     for (first, strip), (second, other) in combinations(enumerate(config.tapes, start=1), 2):

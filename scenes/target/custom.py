@@ -25,6 +25,10 @@ Length = Annotated[float, Field(ge=1.0, le=1e4)]
 PlaceMm = tuple[Coordinate, Coordinate]
 SizeMm = tuple[Length, Length]
 DamageId = Annotated[int, Field(ge=1, le=9999)]
+Chamfer = Annotated[
+    float,
+    Field(ge=0.0, le=100.0, description="leg of a chamfer of 45 degrees that widens the hole's edge on the face"),
+]
 
 
 class FlatConfig(Config):
@@ -104,12 +108,23 @@ class DamageConfig(Config):
         """Declared radius in metres: of the drill, or of a dent's rim on a flat face."""
         return self.diameter_mm * MM / 2
 
+    @property
+    def mouth_m(self) -> float:
+        """Radius in metres of what is missing of a flat face."""
+        return self.radius_m
+
 
 class HoleConfig(DamageConfig):
     """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
 
     kind: Literal["through", "blind"] = "through"
     depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
+    chamfer_mm: Chamfer = 0.0
+
+    @property
+    def mouth_m(self) -> float:
+        """Radius in metres of what is missing of the face, chamfer included."""
+        return self.radius_m + self.chamfer_mm * MM
 
     @model_validator(mode="after")
     def _depth_where_blind(self) -> Self:

@@ -62,6 +62,7 @@ class DrawnThrough(Config):
         default="uniform",
         description="uniform in the diameter, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
     )
+    chamfer_mm: custom.Chamfer = 0.0
 
 
 class DrawnBlind(DrawnThrough):
@@ -155,6 +156,8 @@ class DrawnTargetConfig(Config):
             if max(declared[0], least_mm) > min(declared[1], most_mm):
                 can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
+        if isinstance(damage, DrawnDents) and damage.chamfer_mm > 0:
+            problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
         if widest_mm / 2 * bend_per_mm > WIDEST_BEND:
             wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
             problems.append(f"damage.diameter_mm: {wide}")
@@ -180,7 +183,8 @@ class DrawnTargetConfig(Config):
         independent. A dent's rim on a face that bends away is up to sqrt 2 larger than on a flat one; allowed for with
         holes too, so that the kind of damage does not change its places."""
         bend_per_mm = _tightest_per_mm(self.board)
-        rim_mm = self.damage.diameter_mm[1] / 2 * (math.sqrt(2) if bend_per_mm > 0 else 1.0)
+        mouth_mm = self.damage.diameter_mm[1] / 2 + self.damage.chamfer_mm
+        rim_mm = mouth_mm * (math.sqrt(2) if bend_per_mm > 0 else 1.0)
         shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
         return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
 
@@ -215,9 +219,10 @@ class DrawnTargetConfig(Config):
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
                     least, most = max(least, legal[0]), min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
-            made.append(
-                custom.DentConfig(**facts) if damage.kind == "dent" else custom.HoleConfig(**facts, kind=damage.kind)
-            )
+            if damage.kind == "dent":
+                made.append(custom.DentConfig(**facts))
+            else:
+                made.append(custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm))
         common: dict[str, Any] = {key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")}
         common["dents" if damage.kind == "dent" else "holes"] = tuple(made)
         pose = within("offset", self.offset_mm, 2) + within("tilt", self.tilt_deg, 2) + within("roll", self.roll_deg, 1)

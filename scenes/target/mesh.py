@@ -273,7 +273,10 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
         profile = np.vstack([profile, (0.0, spare_m)])
     else:
         bottom_m = -depth_m - (spare_m if damage.kind == "through" else 0.0)
-        profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), (radius_m, spare_m), (0.0, spare_m)])
+        leg_m = declared.mouth_m - radius_m
+        edge = [(radius_m, -leg_m), (radius_m + leg_m, 0.0)] if leg_m > 0 else []
+        top_m = radius_m + leg_m
+        profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), *edge, (top_m, spare_m), (0.0, spare_m)])
     angle = 2 * np.pi / SEGMENTS
     equal_area = np.sqrt(angle / np.sin(angle))
     # In millimetres: trimesh takes areas below 1e-8 for nothing, and in m2 that is a facet of a small hole.

@@ -189,7 +189,9 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
             # Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) / 8 lower
             # on average than at the centre. The back of a through-hole is a parallel surface, curvatures k / (1 - t k).
             back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
+            leg_m = item.mouth_m - radius_m
             volume_m3 = math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+            volume_m3 += math.pi * leg_m**2 * (radius_m + leg_m / 3)
         in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         truth.append(Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera))
     return tuple(truth)
@@ -206,7 +208,8 @@ def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
 
 
 def widest_rim_m(item: custom.HoleConfig | custom.DentConfig, face: Face) -> float:
-    """Return the largest radius of a rim: a dent's in the direction in which the face bends towards the ball most."""
+    """Return the largest radius of a rim, of a hole with its chamfer, of a dent in the direction in which the face bends
+    towards the ball most."""
     if isinstance(item, custom.HoleConfig):
-        return item.radius_m
+        return item.mouth_m
     return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]
