@@ -208,8 +208,7 @@ def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
 
 
 def widest_rim_m(item: custom.HoleConfig | custom.DentConfig, face: Face) -> float:
-    """Return the largest radius of a rim, of a hole with its chamfer, of a dent in the direction in which the face bends
-    towards the ball most."""
+    """Return the largest radius of a rim: a chamfer counts, and the direction in which a face bends to a dent most."""
     if isinstance(item, custom.HoleConfig):
         return item.mouth_m
     return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]
