@@ -91,7 +91,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[LocalConfig]] = LocalConfig
     name = "local"
-    version = 1
+    version = 2
 
     def __init__(self, settings: LocalConfig) -> None:
         self.settings = settings
@@ -146,7 +146,8 @@ class LocalDetector:
         centre is the mean of a finding's core, each pixel weighted by how far its score exceeds the core's least."""
         assert isinstance(evidence, LocalEvidence)
         sizes = np.abs(evidence.signed).ravel()
-        cells = np.flatnonzero(sizes > threshold)
+        # saddles below the threshold part or join peaks as those above it do, or a peak would be two at some thresholds
+        cells = np.flatnonzero(sizes > max(min(SADDLE * threshold, threshold - PROMINENCE), 0.0))
         order = cells[np.argsort(-sizes[cells], kind="stable")]
         peak_of = np.full(sizes.size, -1, dtype=np.int64)
         peak_of[order] = _peaks(evidence.signed, order, SADDLE, PROMINENCE)

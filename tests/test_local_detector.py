@@ -74,6 +74,17 @@ def test_white_noise_scores_as_noise_does(detector: LocalDetector) -> None:
     assert 3.0 < detector.quiet_threshold(seen(lambda u, v: 0 * u), evidence) < 6.0
 
 
+def test_peaks_are_the_same_at_every_threshold(detector: LocalDetector) -> None:
+    """A threshold between a peak and its saddle parts no peak: the tail of low peaks tells how many there
+    are at a higher one."""
+    cloud = seen(lambda u, v: 0 * u)
+    evidence = detector.analyse(cloud)
+    scores = [[each.score for each in detector.find(cloud, evidence, threshold)] for threshold in (2.2, 3.0, 3.4)]
+    for above, threshold in zip(scores[1:], (3.0, 3.4), strict=True):
+        assert above == [score for score in scores[0] if score > threshold]
+    assert len(scores[2]) >= 3
+
+
 def test_what_no_single_pixel_shows_is_found_by_its_mean(detector: LocalDetector) -> None:
     """A dent of one deviation, 30 pixels wide: 700 pixels, so that their mean stands out by 20 deviations."""
     cloud = seen(disc(120, 100, 15, NOISE_M))
