@@ -41,6 +41,7 @@ PROGRAMS = [
     "detect",
     "export",
     "flatfield",
+    "implant",
     "target",
     "validate",
     "prepare",

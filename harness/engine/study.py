@@ -305,11 +305,45 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     holes, runs = own(tables.holes), own(tables.runs)
     if holes.empty:
         return None
-    judged, calibrating = runs[runs["threshold"].notna()], runs[runs["role"] == "calibration"]
-    threshold = float(judged["threshold"].iloc[0])
+    calibrating = runs[runs["role"] == "calibration"]
     boards = [batch.set_ups[0].target for batch in group.then if batch.role == "damaged"]
     targets = [[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards]
     renders = (path.stem for batch in group.then for path in batch.paths)
+    loudest = calibrating[calibrating["quiet_threshold"].notna()]  # runs that judged no pixel are left out
+    # equal where every frame of every judged board is
+    decided_by = [source_digest(SIMULATION, PACKAGES), *renders, point.frames_key, config.capture.to_data()]
+    study = config.study
+    return SetUpRecord(
+        variant=point.variant,
+        frames=frames,
+        axes=dict(point.axes),
+        detector=config.detector.name,
+        detector_version=detector_version(config),
+        calibration_runs=len(calibrating),
+        failed=failed,
+        # the damage and the size of every damaged board, wherever and before whichever camera it stands
+        targets_digest=digest(targets),
+        frames_digest=digest([*decided_by, config.repeats, None if study is None else study.units]),
+        units=1 if study is None else study.units or 1,
+        calibrated=None
+        if loudest.empty
+        else Calibrated(
+            board=loudest["board"].to_numpy(int),
+            repeat=loudest["repeat"].to_numpy(int),
+            score=loudest["quiet_threshold"].to_numpy(float),
+            x_mm=loudest["loudest_x_mm"].to_numpy(float),
+            y_mm=loudest["loudest_y_mm"].to_numpy(float),
+            u_px=loudest["loudest_u_px"].to_numpy(float),
+            v_px=loudest["loudest_v_px"].to_numpy(float),
+        ),
+        **judged_facts(holes, runs),
+    )
+
+
+def judged_facts(holes: pd.DataFrame, runs: pd.DataFrame) -> dict[str, Any]:
+    """Return what the tables of one set-up's judged boards put into its record: threshold, hits, false calls."""
+    judged = runs[runs["threshold"].notna()]
+    threshold = float(judged["threshold"].iloc[0])
     by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
 
     def false_calls(role: str) -> Unflawed:
@@ -323,51 +357,18 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             no_return_calls=no_return,
         )
 
-    loudest = calibrating[calibrating["quiet_threshold"].notna()]  # runs that judged no pixel are left out
-    return SetUpRecord(
-        variant=point.variant,
-        frames=frames,
-        axes=dict(point.axes),
-        detector=config.detector.name,
-        detector_version=detector_version(config),
-        threshold=threshold,
-        threshold_mm=threshold * float(judged["scale_mm"].mean()),
-        calibration_runs=len(calibrating),
-        failed=failed,
-        # the damage and the size of every damaged board, wherever and before whichever camera it stands
-        targets_digest=digest(targets),
-        # equal where every frame of every judged board is
-        frames_digest=digest(
-            [
-                source_digest(SIMULATION, PACKAGES),
-                *renders,
-                point.frames_key,
-                config.capture.to_data(),
-                config.repeats,
-                None if config.study is None else config.study.units,
-            ]
-        ),
-        inspected=Inspected(
+    return {
+        "threshold": threshold,
+        "threshold_mm": threshold * float(judged["scale_mm"].mean()),
+        "inspected": Inspected(
             **{name.removeprefix("true_"): holes[name].to_numpy(kind) for name, kind in INSPECTED.items()},
             hit=by_depth | by_no_return,
             by_depth=by_depth,
             by_no_return=by_no_return,
         ),
-        unflawed=false_calls("hole_free"),
-        beside=false_calls("damaged"),
-        units=1 if config.study is None else config.study.units or 1,
-        calibrated=None
-        if loudest.empty
-        else Calibrated(
-            board=loudest["board"].to_numpy(int),
-            repeat=loudest["repeat"].to_numpy(int),
-            score=loudest["quiet_threshold"].to_numpy(float),
-            x_mm=loudest["loudest_x_mm"].to_numpy(float),
-            y_mm=loudest["loudest_y_mm"].to_numpy(float),
-            u_px=loudest["loudest_u_px"].to_numpy(float),
-            v_px=loudest["loudest_v_px"].to_numpy(float),
-        ),
-    )
+        "unflawed": false_calls("hole_free"),
+        "beside": false_calls("damaged"),
+    }
 
 
 def failed_by_point(plan: SweepPlan, whats: Iterable[str], thresholds: Mapping[str, float]) -> Counter[str]:

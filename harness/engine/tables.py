@@ -47,7 +47,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         for name, made in parts.items():
             rows = [row for record in chunk for row in record.get(name, ())]
             if rows:
-                made.append(_columns(rows, grids))
+                made.append(columns_of(rows, grids))
     paths = list(experiment.points[0].axes)
     names = names_of(paths)
     said = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
@@ -89,7 +89,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
     )
 
 
-def _columns(rows: list[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]) -> dict[str, Any]:
+def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]) -> dict[str, Any]:
     """Rows as columns, each apart: those that JSON filled with None hold numbers with NaN; lists of counts are lists
     still, and those of thresholds one of ``grids``, which takes in new ones."""
     found = {}

@@ -180,6 +180,8 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
 
 def threshold_note(record: StudyRecord) -> str:
     """Return how thresholds came about."""
+    if told := record.provenance.get("thresholds"):
+        return str(told)
     if record.false_calls_per_m2 is None:
         return "Thresholds were given, not calibrated: the rates beside them are what came of it."
     wanted = record.false_calls_per_m2

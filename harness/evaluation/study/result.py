@@ -135,6 +135,7 @@ def validity_of(
         ("What counts as a hit", tuple(hits)),
         ("Departures from MIL-HDBK-1823A", _departures(limits, chances, facts)),
         ("What is not in it", _missing(limits, facts)),
+        ("What is measured and what is simulated", tuple(facts.get("implanted", ()))),
     )
     return tuple((heading, sentences) for heading, sentences in sections if sentences)
 

@@ -1,0 +1,294 @@
+"""A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged as boards are.
+
+A placement is what a board is to a simulated study: some damages at once, in one group of recorded frames. Placements
+of one recording share its surface and fixed pattern, and where there are few frames its noise."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import ndimage
+
+from detectors.average import AverageConfig, average
+from detectors.noise import REACH_FRAMES, noise_reach_px
+from detectors.recordings import Recording
+from harness.engine.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
+from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, pixel_areas
+from harness.engine.study import judged_facts
+from harness.engine.tables import columns_of
+from harness.evaluation.study.record import SetUpRecord
+from harness.tables.trials import ResultTables
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
+from harness.vocabulary.seeds import digest, random_stream
+from scenes.implants import BEYOND_PX, Implant, implant_of, local_board, side_mm, unit_config
+from scenes.sensor.camera import camera_of
+from scenes.target.custom import TargetConfig
+from scenes.target.drawn import DrawnTargetConfig, Purpose
+from scenes.target.truth import truth_of
+
+MOST_HOLE_FREE, MOST_SETTING = 20, 5
+"""Averages of the undamaged recording on which false calls are counted, and that set a threshold, at most."""
+MOST_EMPTY = 200
+"""Placements in a row without a place for any damage, after which there is none."""
+NORMAL_PX = 4
+"""Half the side of the square of the surface whose plane is taken as the tangent plane."""
+VARIANT = "main"
+
+
+@dataclass(frozen=True)
+class Judging:
+    """The rules by which clouds are judged: detector, settings, hit radius, and the ``threshold``; where that is None,
+    ``threshold_of`` an undamaged cloud returns it with warnings."""
+
+    detector: str
+    settings_json: str
+    radius_m: float
+    threshold: float | None
+    threshold_of: Callable[[Cloud], tuple[float, tuple[str, ...]]]
+
+
+class Scan:
+    """A recording of an undamaged part, its surface, and what a detector judges of it. Raises UserError for a recording
+    without a lens or without anything to judge."""
+
+    def __init__(self, recording: Recording, judging: Judging) -> None:
+        if recording.lens is None or recording.slopes is None or recording.projection != "central":
+            fix = "name the lens's file or the camera with --intrinsics"
+            raise UserError(f"{recording.name}: the lens is not known, and damage cannot be placed", fix=fix)
+        self.recording, self.lens, self.slopes = recording, recording.lens, recording.slopes
+        self.frames = list(recording.frames())
+        self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES])
+        self.whole = self.averaged(self.frames)
+        evidence = detector_of(judging.detector, judging.settings_json).analyse(self.whole)
+        self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
+        self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
+        points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
+        # the board's frame: the plane through the surface, its z to the camera, its x along the picture's rows
+        centre = points_m.mean(axis=0)
+        _, axes = np.linalg.eigh(np.cov((points_m - centre).T))
+        normal = axes[:, 0] * -np.sign(axes[2, 0])
+        along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+        along /= np.linalg.norm(along)
+        self.T_camera_board = np.eye(4)
+        self.T_camera_board[:3] = np.column_stack([along, np.cross(normal, along), normal, centre])
+        places = transform_points(invert(self.T_camera_board), points_m)[:, :2]
+        middle = places.min(axis=0) / 2 + places.max(axis=0) / 2
+        self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
+        self.size_m: np.ndarray = np.ptp(places, axis=0)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """(h, w, 3) rays with z = 1."""
+        return np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
+
+    @cached_property
+    def places_m(self) -> np.ndarray:
+        """(h, w, 2) where each pixel's ray meets the plane, NaN where nothing is judged."""
+        normal, centre = self.T_camera_board[:3, 2], self.T_camera_board[:3, 3]
+        met = self.rays * ((centre @ normal) / (self.rays @ normal))[..., None]
+        places = transform_points(invert(self.T_camera_board), met)[..., :2]
+        return np.where(self.judged[..., None], places, np.nan)
+
+    @cached_property
+    def depth_px(self) -> np.ndarray:
+        """(h, w) distance of each pixel to the nearest that is not judged or not in the picture."""
+        return np.asarray(ndimage.distance_transform_edt(np.pad(self.judged, 1))[1:-1, 1:-1])
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Judged area of the surface in plan."""
+        areas = pixel_areas(self.places_m)
+        return float(np.nansum(areas[self.judged]))
+
+    def averaged(self, frames: Sequence[Frame]) -> Cloud:
+        """Return the average of some frames, as `harness.detect` takes it."""
+        cloud = average(replace(self.recording, read=lambda: iter(frames), selection=None), AverageConfig())
+        return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
+
+    def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the point (3,) of the surface in the camera's frame above a place of the plane, and the unit normal
+        (3,) to the camera there; None where less than ``rim_px`` of judged surface lie around it."""
+        point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
+        u, v = self.lens.project(point)
+        row, column = round(float(v)), round(float(u))
+        h, w = self.judged.shape
+        if not (0 <= row < h and 0 <= column < w) or self.depth_px[row, column] < rim_px:
+            return None
+        around = np.s_[
+            max(row - NORMAL_PX, 0) : row + NORMAL_PX + 1, max(column - NORMAL_PX, 0) : column + NORMAL_PX + 1
+        ]
+        points = (self.rays[around] * self.surface_z_m[around][..., None]).reshape(-1, 3)
+        points = points[np.isfinite(points[:, 2])]
+        middle = points.mean(axis=0)
+        normal = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]
+        normal = normal * -np.sign(normal[2])
+        ray = np.array([*(point[:2] / point[2]), 1.0])
+        return ray * (middle @ normal) / (ray @ normal), normal
+
+    def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
+        """Return a cloud of this scan with the truth of the damages that were put into it."""
+        truth, outlines = truth_of(target, self.T_camera_board), {}
+        intact = self.judged.copy()
+        margin_m = INTACT_MARGIN_PX * math.sqrt(self.area_m2 / max(self.judged.sum(), 1))
+        for damage in truth:
+            apart_m = np.linalg.norm(self.places_m - damage.centre_board_m[:2], axis=-1)
+            inside = np.flatnonzero(apart_m.ravel() < damage.diameter_m / 2)
+            outlines[damage.id] = inside if inside.size else np.array([int(np.nanargmin(apart_m))])
+            intact &= ~(apart_m < damage.diameter_m / 2 + margin_m)
+        depths = {damage.id: damage.depth_m for damage in truth}
+        return KnownCloud(cloud, invert(self.T_camera_board), target, truth, outlines, self.places_m, intact, depths)
+
+
+@dataclass(frozen=True, eq=False)
+class Implanted:
+    """Damages of ``target`` in one scan, at places where they fit, with what each changes."""
+
+    number: int
+    scan: Scan
+    target: TargetConfig
+    implants: tuple[Implant, ...]
+
+    def cloud(self, group: slice) -> Cloud:
+        """Return the average of a group of the scan's frames with the damage in them."""
+        changed = []
+        for number, frame in list(enumerate(self.scan.frames))[group]:
+            z_m, reason = frame.z_m.copy(), frame.reason.copy()
+            for implant in self.implants:
+                implant.put_into(frame, number, z_m, reason)
+            changed.append(replace(frame, z_m=z_m, reason=reason))
+        return self.scan.averaged(changed)
+
+
+def placements(
+    scans: Sequence[Scan], family: DrawnTargetConfig, camera: str, targets: int, seed: int, cache: Path
+) -> Iterator[Implanted]:
+    """Yield placements with ``targets`` damages in all, or a few more, scan by scan in turn; renders are kept in
+    ``cache``. Raises UserError where no damage finds a place."""
+    units = [unit_config(camera, scan.lens) for scan in scans]
+    found = number = empty = 0
+    while found < targets:
+        scan, (config, same) = scans[number % len(scans)], units[number % len(scans)]
+        placed = damages_placed(scan, family, camera, "damaged", number)
+        empty = 0 if placed.damages else empty + 1
+        if empty > MOST_EMPTY:
+            fix = "smaller --diameters, a larger --crop, or a camera nearer to the part"
+            raise UserError(f"{scan.recording.name}: no place for the damage on what is judged of it", fix=fix)
+        implants = []
+        for damage in placed.damages:
+            spot = scan.place(*damage.centre_m, 0.0)
+            assert spot is not None  # `damages_placed` has looked
+            board = local_board(placed, damage, *spot, side_mm(damage.diameter_mm, float(spot[0][2]), config))
+            draw = int(random_stream(seed, "implant", number, damage.id).integers(2**31))
+            implants.append(implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache))
+        if implants:
+            found += len(implants)
+            yield Implanted(number, scan, placed, tuple(implants))
+        number += 1
+
+
+def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: Purpose, number: int) -> TargetConfig:
+    """Return a board of the family with those of its damages that have enough judged surface around them; as much for
+    the smallest as for the largest, so that size and place are independent."""
+    drawn = family.drawn(purpose, number)
+    pitch_m = math.sqrt(scan.area_m2 / max(scan.judged.sum(), 1))
+    rim_px = family.damage.diameter_mm[1] * MM / 2 / pitch_m + BEYOND_PX + scan.reach_px
+    kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
+    return drawn.model_copy(
+        update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in ("holes", "dents")}
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedScans:
+    """The study's tables and records, one set-up for each number of frames; ``warnings``: full sentences;
+    ``calmer``: share of the changed pixels that keep more noise than the damage would leave."""
+
+    tables: ResultTables
+    set_ups: tuple[SetUpRecord, ...]
+    warnings: tuple[str, ...]
+    calmer: float
+
+
+def judge_scans(
+    scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
+    frames: Sequence[int],
+) -> JudgedScans:  # fmt: skip
+    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements.
+    Where a recording has two groups of so many frames or more, every second sets the threshold and the others are
+    judged; else the same frames do both, and a warning says so."""
+    rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
+    warnings: list[str] = []
+    calibrated = {}
+    for count in frames:
+        groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
+        if not groups:
+            longest = max(len(scan.frames) for scan in scans)
+            raise UserError(f"--frames {count}: no recording has so many", legal=f"1 to {longest}")
+        setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
+        if len(groups) == 1:
+            warnings.append(f"{count} frames: one average sets the threshold, shows the false calls and is damaged too")
+        setting, quiet = setting[:MOST_SETTING] if judging.threshold is None else [], judged[:MOST_HOLE_FREE]
+        own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
+        warnings += dict.fromkeys(f"{count} frames: {said}" for _, doubts in own for said in doubts)
+        calibrated[count] = len(own)
+        threshold = judging.threshold or float(np.median([value for value, _ in own]))
+
+        for number, (scan, group) in enumerate(quiet):
+            sites = damages_placed(scan, family, camera, "hole_free", number)
+            known = scan.known(scan.averaged(scan.frames[group]), sites)
+            _add(rows, judging, known, threshold, {"frames": count, "board": number, "role": "hole_free"})
+        for at, placement in enumerate(made):
+            own_groups = [group for scan, group in judged if scan is placement.scan] or [
+                group for scan, group in groups if scan is placement.scan
+            ]
+            cloud = placement.cloud(own_groups[at % len(own_groups)])
+            known = placement.scan.known(cloud, placement.target)
+            _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
+            print(f"{count} frames: placement {at + 1} of {len(made)}", file=sys.stderr)
+    tables = ResultTables(
+        **{name: pd.DataFrame(columns_of(some, {}) if some else {}) for name, some in rows.items()},
+        probes=pd.DataFrame(), variants=pd.DataFrame(), noise=pd.DataFrame(), axes=pd.DataFrame(),
+    )  # fmt: skip
+    detector = detector_of(judging.detector, judging.settings_json)
+    camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
+    set_ups = []
+    for count in frames:
+        holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
+        set_ups.append(
+            SetUpRecord(
+                variant=VARIANT,
+                frames=count,
+                axes={},
+                detector=detector.name,
+                detector_version=detector.version,
+                calibration_runs=calibrated[count],
+                failed=0,
+                targets_digest=digest([placement.target.to_data() for placement in made]),
+                frames_digest=digest(
+                    [camera_data, count, *(str(path) for one in scans for path in one.recording.files)]
+                ),
+                **judged_facts(holes, runs),
+            )
+        )
+    calmer = [implant.calmer for placement in made for implant in placement.implants]
+    return JudgedScans(tables, tuple(set_ups), tuple(warnings), float(np.mean(calmer)))
+
+
+def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]) -> None:
+    """Judge one cloud, and add its rows, ``named`` by frames, board and role."""
+    began, hole_free, radius_m = time.perf_counter(), named["role"] == "hole_free", judging.radius_m
+    judged = judge(known, judging.detector, judging.settings_json, threshold, radius_m, hole_free=hole_free)
+    found = study_rows(known, judged, radius_m, hole_free=hole_free)
+    for run in found["runs"]:
+        run["seconds_detect"] = time.perf_counter() - began
+    for name, some in found.items():
+        rows[name] += [{"variant": VARIANT, "repeat": 0, **named, **row} for row in some]

@@ -1,0 +1,214 @@
+"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in real scans."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.engine.implants import Scan
+    from scenes.target.drawn import DrawnTargetConfig
+
+MOST_AT_ONCE, FILLED = 8, 0.25
+"""Damages of one placement at most, and the share of the scan that discs as wide as they are apart may cover."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.implant " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.implant",
+        description="Put virtual damage at random places of recorded frames of an undamaged part, as the camera would "
+        "have measured it, and state which size is found: a50, a90, a90/95 and false calls per square metre. Each PATH "
+        "is one static capture. The frames keep their own noise, fixed pattern and surface; only the damage is "
+        "simulated.",
+        epilog="example: python -m harness.implant captures/wall --camera azure_kinect_nfov --damage through "
+        "--diameters 2:10 --out implanted",
+    )
+    add = parser.add_argument
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
+    add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
+    add("--damage", required=True, metavar="KIND", help="through, blind or dent, as an experiment's drawn boards have")
+    add("--diameters", required=True, type=_span, metavar="FROM:TO", help="of the damage, mm")
+    add("--depths", type=_span, metavar="FROM:TO", help="of blind holes and dents, mm")
+    add("--thickness", type=float, default=12.7, metavar="MM", help="of the part (default: 12.7)")
+    behind = "distance of what stands behind a through-hole, mm, or none (default: 20)"
+    add("--backing", default="20", metavar="MM|none", help=behind)
+    add("--albedo", type=float, default=0.6, help="of part and backing at the camera's wavelength (default: 0.6)")
+    add("--frames", type=int, nargs="+", metavar="N", help="frames to average (default: 1 and all)")
+    add("--targets", type=int, default=60, metavar="N", help="damages in all (default: 60, as MIL-HDBK-1823A asks)")
+    add("--hit-radius", type=float, default=15.0, metavar="MM", help="a finding this near is a hit (default: 15)")
+    add(
+        "--apart", type=float, metavar="MM", help="least distance of two damages (default: hit radius times 2, plus 10)"
+    )
+    add("--seed", type=int, default=1, help="of places, sizes and noise (default: 1)")
+    calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
+    add("--false-calls", type=float, metavar="N", help=calls)
+    add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
+    add("--detector", default="local", help="detector's name (default: local)")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
+    add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}")
+    add("--target", type=int, metavar="N", help="with --crop auto: take surface N")
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    add("--max-frames", type=int, metavar="N", help="use the first N frames only")
+    add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
+    return parser
+
+
+def _span(text: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO, such as 2:10") from error
+    return low, high
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.engine.implants import Judging, Scan, judge_scans, placements
+    from harness.engine.tables import write_tables
+    from harness.evaluation.study.record import StudyRecord, record_text
+    from harness.evaluation.study.result import evaluate_study
+    from harness.inspection.arguments import detector_of, opened
+    from harness.inspection.run import analysed, refuse_thresholds, threshold_of
+    from harness.report.study_page import study_parts, write_study_report
+    from harness.tables.outputs import PROVENANCE, STUDY
+    from harness.tables.study import study_tables
+    from harness.tables.text import show
+    from harness.vocabulary.declaration.yaml_source import to_yaml
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.geometry import MM
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+    from harness.vocabulary.seeds import canonical_json, digest
+    from scenes.render.scene import load_mitsuba
+
+    load_mitsuba()  # before anything loads Open3D, with which LLVM cannot be
+    options.quiet_capture = None  # the recording itself is undamaged
+    refuse_thresholds(options)
+    detector, settings = detector_of(options, options.crop, options.set)
+
+    def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
+        value, _, evidence = threshold_of(options, detector, cloud, analysed(detector, cloud), lambda: (0.0, ""))
+        return value, evidence.warnings
+
+    how = (options.hit_radius * MM, options.threshold, own_threshold)
+    judging = Judging(options.detector, canonical_json(settings), *how)
+    some = slice(options.max_frames) if options.max_frames else None
+    scans = [
+        Scan(opened([path], options.intrinsics, unit=options.unit, frames=some), judging) for path in options.paths
+    ]
+    family = _family(options, scans)
+    cache = options.out / ".cache" / "renders"
+    made = []
+    for placement in placements(scans, family, options.camera, options.targets, options.seed, cache):
+        made.append(placement)
+        done = sum(len(one.implants) for one in made)
+        print(f"rendered {done} of {options.targets} damages", file=sys.stderr)
+    longest = max(len(scan.frames) for scan in scans)
+    frames = sorted(set(options.frames or (1, longest)))
+    found = judge_scans(scans, made, family, options.camera, judging, frames)
+
+    area_m2 = sum(scan.area_m2 for scan in scans)
+    said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
+    facts = {
+        "implanted": _shares(options, said, found.calmer),
+        "recordings": [str(path) for path in options.paths],
+        "camera": options.camera,
+        "targets": options.targets,
+        "frames": frames,
+        "detector": {"name": options.detector, "settings": settings},
+        "family": family.to_data(),
+    }
+    origin = record(command) | {"guesses": list(found.warnings), "seed": options.seed, "failures": []}
+    title = f"Virtual damage in {said}"
+    thresholds = (
+        f"Given as {options.threshold:g}."
+        if options.threshold
+        else "Set by the undamaged frames as harness.detect sets it, by noise that stands out towards the camera, for "
+        f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
+    )
+    study = StudyRecord(
+        name="implant",
+        digest=digest(facts),
+        hit_radius_mm=options.hit_radius,
+        false_calls_per_m2=None,
+        provenance={**{key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")},
+                    "thresholds": thresholds},
+        set_ups=found.set_ups,
+    )  # fmt: skip
+    provenance = {**origin, "results_version": RESULTS_VERSION, "experiment": "implant", "digest": study.digest}
+    result = evaluate_study(study, found.tables, facts)
+    write_text(options.out / STUDY.name, record_text(study))
+    write_tables(options.out, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
+    write_text(options.out / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
+    page = write_study_report(options.out, result, (), provenance, to_yaml(facts), title)
+    show([*(f"warning: {text}" for text in found.warnings), *study_parts(result)])
+    print(f"report: {page}")
+    return 0
+
+
+def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
+    """Return the damage as a family of boards as large as the largest scan. Raises UserError for what is not legal."""
+    import math
+
+    from harness.vocabulary.declaration.diagnose import settings_of
+    from harness.vocabulary.geometry import MM
+    from scenes.sensor.camera import CameraConfig, camera_of
+    from scenes.target.drawn import DrawnTargetConfig
+
+    width_mm, height_mm = (max(float(scan.size_m[axis]) for scan in scans) / MM for axis in (0, 1))
+    apart_mm = options.apart or 2 * options.hit_radius + 10
+    room = FILLED * min(scan.area_m2 for scan in scans) / (math.pi / 4 * (apart_mm * MM) ** 2)
+    damage = {"kind": options.damage, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
+    damage |= {"diameter_mm": list(options.diameters)}
+    damage |= {"depth_mm": list(options.depths)} if options.depths else {}
+    wavelength_nm = camera_of(CameraConfig(name=options.camera)).optics.wavelength_nm
+    albedos = {"wavelength_nm": wavelength_nm, "board": options.albedo, "backing": options.albedo}
+    try:
+        backing = None if options.backing == "none" else {"distance_mm": float(options.backing)}
+    except ValueError as error:
+        raise UserError(f"--backing {options.backing}: is no number", legal="millimetres, or none") from error
+    data = {
+        "seed": options.seed,
+        "damage": damage,
+        "board": {"width_mm": width_mm, "height_mm": height_mm, "thickness_mm": options.thickness},
+        "apart_mm": apart_mm,
+        "edge_mm": 1.0,
+        "material": {"albedo_850": options.albedo, "grain_contrast": 0.0},
+        "backing": backing and {**backing, "albedo_850": options.albedo},
+        "room": None,
+        "other_wavelengths": [albedos],
+    }
+    return settings_of(DrawnTargetConfig, data, "the virtual damage")
+
+
+def _shares(options: argparse.Namespace, said: str, calmer: float) -> list[str]:
+    """Return sentences on what is measured, what is simulated, and what the limit holds for."""
+    return [
+        f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
+        f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
+        f"of {options.albedo:g}; noise is added where the damage weakens the light.",
+        f"{100 * calmer:.0f} % of the pixels that damage changes should be quieter than the recording, and are not: "
+        "damage there is a little harder to find than it would be.",
+        "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "
+        "surface and fixed pattern, and its noise where it has few frames: intervals are over places and sizes in this "
+        "recording, not over other parts, units or days.",
+        "The undamaged recording is the hole-free board. Where false calls are counted on the frames that set the "
+        "threshold, a warning says so.",
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

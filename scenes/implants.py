@@ -1,0 +1,170 @@
+"""Virtual damage for a real scan: what a camera would have measured of a damage, less what it measures without it.
+
+A small board stands where the scan's surface is, at its distance and angle, and is rendered twice: with one damage and
+without. The camera's own model turns both renders into frames, with the same draws of noise. What the recorded frames
+have of their own (noise, fixed pattern, texture, surface) is not in the difference, so they keep it.
+
+Not modelled: the surface's bend within the small board (its tangent plane stands for it), texture at the damage, light
+that reaches the damage by way of other surfaces, and a damage that makes pixels quieter: recorded noise is never taken
+away. The recorded range is not rounded a second time."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
+from scenes.optics import RenderConfig
+from scenes.render.cache import cached_view
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_paths
+from scenes.sensor.source import SimulatedUnit
+from scenes.target import custom
+
+LEAST_DRAWS = 48
+"""Frames drawn with and without the damage, at least: they tell how much noisier the damage makes a pixel."""
+FINEST_STEP_MM = 1e-3
+"""Rounding step of the frames drawn; that of the recording is in its own range already."""
+BEYOND_PX = 2
+"""Pixels beyond the reach of the camera's filter about the damage's rim that may change."""
+AROUND_PX = 8
+"""Pixels of the small board beyond those: its rim disturbs both renders alike."""
+CALMER = 0.9
+"""Share of the noise without the damage below which less noise is wanted than the recording has."""
+
+
+@dataclass(frozen=True)
+class Implant:
+    """A damage's difference on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change of z, 0 beyond
+    the damage's reach. ``noise_m`` (t, h, w): noise to add to frame t, 0 where the light does not grow weaker.
+    ``lost`` (t, h, w) bool: pixels that the damage makes invalid in frame t. ``calmer``: share of the changed pixels
+    whose noise should be less than the recording's, which they keep."""
+
+    region: Region
+    shift_m: np.ndarray
+    noise_m: np.ndarray
+    lost: np.ndarray
+    calmer: float
+
+    def put_into(self, frame: Frame, number: int, z_m: np.ndarray, reason: np.ndarray) -> None:
+        """Change ``z_m`` and ``reason`` (H, W), copies of those of the recording's frame, in place. Of its pixels those
+        without range stay so; ``number``: of the frame among those drawn, counted from 0, again from 0 beyond them."""
+        cut = np.s_[self.region.row0 : self.region.row1, self.region.col0 : self.region.col1]
+        draw = number % len(self.noise_m)
+        lost = self.lost[draw] & np.isfinite(frame.z_m[cut])
+        z_m[cut] += np.where(lost, np.nan, self.shift_m + self.noise_m[draw])
+        reason[cut][lost] = Reason.LOW_AMPLITUDE
+
+
+def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
+    """Return the camera without what a recording has of its own (pattern, offset, drift, jumps, rounding), and whether
+    its pixels are the recording's: then with the recording's ``lens``, else with its own."""
+    facts = camera_of(CameraConfig(name=name))
+    same = (facts.nominal_lens.width, facts.nominal_lens.height) == (lens.width, lens.height)
+    numbers: dict[str, Any] = {"engine.output_step_mm": FINEST_STEP_MM}
+    if same:
+        numbers |= {f"lens.{key}_px": getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
+        numbers |= {"lens.distortion": [*map(float, lens.distortion)]}
+    known = number_paths(facts.to_data())
+    effects = NO_EFFECTS.model_copy(
+        update=dict.fromkeys(("noise", "multipath", "wiggling", "ambient", "saturation"), True)
+    )
+    return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
+
+
+def local_board(
+    target: custom.TargetConfig, damage: custom.DamageConfig, place_m: np.ndarray, normal: np.ndarray, side_mm: float
+) -> custom.TargetConfig:
+    """Return a board of ``target``'s material with this damage alone at its centre, which lies at ``place_m`` (3,) in
+    the camera's frame, its face towards ``normal`` (3,), a unit vector to the camera."""
+    x, y, z = normal * [1.0, -1.0, -1.0]
+    pose = custom.PoseConfig(
+        distance_m=float(place_m[2]),
+        offset_x_mm=float(place_m[0]) / MM,
+        offset_y_mm=float(place_m[1]) / MM,
+        tilt_x_deg=float(np.degrees(np.arcsin(-y))),
+        tilt_y_deg=float(np.degrees(np.arctan2(x, z))),
+    )
+    alone = damage.model_copy(update={"centre_mm": (0.0, 0.0)})
+    kept = {name: tuple(alone for each in getattr(target, name) if each.id == damage.id) for name in ("holes", "dents")}
+    board = target.board.model_copy(update={"width_mm": side_mm, "height_mm": side_mm})
+    backing = target.backing and target.backing.model_copy(update={"size_mm": None})
+    return target.model_copy(update={**kept, "board": board, "backing": backing, "pose": pose})
+
+
+def implant_of(
+    config: CameraConfig, same: bool, lens: Lens, board: custom.TargetConfig, frames: int, seed: int, cache: Path
+) -> Implant:
+    """Return the difference that the one damage of `local_board` makes to ``frames`` frames (or more) of a recording
+    with this lens; ``config``, ``same`` of `unit_config`. Raises UserError where the board leaves the view."""
+    camera = camera_of(config)
+    declared = board.at_wavelength(camera.optics.wavelength_nm)
+    count, units, drawn = max(frames, LEAST_DRAWS), [], []
+    for target in (declared, declared.hole_free()):
+        view, _ = cached_view(target, camera.optics, RenderConfig(), cache)
+        unit = SimulatedUnit(camera, config, view)
+        units.append(unit)
+        drawn.append(np.stack([frame.z_m for frame in unit.capture(count, seed, "implant").frames()]).astype(float))
+    without_noise = config.model_copy(update={"effects": config.effects.model_copy(update={"noise": False})})
+    smooth = [
+        next(SimulatedUnit(camera, without_noise, unit.view).capture(1, seed).frames()).z_m.astype(float)
+        for unit in units
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of pixels that no frame shows
+        means, spreads = zip(*((np.nanmean(z, axis=0), np.nanvar(z, axis=0)) for z in drawn), strict=True)
+        # without noise there is no scatter of the mean; a pixel at a gate may need noise to be valid
+        middle = [np.where(np.isfinite(z), z, mean) for z, mean in zip(smooth, means, strict=True)]
+        more = np.sqrt(np.clip(1.0 - spreads[1] / spreads[0], 0.0, 1.0))
+        noise_m = more * (drawn[0] - means[0])
+        calm = spreads[0] < CALMER**2 * spreads[1]
+    near = _near(units[0], board)
+    shift_m = np.where(near, np.nan_to_num(middle[0] - middle[1]), 0.0)
+    noise_m = np.where(near, np.nan_to_num(noise_m), 0.0)
+    lost = near & np.isnan(drawn[0]) & np.isfinite(drawn[1])
+    calmer = float((calm & near).sum() / max(near.sum(), 1))
+    region = units[0].region
+    if same:
+        return Implant(region, shift_m, noise_m, lost, calmer)
+    # the recording was aligned to other pixels: each takes its value between those of the camera that it lies among
+    rays = _corners_m(board)
+    ends = lens.project(rays)
+    (left, top), (right, bottom) = np.floor(ends.min(axis=0)).astype(int), np.ceil(ends.max(axis=0)).astype(int)
+    onto = Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
+    slopes = lens.region_slopes(onto)
+    at = camera.nominal_lens.project(np.concatenate([slopes, np.ones((*onto.shape, 1))], axis=-1))
+    rows_columns = [at[..., 1] - region.row0, at[..., 0] - region.col0]
+
+    def moved(image: np.ndarray) -> np.ndarray:
+        return np.asarray(ndimage.map_coordinates(image.astype(float), rows_columns, order=1))
+
+    return Implant(onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5, calmer)
+
+
+def side_mm(diameter_mm: float, distance_m: float, config: CameraConfig) -> float:
+    """Return the side of a board that holds a damage, what the camera's filter reaches of it, and a rim."""
+    camera = camera_of(config)
+    pitch_mm = distance_m / MM / min(camera.nominal_lens.fx, camera.nominal_lens.fy)
+    return diameter_mm + 2 * (camera.optics.margin_px + BEYOND_PX + AROUND_PX) * pitch_mm
+
+
+def _near(unit: SimulatedUnit, board: custom.TargetConfig) -> np.ndarray:
+    """Return (h, w) bool: pixels of the unit's region that the damage may change through the camera's filter."""
+    (damage,) = board.damages
+    T_camera_board, slopes = board.pose.T_camera_board, unit.view.slopes[unit.cut]
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    normal, centre = T_camera_board[:3, 2], T_camera_board[:3, 3]
+    on_plane = rays * ((centre @ normal) / (rays @ normal))[..., None]
+    lens = unit.camera.nominal_lens
+    reach_m = (unit.camera.optics.margin_px + BEYOND_PX) * float(centre[2]) / min(lens.fx, lens.fy)
+    return np.asarray(np.linalg.norm(on_plane - centre, axis=-1) < damage.radius_m + reach_m)
+
+
+def _corners_m(board: custom.TargetConfig) -> np.ndarray:
+    half = board.board.width_mm / 2 * MM
+    corners = np.array([(x, y, 0.0, 1.0) for x in (-half, half) for y in (-half, half)])
+    return np.asarray((corners @ board.pose.T_camera_board.T)[:, :3])
