@@ -33,6 +33,8 @@ CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
 COMPARISON_PAGE = Output("compare.html", "the same as a page", of="check")
 EFFICIENCY_PAGE = Output("efficiency.html", "detectors beside the ideal observer", of="efficiency")
+ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
+ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
 FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
 FINDINGS_DATA = Output(
     "findings.json", "the same with both measures, target, settings, provenance", "capture", "capture"
@@ -43,7 +45,7 @@ BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
 CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
 FILES = (
     REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
-    FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
+    ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"
 LATEST = "latest"
@@ -52,12 +54,19 @@ LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
 
 def outputs() -> Iterator[Output]:
     """Yield every file, those of tables included."""
+    from harness.tables.atlas import ATLAS
     from harness.tables.efficiency import EFFICIENCY_TABLES
     from harness.tables.study import STUDY_TABLES
     from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
 
     yield from FILES
-    for tables, of in ((STORED, ""), (SUMMARISED, "other"), (STUDY_TABLES, "study"), (EFFICIENCY_TABLES, "efficiency")):
+    for tables, of in (
+        (STORED, ""),
+        (SUMMARISED, "other"),
+        (STUDY_TABLES, "study"),
+        (EFFICIENCY_TABLES, "efficiency"),
+        ((ATLAS,), "atlas"),
+    ):
         for table in tables:
             for name in table.files:
                 yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)

@@ -1,0 +1,207 @@
+"""``python -m harness.ask``: which camera finds a damage, how far away and with how many frames, from stored limits."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.tables.outputs import ATLAS_PAGE, ATLAS_PICTURE
+from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.files import shipped
+
+if TYPE_CHECKING:
+    from harness.evaluation.atlas import LimitSurface
+
+STORED = "atlas.parquet"
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind"}
+BEST = "matched"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 whatever the answer, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.ask " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.ask",
+        description="Say which cameras find damage of a size nine times in ten at a distance, with how many frames, "
+        "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
+        "extrapolated.",
+        epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
+    )
+    add = parser.add_argument
+    add("--damage", default="through", metavar="KIND", help="hole (through; the default), blind, dent, ...")
+    add("--size", metavar="LENGTH", help="the damage's size with its unit, as 5mm or 0.25in; its diameter for holes")
+    add("--depth", metavar="LENGTH", help="the damage's depth, where the atlas has several")
+    add("--distance", metavar="LENGTH", help="from camera to target, as 1m")
+    add("--frames", type=int, metavar="N", help="frames averaged (default: the least and the most of the atlas)")
+    add("--albedo", type=float, metavar="A", help="of the target, where the atlas has several")
+    add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
+    add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
+    add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
+    add("--out", type=Path, metavar="DIR", help=f"write the whole atlas there: {ATLAS_PAGE.name}, a picture, atlas.csv")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.evaluation.atlas import surfaces_of
+    from harness.tables.atlas import ATLAS, curves
+    from harness.tables.schema import write_table
+
+    asked = sum(given is not None for given in (options.size, options.distance))
+    if asked == 1 or (not asked and options.out is None):
+        raise UserError(
+            "a question needs --size and --distance",
+            legal="--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas",
+        )
+    limits, about = _read(options.atlas or shipped("baselines") / STORED)
+    surfaces = surfaces_of(limits)
+    titles, warnings = _cameras(surfaces)
+    if asked:
+        _answer(options, surfaces, titles, warnings, about)
+    if options.out is not None:
+        from harness.report.atlas import atlas_html, save_atlas_png
+        from harness.vocabulary.files import write_text
+
+        rows = curves(surfaces, titles)
+        write_table(options.out, ATLAS, ATLAS.frame(rows), about)
+        write_text(options.out / ATLAS_PAGE.name, atlas_html(rows, list(warnings.values()), about, command))
+        save_atlas_png(options.out / ATLAS_PICTURE.name, rows)
+        print(f"wrote {options.out / ATLAS_PAGE.name}, {ATLAS_PICTURE.name}, {', '.join(ATLAS.files)}")
+    return 0
+
+
+def _read(path: Path) -> tuple[Any, dict[str, Any]]:
+    """Return the table of limits and what is stored with it. Raises UserError where it is none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from harness.evaluation import atlas
+    from harness.tables.limits import LIMITS
+
+    file = path / LIMITS.files[1] if path.is_dir() else path
+    legal = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
+    try:
+        table = pq.read_table(file)
+    except (OSError, pa.ArrowException) as error:
+        raise UserError(f"{file}: cannot be read as a table of limits: {error}", legal=legal) from error
+    needed = (atlas.CAMERA, atlas.DAMAGE, atlas.AXES["distance_m"], "frames", "a90_mm", "a90_low_mm", "largest_mm")
+    if missing := [name for name in needed if name not in table.column_names]:
+        raise UserError(f"{file}: it lacks the columns {', '.join(missing)}", legal=legal)
+    return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
+
+
+def _cameras(surfaces: Sequence[LimitSurface]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the cameras' titles, and warnings on those whose precision is a guess."""
+    from scenes.sensor.camera import guessed_precision, load_camera
+
+    cameras = {surface.camera: load_camera(surface.camera) for surface in surfaces}
+    warnings = {name: guessed_precision(camera) for name, camera in cameras.items()}
+    return {name: camera.title for name, camera in cameras.items()}, {k: text for k, text in warnings.items() if text}
+
+
+def _answer(
+    options: argparse.Namespace,
+    surfaces: Sequence[LimitSurface],
+    titles: dict[str, str],
+    warnings: dict[str, str],
+    about: Any,
+) -> None:
+    from harness.tables.atlas import ATLAS, damage_words, rows_at
+    from harness.tables.text import many, show
+
+    size_mm, distance_m = 1e3 * _length_m("--size", options.size), _length_m("--distance", options.distance)
+    kind = KINDS.get(options.damage, options.damage)
+    asked = _chosen(options, surfaces, kind)
+    place = {"distance_m": distance_m}
+    if options.depth is not None:
+        place["depth_mm"] = 1e3 * _length_m("--depth", options.depth)
+    if options.albedo is not None:
+        place["albedo"] = options.albedo
+    for axis, option in (("depth_mm", "--depth"), ("albedo", "--albedo")):
+        values = sorted({value for surface in asked for value in surface.grid.get(axis, ())})
+        if axis in place and not values:
+            raise UserError(f"{option}: the atlas has none for {damage_words(kind)}s", fix=f"leave {option} out")
+        if values and axis not in place:
+            if len(values) > 1:
+                raise UserError(f"{option} is missing", legal=f"{values[0]:g} to {values[-1]:g} in this atlas")
+            place[axis] = values[0]
+    computed = sorted({int(value) for surface in asked for value in surface.grid["frames"]})
+    rows, refused = [], []
+    for frames in [options.frames] if options.frames else sorted({computed[0], computed[-1]}):
+        found, why = rows_at(asked, titles, {**place, "frames": frames}, size_mm)
+        rows += found
+        refused += [reason for reason in why if reason not in refused]
+    if not rows:
+        raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix="run a study: tofpod sweep atlas")
+    for text in dict.fromkeys(warnings.get(row.surface.camera) for row in rows):
+        if text:
+            print(f"warning: {text}")
+    verdicts = [row.answer.verdict(size_mm) for row in rows]
+    said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
+    answer = (
+        f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m are found nine times out of ten in "
+        f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
+    )
+    worst = max(row.surface.error for row in rows)
+    notes = [
+        f"Simulated: one unit of each camera under the conditions of {about.get('experiment', 'the study')}.yaml; "
+        f"the surfaces miss set-ups left out by {100 * worst:.0f} % of a90 at the most (rms).",
+        *(f"not answered: {reason}" for reason in refused),
+    ]
+    show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
+
+
+def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:
+    """Return the surfaces that a question is about. Raises UserError where a name is not in the atlas."""
+    detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
+    detector = options.detector or (BEST if BEST in detectors else detectors[0])
+    given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
+    for name, wanted in given:
+        there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
+        if unknown := [one for one in wanted if one not in there]:
+            option = "--damage" if name == "kind" else f"--{name}"
+            raise UserError(f"{option} {', '.join(unknown)}: not in the atlas", legal=", ".join(there))
+    cameras = options.camera or [surface.camera for surface in surfaces]
+    return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
+
+
+def _length_m(option: str, text: str) -> float:
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
+    if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
+        raise UserError(f"{option} {text}: no length with its unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")
+    return float(match[1]) * UNITS_M[match[2]]
+
+
+def _exactly(row: Any, about: dict[str, Any]) -> str:
+    """Return the command that computes one set-up of the answer by a study of its own."""
+    from harness.evaluation import atlas
+
+    axes = {
+        atlas.CAMERA: row.surface.camera,
+        **{atlas.AXES[axis]: row.place[axis] for axis in ("distance_m", "frames")},
+    }
+    axes["capture.frames"] = int(axes.pop("frames"))
+    parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
+    depth = row.place.get("depth_mm")
+    if depth is not None or row.surface.kind != "through":
+        axes[atlas.DAMAGE] = {"kind": row.surface.kind, "per_board": 6, "diameter_mm": [2.0, 40.0], "sizes": "log"}
+        axes[atlas.DAMAGE] |= {} if depth is None else {"depth_mm": [depth, depth]}
+    if "albedo" in row.place:
+        axes[atlas.AXES["albedo"]] = row.place["albedo"]
+    swept = {path: [value] for path, value in axes.items()}
+    return " ".join([*parts, "--set study.boards=36 --set", shlex.quote(f"sweep={json.dumps(swept)}")])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,166 @@
+"""The atlas of limits: a90 of many set-ups as one smooth surface for each camera, kind of damage and detector, over
+distance, frames, depth and albedo; questions are answered from it, and those beyond what was computed are refused.
+
+The surface is a quadratic of ln a90 in the logarithms of the axes, by least squares weighted with each limit's own
+interval. Its error is stated: the root mean square of ln a90 at each set-up as the others predict it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from harness.evaluation.intervals import CONFIDENCE
+
+CAMERA, DETECTOR, DAMAGE = "source.camera.name", "detector.name", "source.target.damage"
+AXES = {
+    "distance_m": "source.target.distance_m",
+    "frames": "frames",
+    "depth_mm": "depth_mm",
+    "albedo": "source.target.material.albedo_850",
+}
+"""The axes of a surface, and the columns of the table of limits that hold their values."""
+UNKNOWN_VARIANCE = 0.25
+"""Variance of ln a90 where an interval has no positive lower end: a factor of 1.65 either way."""
+TOLERANCE = 1e-9
+
+
+class Outside(Exception):
+    """A question that the atlas does not answer; the text says why and what it does answer."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN where no limit was found among the sizes that
+    were inspected around the set-up, up to ``largest_mm``."""
+
+    a90_mm: float
+    low_mm: float
+    high_mm: float
+    largest_mm: float
+
+    def verdict(self, size_mm: float) -> str:
+        """Return whether damage of this size is found nine times out of ten: yes, no or undecided."""
+        if np.isnan(self.a90_mm):
+            return "no" if size_mm <= self.largest_mm else "undecided"
+        return "yes" if self.high_mm <= size_mm else "no" if self.low_mm > size_mm else "undecided"
+
+
+@dataclass(frozen=True)
+class LimitSurface:
+    """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed on each axis;
+    ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``; ``largest_mm`` (n,): the largest size
+    inspected at each; ``known`` (n,): whether a limit was found. ``error``: of ln a90, leaving each set-up out."""
+
+    camera: str
+    kind: str
+    detector: str
+    grid: Mapping[str, tuple[float, ...]]
+    nodes: np.ndarray
+    largest_mm: np.ndarray
+    known: np.ndarray
+    coefficients: np.ndarray
+    covariance: np.ndarray
+    terms: tuple[tuple[int, ...], ...]
+    degrees: int
+    error: float
+
+    def at(self, **place: float) -> Answer:
+        """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond what was computed."""
+        ends = {axis: values for axis, values in self.grid.items() if axis in place}
+        for axis, values in ends.items():
+            if not values[0] - TOLERANCE <= place[axis] <= values[-1] + TOLERANCE:
+                only = f"{values[0]:g} to {values[-1]:g}" if len(values) > 1 else f"{values[0]:g} only"
+                raise Outside(f"{axis} {place[axis]:g}: the atlas has {only}")
+        wanted = np.array([place.get(axis, values[0]) for axis, values in self.grid.items()])
+        around = np.all([self._near(k, value) for k, value in enumerate(wanted)], axis=0)
+        largest_mm = float(self.largest_mm[around].min()) if around.any() else float("nan")
+        if not around.any() or not self.known[around].all() or not len(self.coefficients):
+            unknown = float("nan")
+            return Answer(unknown, unknown, unknown, largest_mm)
+        row = _rows(self._scaled(wanted[None]), self.terms)[0]
+        middle = float(row @ self.coefficients)
+        spread = np.hypot(np.sqrt(row @ self.covariance @ row), self.error)
+        half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, self.degrees) * spread)
+        a90, low, high = (float(np.exp(middle + end)) for end in (0.0, -half, half))
+        return Answer(a90, low, high, largest_mm)
+
+    def _near(self, axis: int, value: float) -> np.ndarray:
+        """Nodes of the cell that holds a value: its neighbours on the axis, or those at the value itself."""
+        values = np.array(list(self.grid.values())[axis])
+        low = values[values <= value + TOLERANCE].max()
+        high = values[values >= value - TOLERANCE].min()
+        return np.asarray(np.isclose(self.nodes[:, axis], low) | np.isclose(self.nodes[:, axis], high))
+
+    def _scaled(self, places: np.ndarray) -> np.ndarray:
+        return _scaled(places, list(self.grid.values()))
+
+
+def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
+    """Return the surfaces of a table of limits (`harness.tables.limits.LIMITS`), by camera, kind and detector. Raises
+    KeyError where the table lacks an axis."""
+    rows = limits.copy()
+    damages = [json.loads(text) for text in rows[DAMAGE]]
+    rows["kind"] = [damage["kind"] for damage in damages]
+    rows["depth_mm"] = [float(np.mean(damage.get("depth_mm") or [np.nan])) for damage in damages]
+    if DETECTOR not in rows:
+        rows[DETECTOR] = rows["detector"]
+    held = {axis: column for axis, column in AXES.items() if column in rows}
+    rows = rows.rename(columns={column: axis for axis, column in held.items()})
+    groups = [(group, group.iloc[0]) for _, group in rows.groupby([CAMERA, "kind", DETECTOR], sort=False)]
+    return [_surface(one[CAMERA], one["kind"], one[DETECTOR], group, list(held)) for group, one in groups]
+
+
+def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Sequence[str]) -> LimitSurface:
+    axes = [axis for axis in axes if rows[axis].notna().all()]
+    grid = {axis: tuple(float(value) for value in np.unique(rows[axis])) for axis in axes}
+    nodes = rows[axes].to_numpy(float)
+    a90, low, high, largest = (
+        rows[name].to_numpy(float) for name in ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm")
+    )
+    known = np.isfinite(a90) & (a90 <= largest) & ~rows["is_at_most"].to_numpy(bool)
+    with np.errstate(all="ignore"):
+        variance = (np.log(high / low) / (2 * stats.norm.ppf(0.5 + CONFIDENCE / 2))) ** 2
+    sure = np.isfinite(variance) & (low > 0) & (variance < UNKNOWN_VARIANCE)
+    variance = np.where(sure, np.maximum(variance, 1e-4), UNKNOWN_VARIANCE)
+    scaled = _scaled(nodes, list(grid.values()))
+    terms = _terms([len(values) for values in grid.values()], int(known.sum()))
+    fixed = (camera, kind, detector, grid, nodes, largest, known)
+    if not terms:
+        return LimitSurface(*fixed, np.zeros(0), np.zeros((0, 0)), (), 0, float("nan"))
+    design, weights = _rows(scaled[known], terms), 1.0 / variance[known]
+    inverse = np.linalg.pinv(design.T @ (weights[:, None] * design))
+    coefficients = inverse @ (design.T @ (weights * np.log(a90[known])))
+    residuals = np.log(a90[known]) - design @ coefficients
+    degrees = len(residuals) - len(terms)
+    leverage = np.einsum("ij,jk,ik->i", design, inverse, design) * weights
+    left_out = residuals / np.maximum(1.0 - leverage, 0.05)
+    scale = max(1.0, float((weights * residuals**2).sum()) / degrees)
+    return LimitSurface(*fixed, coefficients, inverse * scale, terms, degrees, float(np.sqrt(np.mean(left_out**2))))
+
+
+def _scaled(places: np.ndarray, grid: Sequence[Sequence[float]]) -> np.ndarray:
+    """Places (n, k) as logarithms between -1 and 1 over the grid; 0 on an axis with one value."""
+    ends = np.log([[values[0], values[-1]] for values in grid])
+    half = np.maximum(np.diff(ends, axis=1)[:, 0] / 2, TOLERANCE)
+    return np.asarray((np.log(places) - ends.mean(axis=1)) / half)
+
+
+def _terms(counts: Sequence[int], known: int) -> tuple[tuple[int, ...], ...]:
+    """Products of axes: squares where an axis has three values, then products of two; as many as leave two set-ups
+    more than terms, none where even the plane has too few."""
+    varied = [axis for axis, count in enumerate(counts) if count > 1]
+    plane: list[tuple[int, ...]] = [(), *((axis,) for axis in varied)]
+    further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]
+    further += combinations(varied, 2)
+    room = known - 2 - len(plane)
+    return tuple(plane + further[:room]) if room >= 0 else ()
+
+
+def _rows(scaled: np.ndarray, terms: Iterable[tuple[int, ...]]) -> np.ndarray:
+    return np.stack([np.prod(scaled[:, list(term)], axis=1) for term in terms], axis=1)

@@ -1,0 +1,85 @@
+"""The atlas of limits: a page with sliders that needs no network, and its picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from harness.report.blocks import COLOURS, GREY, INK, plain_decades, save_png, template
+from harness.tables.atlas import Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PALETTE = (*COLOURS, INK, GREY)
+DASHES = {"-": "", "--": "7 4", ":": "2 4"}
+"""Styles of lines for numbers of frames, from the least to the most: of pictures, and as SVG has them."""
+
+
+def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str, Any], command: str) -> str:
+    """Return the page: damage, size, distance and frames are chosen, and the cameras that find it are named."""
+    curves: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for row in rows:
+        place = {axis: value for axis, value in row.place.items() if axis != "distance_m"}
+        of = (row.title, row.damage, row.surface.detector, *place.values())
+        curve = curves.setdefault(
+            of, {"camera": row.title, "damage": row.damage, "detector": row.surface.detector, **place}
+        )
+        one = row.answer
+        for name, value in (("distance_m", row.place["distance_m"]), ("a90", one.a90_mm), ("low", one.low_mm),
+                            ("high", one.high_mm), ("largest", one.largest_mm)):  # fmt: skip
+            curve.setdefault(name, []).append(float(f"{value:.4g}") if np.isfinite(value) else None)
+    lines = {"curves": list(curves.values()), "colours": PALETTE, "dashes": list(DASHES.values())}
+    data = json.dumps(lines, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    worst = max((row.surface.error for row in rows), default=float("nan"))
+    return template("atlas.html").render(
+        title="Which camera finds it, how far away, with how many frames?",
+        answer="",
+        data=Markup(data),
+        warnings=warnings,
+        error=f"{100 * worst:.0f}",
+        experiment=about.get("experiment", "a study"),
+        commit=about.get("commit", "not recorded"),
+        command=command,
+    )
+
+
+def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
+    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage."""
+    damages = list(dict.fromkeys(row.damage for row in rows))
+    titles = list(dict.fromkeys(row.title for row in rows))
+    counts = sorted({int(row.place["frames"]) for row in rows})
+    shown = {counts[0]: "--", counts[-1]: "-"}
+    detector = rows[0].surface.detector
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots(1, len(damages), sharey=True, squeeze=False)[0]
+        for panel, damage in zip(axes, damages, strict=True):
+            for frames, style in shown.items():
+                for title, colour in zip(titles, PALETTE, strict=False):
+                    line = [
+                        one
+                        for one in rows
+                        if (one.damage, one.title, one.surface.detector) == (damage, title, detector)
+                    ]
+                    line = [one for one in line if one.place["frames"] == frames]
+                    x = [one.place["distance_m"] for one in line]
+                    low, middle, high = (
+                        [getattr(one.answer, name) for one in line] for name in ("low_mm", "a90_mm", "high_mm")
+                    )
+                    label = title if frames == counts[-1] else None
+                    panel.plot(x, middle, style, color=colour, label=label)
+                    if frames == counts[-1]:
+                        panel.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
+            panel.set(title=damage, xlabel="distance (m)", yscale="log")
+            plain_decades(panel.yaxis)
+        axes[0].set_ylabel("diameter found 90 % of the time (mm)")
+        axes[-1].plot([], [], "--", color=GREY, label=f"{counts[0]} frame{'s' * (counts[0] > 1)} (lines: {counts[-1]})")
+        figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+    save_png(path, (3.6 * max(len(damages), 2), 5.2), draw)
