@@ -81,7 +81,7 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gate]:
     ("changed", "why"),
     [
         pytest.param(("detector.name=halved",), "a90", id="halved sensitivity"),
-        pytest.param(DOUBLED_NOISE, "a90", id="doubled sensor noise"),
+        pytest.param(DOUBLED_NOISE, "signals", id="doubled sensor noise"),
         pytest.param(("detector.name=shifted",), "a90", id="threshold too high"),
         pytest.param(("detector.name=lowered",), "false calls", id="threshold too low"),
         pytest.param(("detector.name=cropped",), "a90", id="broken crop"),
