@@ -91,6 +91,8 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
 
     file = path / LIMITS.files[1] if path.is_dir() else path
     legal = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
+    if not file.is_file():
+        raise UserError(f"{file}: there is no such table of limits", legal=legal, fix="tofpod sweep atlas computes it")
     try:
         table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -16,10 +18,22 @@ from harness.experiment.load import load_experiment
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_every_program_of_the_readme_is_one_of_the_command(capsys):
-    text = (ROOT / "README.md").read_text()
-    named = {word.removeprefix("harness.").strip("`)") for word in text.split() if word.startswith("harness.")}
-    assert {name for name in named if name.isidentifier()} - {"prepare", "testing"} <= set(programs())
+COMMANDS = re.compile(r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE)
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_every_command_of_the_documents_is_understood(path, capsys):
+    text = path.read_text().replace("\\\n", " ")
+    for command in COMMANDS.findall(text):
+        name, *given = shlex.split(command)
+        if name in programs() and given and "..." not in command:
+            assert importlib.import_module(f"harness.{name}")._parser().parse_args(given), command
+
+
+def test_every_program_is_in_the_documents(capsys):
+    text = (ROOT / "docs" / "programs.md").read_text()
+    assert {name for name in programs() if f"harness.{name} " not in text} == set()
     assert main([]) == 0
     shown = capsys.readouterr().out
     assert all(command in shown for _, command in TASKS) and all(name in shown for name in programs())
