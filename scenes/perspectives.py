@@ -17,14 +17,21 @@ from harness.vocabulary.seeds import random_stream
 from scenes.optics import Optics
 from scenes.target.checks import NEAREST_M
 from scenes.target.custom import PoseConfig, TargetConfig
-from scenes.target.truth import OUTLINE_STEPS, face_grid_m, outline_board_m
+from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
-    """Raise UserError where a part of the face is out of the camera's field of view, or all of it out of its range. A
-    face partly out of range is legal: its pixels there have no range, as they would have in the real camera."""
-    outline = transform_points(config.pose.T_camera_board, outline_board_m(config.board))
-    seen_region(outline, optics)
+    """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
+    out of its range. A face partly out of view is legal, and damage there is no target; so is a face partly out of
+    range: its pixels there have no range, as they would have in the real camera."""
+    seen_region(config, optics)
+    places = np.array([face_of(config.board).point(*damage.centre_m) for damage in config.damages]).reshape(-1, 3)
+    if len(places) and not optics.lens.images(transform_points(config.pose.T_camera_board, places)).any():
+        raise UserError(
+            f"none of the target's {len(places)} damages is in view of {optics.title}",
+            legal="one damage or more in view; those out of view are not counted as targets",
+            fix="change target.pose, or move the damage",
+        )
     face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
     range_m = face[..., 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
@@ -35,24 +42,29 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
         )
 
 
-def seen_region(outline_camera_m: np.ndarray, optics: Optics) -> Region:
-    """Return the pixels on which an outline (n, 3) lies. Raises UserError where part is off the sensor or behind it."""
-    lens = optics.lens
-    nearest_m = float(outline_camera_m[:, 2].min())
+def seen_region(config: TargetConfig, optics: Optics) -> Region:
+    """Return the pixels on which the face lies: all of the sensor's where a part of the face is out of view. Raises
+    UserError where all of it is, or where it reaches behind the lens."""
+    lens, places = optics.lens, face_grid_m(config.board, steps=OUTLINE_STEPS).reshape(-1, 3)
+    face = transform_points(config.pose.T_camera_board, places)
+    nearest_m = float(face[:, 2].min())
     if nearest_m <= NEAREST_M:
         raise UserError(
             f"the target reaches to {nearest_m:.3f} m before the lens",
             legal=f"all of the face at least {NEAREST_M:g} m in front of the camera",
             fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
         )
-    uv = lens.project(outline_camera_m)
-    low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
-    if low.min() < 0 or high[0] > lens.width or high[1] > lens.height:
+    in_view = lens.images(face)
+    if not in_view.any():
         raise UserError(
-            f"the target covers columns {low[0]}..{high[0]} and rows {low[1]}..{high[1]}",
-            legal=f"columns 0..{lens.width} and rows 0..{lens.height} of {optics.title}",
-            fix="move the target away (distance), towards the axis (offset), or make it smaller",
+            f"the target is out of view of {optics.title}",
+            legal="a part of the face in view",
+            fix="move the target towards the axis (offset) or turn it to the camera (tilt)",
         )
+    if not in_view.all():
+        return lens.whole
+    uv = lens.project(face)
+    low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
     return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
 
 

@@ -228,8 +228,11 @@ def test_the_nearest_declared_albedo_counts():
 def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
     optics = load_camera("azure_kinect_nfov").optics
     check_in_view(thesis(), optics)
-    with pytest.raises(UserError, match="covers columns"):
-        check_in_view(thesis(distance_m=0.35), optics)
+    check_in_view(thesis(distance_m=0.35), optics)  # its ends are out of view, its middle is seen
+    with pytest.raises(UserError, match="the target is out of view"):
+        check_in_view(thesis(offset_y_mm=900.0), optics)
+    with pytest.raises(UserError, match="none of the target's 11 damages is in view"):
+        check_in_view(thesis(offset_y_mm=400.0), optics)
     partly = type(optics)(**{**optics.__dict__, "nearest_m": 0.72})
     check_in_view(thesis(), partly)
     # all of the face nearer than 0.5 m along the axis, though not along the rays
@@ -243,7 +246,7 @@ def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
 @pytest.mark.parametrize(
     ("override", "wanted"),
     [
-        ("source.target.distance_m=0.35", "smoke.yaml:9:11: the target covers columns"),
+        ("source.target.offset_x_mm=1500.0", "smoke.yaml:9:11: the target is out of view"),
         ("source.camera.numbers={lens.fx_px: 0.0}", "lens.fx_px"),
         ("source.camera.numbers={wavelength_nm: 940.0}", "the target has no albedo at 940 nm"),
         ("source.render.seed=5000000", "less than or equal to 1000000"),

@@ -201,7 +201,7 @@ def test_dry_run_counts_and_runs_nothing(finished, tmp_path):
     [
         (["--set", "repeats=0"], "repeats"),
         (["--set", "capture.framse=3"], "did you mean"),
-        (["--set", "source.target.distance_m=0.3"], "covers columns"),
+        (["--set", "source.target.offset_x_mm=1500.0"], "the target is out of view"),
         (["--serial", "--scheduler", "tcp://x:1"], "ask for different engines"),
         (["--memory-limit", "0.1"], "0.5 GB or more"),
     ],

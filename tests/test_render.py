@@ -12,6 +12,7 @@ import trimesh
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR
+from scenes.closed_form import plane_view
 from scenes.optics import Quadrilaterals, RenderConfig, footprint_of
 from scenes.render import scene as variant
 from scenes.render.cache import cached_view, render_key
@@ -262,9 +263,42 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
 
 
 def test_target_out_of_view_is_refused():
-    near = SMALL.model_copy(update={"pose": SMALL.pose.model_copy(update={"distance_m": 0.3})})
-    with pytest.raises(UserError, match="covers columns"):
-        target_region(build_target(near), CAMERA.optics)
+    aside = SMALL.model_copy(update={"pose": SMALL.pose.model_copy(update={"offset_x_mm": 2000.0})})
+    with pytest.raises(UserError, match="the target is out of view of Azure Kinect"):
+        target_region(build_target(aside), CAMERA.optics)
+
+
+def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
+    """A plate larger than the field: its direct light is that of an endless plane, to the last pixel of the sensor, and
+    what lies within the view is as on a plate that ends inside."""
+    camera = load_camera("azure_kinect_nfov_binned")
+    large = TargetConfig.from_data({
+        "name": "custom",
+        "board": {"width_mm": 1700.0, "height_mm": 1200.0, "thickness_mm": 10.0},
+        "holes": [{"id": 1, "diameter_mm": 30.0, "centre_mm": [-60.0, 20.0], "kind": "blind", "depth_mm": 8.0}],
+        "material": {"albedo_850": 0.6, "grain_contrast": 0.0},
+        "pose": {"distance_m": 0.6, "tilt_x_deg": 12.0, "tilt_y_deg": -16.0},
+    })  # fmt: skip
+    assert target_region(build_target(large), camera.optics) == camera.nominal_lens.whole
+    view = render_view(build_target(large), camera.optics, RenderConfig(bounces=0))
+    normal = large.pose.T_camera_board[:3, 2]
+    slope_x, slope_y = -normal[0] / normal[2], -normal[1] / normal[2]
+    plane = plane_view(camera, camera.nominal_lens.whole, 0.6, 0.6, slope_x, slope_y)
+    lit = ~hole_pixels(view, large) & (np.hypot(view.slopes[..., 0], view.slopes[..., 1]) < np.tan(np.deg2rad(34)))
+    assert view.range_m[lit] == pytest.approx(plane.range_m[lit], rel=1e-5)
+    assert np.abs(view.phasor_direct[:, lit] / plane.phasor[:, lit] - 1).max() < 5e-3
+    board = large.board.model_copy(update={"width_mm": 200.0, "height_mm": 150.0})
+    small = render_view(build_target(large.model_copy(update={"board": board})), camera.optics, RenderConfig(bounces=0))
+    inner = np.s_[:, 20:-20, 20:-20]
+    same = view.phasor_direct[:, *small.region.within(view.region)]
+    assert np.abs(small.phasor_direct[inner] / same[inner] - 1).max() < 1e-2
+
+
+def hole_pixels(view, target) -> np.ndarray:
+    """(h, w) bool: pixels within 3 pixels of the target's only hole."""
+    centre = target.pose.T_camera_board[:3] @ [*target.holes[0].centre_m, 0.0, 1.0]
+    apart = np.linalg.norm(view.slopes - centre[:2] / centre[2], axis=-1)
+    return apart < 0.035
 
 
 def test_renders_repeat_exactly_and_the_cache_returns_the_same_view(tmp_path, thesis_view):

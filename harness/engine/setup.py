@@ -43,8 +43,8 @@ class SetUpRef:
 
 @dataclass(frozen=True)
 class SetUp:
-    """One target before one unit. ``truth`` is the target's damage, also where ``unit``'s view was rendered without it
-    (``damaged`` False): the same places on a hole-free board. Arrays cover ``unit.region``, (h, w)."""
+    """One target before one unit. ``truth`` is the target's damage with its centre in view, also where the view was
+    rendered without it (``damaged`` False): the same places without holes. Arrays cover ``unit.region``, (h, w)."""
 
     unit: SimulatedUnit
     damaged: bool
@@ -107,7 +107,8 @@ class SetUp:
     def intact(self) -> np.ndarray:
         """(h, w) bool: undamaged face well away from damage and rim."""
         whole = self.on_board.copy()
-        whole.ravel()[np.concatenate(list(self.outlines.values()))] = False
+        for pixels in self.outlines.values():
+            whole.ravel()[pixels] = False
         return _eroded(whole)
 
     @cached_property
@@ -173,7 +174,10 @@ def load_set_up(ref: SetUpRef) -> SetUp:
     if view is None:
         raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")
     unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
-    return SetUp(unit, ref.damaged, truth_of(ref.target, T_camera_board), ref.target, T_camera_board)
+    truth = truth_of(ref.target, T_camera_board)
+    in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
+    seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
+    return SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
 
 
 @dataclass(frozen=True)

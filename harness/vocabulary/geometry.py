@@ -92,6 +92,11 @@ UNDISTORT_STEPS = 200
 """Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60."""
 
 
+SAME_SLOPE = 1e-3
+"""Rays closer than this, in slope, are the same: beyond the angle at which a lens' distortion turns back they differ
+by more."""
+
+
 @dataclass(frozen=True)
 class Lens:
     """A central camera: pinhole with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2,
@@ -140,6 +145,16 @@ class Lens:
         flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
         pixels, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
+
+    def images(self, points_camera_m: np.ndarray) -> np.ndarray:
+        """Tell which points (..., 3) have an image on the sensor, (...) bool: they lie in front of the camera, and the
+        ray of the pixel on which the projection puts them leads back to them."""
+        ahead = points_camera_m[..., 2] > 0
+        points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
+        u, v = np.moveaxis(self.project(points), -1, 0)
+        found = ahead & (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
+        back = self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0)) - points[..., :2] / points[..., 2:]
+        return np.asarray(found & (np.abs(back).max(axis=-1) < SAME_SLOPE))
 
 
 @dataclass(frozen=True)

@@ -285,7 +285,7 @@ PILOT_SEED = 1 << 20
 
 def target_region(target: Target, optics: Optics) -> Region:
     """Return the region of the sensor that a render of the target covers. Raises UserError as `seen_region` does."""
-    tight = seen_region(transform_points(target.T_camera_board, target.outline_board_m), optics)
+    tight = seen_region(target.config, optics)
     return tight.grown(RIM_PX + optics.margin_px, optics.lens.height, optics.lens.width)
 
 
@@ -305,10 +305,12 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
         here = direct.surface == index
         rgb[here] = part.rgb_at(direct.uv[here])
     if config.bounces > 0:
-        # pixels within the face's outline as the camera sees it
-        uv = lens.project(transform_points(target.T_camera_board, target.outline_board_m))
-        polygon = np.round(uv - [region.col0, region.row0]).astype(np.int32)
-        inside = cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)
+        # pixels within the face's outline as the camera sees it; all, where a part of the outline is out of view
+        outline = transform_points(target.T_camera_board, target.outline_board_m)
+        inside = np.ones(region.shape, bool)
+        if lens.images(outline).all():
+            polygon = np.round(lens.project(outline) - [region.col0, region.row0]).astype(np.int32)
+            inside = cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)
         indirect, noise_m = indirect_light(lit, target, optics, slopes, direct, inside, config)
         phasor = phasor + indirect[:-1]
         intensity = intensity + indirect[-1].real

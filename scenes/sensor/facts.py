@@ -162,6 +162,12 @@ class CameraFacts(Config):
         """The lens of the file; without distortion, that of a scanner is the raster of its beam's directions."""
         return self.lens.lens()
 
+    def images(self, points_camera_m: np.ndarray) -> np.ndarray:
+        """Tell which points (..., 3) have an image on the sensor and within the lens's field, (...) bool."""
+        half_angle, aside = self.lens.field_half_angle_deg, np.linalg.norm(points_camera_m[..., :2], axis=-1)
+        widest = np.deg2rad(half_angle.value) if half_angle else np.pi / 2
+        return self.nominal_lens.images(points_camera_m) & (np.arctan2(aside, points_camera_m[..., 2]) <= widest)
+
 
 def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
     """Return the distorted slopes of true ones (n,) by radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6)."""

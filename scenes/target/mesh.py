@@ -100,6 +100,9 @@ SEGMENTS = 128
 """Sides of a circle. The polygon has the circle's area; at 1 in, corners are 2.5 um outside, sides 1.3 um inside."""
 RINGS = 48
 """Steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %."""
+LARGE_M, LONGEST_M = 0.65, 0.1
+"""Side of a board from which on its triangles are cut to edges of ``LONGEST_M``: a renderer in float32 misses the plane
+of a triangle from a facet of a hole to a far corner by its length squared over its width times 1e-7, 0.1 mm at 1 m."""
 MAX_CELLS = 1_000_000
 """Most cells of a bent sheet: some 300 MB."""
 
@@ -144,10 +147,15 @@ class Target:
 
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
+    import trimesh
+
     check_target(config)
     T_camera_board, board, material = config.pose.T_camera_board, config.board, config.material
     truth, sagitta_m = truth_of(config, T_camera_board), _sagitta_m(config)
     mesh = board_solid(config, truth)
+    if max(board.width_mm, board.height_mm) * MM > LARGE_M:
+        vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, LONGEST_M)
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
     plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
     mesh.apply_transform(T_camera_board)
     uv = texture_850 = texture_rgb = None
