@@ -17,7 +17,9 @@ QUIET = CameraConfig(
     name="realsense_l515", effects=NO_EFFECTS.model_copy(update={"multipath": True, "saturation": True})
 )
 PATCH = Region(372, 422, 500, 560)
-RAW = {"engine.side_weight": 0.0, "engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
+RAW: dict[str, float | list[float]] = {
+    **{"engine.window_px": [1, 1], "engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
+}
 """No smoothing and no gate that looks at neighbours."""
 FINE = {"engine.output_step_mm": 1e-3}
 UNIFORM = {"engine.agree_deviations": 100.0, "scan.sweep_jitter_mm": 0.0}

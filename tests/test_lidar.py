@@ -22,11 +22,11 @@ from scenes.sensor.source import SimulatedUnit
 @pytest.mark.parametrize("distance_m", [0.27, 0.5, 0.75, 1.0, 2.3, 6.4])
 @pytest.mark.parametrize("region", [PATCH, Region(40, 80, 60, 110)], ids=["axis", "corner"])
 def test_range_on_planes_is_exact_without_noise(distance_m, region):
-    """To 0.02 mm, with the receiver 20 mm beside the transmitter; what is left is the plane's perspective curvature
-    across the smoothing."""
+    """With the receiver 20 mm beside the transmitter; what is left is the plane's perspective curvature across the
+    smoothing, some 13 square pixels of half a curvature: 0.01 mm a metre, more in the corner."""
     camera = changed({**FINE, "engine.confidence_electrons": 1.0})
     unit = SimulatedUnit(camera, QUIET, plane_view(camera, region, distance_m, 0.6, 0.1, 0.05))
-    assert np.abs(z_of(unit)[0] - true_z_m(unit)).max() < 0.02e-3
+    assert np.abs(z_of(unit)[0] - true_z_m(unit)).max() < 0.01e-3 + 0.025e-3 * distance_m
 
 
 def test_the_receiver_beside_the_transmitter_is_corrected_for():
@@ -112,11 +112,9 @@ def test_highest_maximum_of_noise_follows_rices_count():
 
 def smoothing_factor(camera: ScannedLidar) -> float:
     """Deviation after the linear smoothing of noise that overlapping integrations correlate along columns."""
-    kernel = np.array([camera.engine.side_weight.value, 1.0, camera.engine.side_weight.value])
-    kernel /= kernel.sum()
-    alike = np.convolve(kernel, kernel[::-1])
+    height, width = camera.engine.window_px.value
     rho = max(0.0, 1 - 1 / camera.integration_points)
-    return float(np.sqrt((kernel**2).sum() * (alike[2] + 2 * rho * alike[3])))
+    return float(np.sqrt((1 + 2 * rho * (1 - 1 / height)) / (height * width)))
 
 
 @pytest.mark.parametrize(("distance_m", "albedo"), [(0.5, 0.95), (1.0, 0.5), (1.5, 0.95), (2.0, 0.6)])
@@ -134,12 +132,12 @@ def test_output_noise_is_the_bound_times_the_smoothing(distance_m, albedo):
 
 
 def correlations(camera: ScannedLidar, frames: int = 60) -> np.ndarray:
-    """(3, 3) noise correlation at lags 0..2 along columns (rows of the result) and along rows (its columns)."""
+    """(7, 7) noise correlation at lags 0..6 along columns (rows of the result) and along rows (its columns)."""
     unit = SimulatedUnit(camera, ONLY_NOISE, plane_view(camera, Region(340, 460, 460, 600), 1.0, 0.6))
     z = z_of(unit, frames)
     d = z - z.mean(axis=0)
     h, w = d.shape[1:]
-    pairs = [[(d[:, a:, b:] * d[:, : h - a, : w - b]).mean() for b in range(3)] for a in range(3)]
+    pairs = [[(d[:, a:, b:] * d[:, : h - a, : w - b]).mean() for b in range(7)] for a in range(7)]
     return np.array(pairs) / pairs[0][0]
 
 
@@ -148,17 +146,19 @@ def test_noise_is_alike_along_sweeps_and_not_across_them():
     a deviation of 0.001 (a million pairs); 0.006 allows for it and for the taps' own 0.3 %."""
     found = correlations(changed({**RAW, **UNIFORM, **FINE}))
     share = 1 - 1 / CAMERA.integration_points
-    assert found == pytest.approx(np.array([[1, 0, 0], [share, 0, 0], [0, 0, 0]]), abs=0.006)
+    expected = np.zeros((7, 7))
+    expected[:2, 0] = 1, share
+    assert found == pytest.approx(expected, abs=0.006)
 
 
-def test_smoothing_correlates_as_its_weights_say():
-    side = CAMERA.engine.side_weight.value
-    kernel = np.array([side, 1, side])
-    along_row = np.convolve(kernel, kernel)
-    overlap = np.array([0.0, 1 - 1 / CAMERA.integration_points, 1.0, 1 - 1 / CAMERA.integration_points, 0.0])
-    along_column = np.convolve(along_row, overlap)
-    expected = np.outer(along_column[4:7] / along_column[4], along_row[2:] / along_row[2])
-    assert correlations(changed({**UNIFORM, **FINE})) == pytest.approx(expected, abs=0.008)
+def test_smoothing_correlates_as_its_window_says():
+    """A plain mean over 9 x 9 pixels: triangles, the one along columns blurred by the overlap. The means of 60 frames
+    take nothing off at this tolerance; neighbouring means share most of their noise, hence its size."""
+    share = 1 - 1 / CAMERA.integration_points
+    triangle = 9.0 - np.abs(np.arange(-10, 11)).clip(max=9)
+    along_column = np.convolve(triangle, [share, 1, share])[11:18]
+    expected = np.outer(along_column / along_column[0], triangle[10:17] / triangle[10])
+    assert correlations(changed({**UNIFORM, **FINE})) == pytest.approx(expected, abs=0.04)
 
 
 def test_noise_of_range_and_of_strength_are_independent():
@@ -214,7 +214,7 @@ def valid_share(distance_m: float, albedo: float) -> float:
 
 
 def test_both_calibration_points_are_met():
-    assert temporal_sigma_m(CAMERA, 1.0, 0.95, 100, 9) == pytest.approx(2.5e-3, rel=0.02)
+    assert temporal_sigma_m(CAMERA, 0.945, 0.3, 100, 9) == pytest.approx(0.71e-3, rel=0.03)
     assert valid_share(6.5, 0.95) == pytest.approx(0.5, abs=0.03)
 
 

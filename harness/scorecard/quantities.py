@@ -87,6 +87,13 @@ class LagConditions(PlaneConditions):
     lag_y_px: Lag = 0
 
 
+class PatchConditions(PlaneConditions):
+    """Square patches of a plane, each less its own plane, and a distance of pixels within them."""
+
+    patch_px: Annotated[int, Field(ge=3, le=70, description="side of a patch in pixels, 3 to 70")] = 38
+    apart_px: Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")] = 0
+
+
 class StepConditions(Config):
     """A straight edge of one matte plane before another, both frontal, 6 degrees off the pixel grid. z steps along the
     image axis ``across``; with ``shadow`` the front is on the emitter's side and throws its shadow on the back."""
@@ -127,6 +134,8 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
     "diameter_px": "⌀ {:g} px".format,
+    "patch_px": "patches of {:g} px".format,
+    "apart_px": lambda v: f"{v:g} px apart" if v else "",
     "multipath": lambda v: "multipath on" if v else "multipath off",
     "lag_px": "lag {} px".format,
 }
@@ -228,6 +237,37 @@ def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
     # as many neighbours count as a single pixel as the camera's own filter mixes
     stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
     return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
+
+
+def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
+    """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product of pixels so far
+    apart, of both directions."""
+    n, k, found = c.patch_px, c.apart_px, []
+    v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
+    plane = np.column_stack([np.ones(n * n), u, v])
+    for unit in range(1, bench.effort.few_frames + 1):
+        z_mm = plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] / MM
+        corners = [(i, j) for i in range(0, len(z_mm) - n + 1, n) for j in range(0, z_mm.shape[1] - n + 1, n)]
+        patches = np.stack([z_mm[i : i + n, j : j + n].ravel() for i, j in corners], axis=1)
+        left = (patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n)
+        beside, below = left[:, :, k:] * left[:, :, : n - k], left[:, k:] * left[:, : n - k]
+        found.append((left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2))
+    variance, product = np.transpose(found, (1, 0, 2))
+    return variance, product
+
+
+@_quantity("deviation within patches", PatchConditions)
+def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
+    """Deviation over a patch of a single frame about the patch's own plane, noise and fixed pattern: median over
+    patches, mean over units."""
+    return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
+
+
+@_quantity("correlation within patches", PatchConditions)
+def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
+    """Correlation of pixels of a patch of a single frame about the patch's own plane, mean of rows and columns."""
+    variance, product = _patch_products(bench, c)
+    return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
 def _mean_errors_mm(stack: FrameStack) -> np.ndarray:

@@ -14,7 +14,6 @@ from scenes.optics import FWHM_PER_DEVIATION, Optics
 from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, Share, checked
 
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
-SMOOTHING_PX = 1  # half width of the on-device smoothing's window
 
 
 class ReceiverFacts(Config):
@@ -77,12 +76,13 @@ class RippleFacts(Config):
 
 
 class LidarEngineFacts(Config):
-    """Processing on the device. ``side_weight``: of the pixels beside, above and below in the 3 x 3 smoothing; the
-    corners have its square. ``agree_deviations``: a neighbour joins where its half path differs by at most so many
-    expected deviations. ``least_agreeing``: share of the window's weights that must agree. ``confidence_electrons``:
-    least strength."""
+    """Processing on the device. ``window_px``: height and width of the smoothing's window, odd. ``agree_deviations``:
+    a neighbour in it joins the mean where its half path differs by at most so many expected deviations.
+    ``least_agreeing``: share of the window that must agree. ``confidence_electrons``: least strength."""
 
-    side_weight: Share
+    window_px: Annotated[
+        Fact[tuple[int, int]], checked("odd, from 1 to 31", lambda value: value % 2 == 1 and 1 <= value <= 31)
+    ]
     agree_deviations: Positive
     least_agreeing: Share
     confidence_electrons: NonNegative
@@ -167,7 +167,13 @@ class ScannedLidar(CameraFacts):
     @property
     def margin_px(self) -> int:
         """Pixels beyond a region whose light reaches it through the integration and the smoothing."""
-        return int(np.ceil(self.integration_points / 2)) + SMOOTHING_PX
+        return int(np.ceil(self.integration_points / 2)) + max(self.half_window_px)
+
+    @property
+    def half_window_px(self) -> tuple[int, int]:
+        """Pixels of the smoothing's window above and below its centre, and beside it."""
+        height, width = self.engine.window_px.value
+        return height // 2, width // 2
 
     @property
     def z_step_m(self) -> float:

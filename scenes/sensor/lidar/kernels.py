@@ -136,7 +136,7 @@ def stronger_peak(  # type: ignore[no-untyped-def]
 ):
     """Choose the higher of two peaks after noise, with the noise of its range. ``height``, ``half_m``, ``deviation_m``
     (2, h, w) of the peaks; ``noise`` (h, w): deviation of a height; ``normals`` (3, h or more, w): of the heights and
-    of the winner's range; ``sweep_m`` (w,) added to a column. Writes into arrays with a border of one pixel."""
+    of the winner's range; ``sweep_m`` (w,) added to a column. Writes into the last three, (h, w)."""
     h, w = noise.shape
     for v in range(h):
         for u in range(w):
@@ -145,9 +145,9 @@ def stronger_peak(  # type: ignore[no-untyped-def]
             second = b > a
             deviation = deviation_m[1, v, u] if second else deviation_m[0, v, u]
             place = half_m[1, v, u] if second else half_m[0, v, u]
-            won_m[v + 1, u + 1] = place + deviation * normals[2, v, u] + sweep_m[u]
-            won_height[v + 1, u + 1] = b if second else a
-            won_deviation_m[v + 1, u + 1] = deviation
+            won_m[v, u] = place + deviation * normals[2, v, u] + sweep_m[u]
+            won_height[v, u] = b if second else a
+            won_deviation_m[v, u] = deviation
 
 
 @numba.njit(**FAST)
@@ -163,47 +163,47 @@ def noise_peaks(  # type: ignore[no-untyped-def]
         v, u = weak[i] // w, weak[i] % w
         crossings = -np.log(max(uniforms[0, i], 1e-300))
         level = np.sqrt(2.0 * np.log(rate / crossings)) if crossings < rate else 0.0
-        if level * noise[v, u] > won_height[v + 1, u + 1]:
-            won_height[v + 1, u + 1] = level * noise[v, u]
-            won_m[v + 1, u + 1] = uniforms[1, i] * unambiguous_m
-            won_deviation_m[v + 1, u + 1] = bandwidth_m / max(level, 1.0)
+        if level * noise[v, u] > won_height[v, u]:
+            won_height[v, u] = level * noise[v, u]
+            won_m[v, u] = uniforms[1, i] * unambiguous_m
+            won_deviation_m[v, u] = bandwidth_m / max(level, 1.0)
 
 
 @numba.njit(**FAST)
 def smooth_and_gate(  # type: ignore[no-untyped-def]
-    won_m, won_height, gate_m, side, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
+    won_m, won_height, gate_m, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
 ):
-    """Average the 3 x 3 neighbours that agree, then range, gates and rounding.
+    """Average the neighbours in a window that agree, then range, gates and rounding.
 
-    ``won_m``, ``won_height`` and ``gate_m`` (h + 2, w + 2): half path, height, and how far a neighbour's half path may
-    differ. ``strength`` (h, w): weighted sum of the agreeing heights over the weights of all neighbours. A pixel whose
-    agreeing weights are too small a share is invalid. Half the path s by a receiver at e gives the range r = (4 s^2 -
-    e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` (h, w) is u.e, ``cosine`` (h, w) u_z. ``limits``: e.e, least
-    strength, least agreeing share, least and greatest range, step.
+    ``won_m``, ``won_height`` (h + 2 p, w + 2 q), with a border of half the window: half path, height. ``gate_m`` (h,
+    w): how far a neighbour's half path may differ. ``strength`` (h, w): sum of the agreeing heights over the number of
+    all neighbours. A pixel whose agreeing neighbours are too small a share is invalid. Half the path s by a receiver at
+    e gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` (h, w) is u.e, ``cosine``
+    (h, w) u_z. ``limits``: e.e, least strength, least agreeing share, least and greatest range, step.
     """
     h, w = cosine.shape
+    p, q = (won_m.shape[0] - h) // 2, (won_m.shape[1] - w) // 2
     e2, least, alike, nearest, farthest, step = limits
     one, zero = np.float32(1), np.float32(0)
+    moved, total, heights = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for v in range(h):
-        tall = one + (side if v > 0 else zero) + (side if v < h - 1 else zero)
+        moved[:], total[:], heights[:] = zero, zero, zero
+        for dy in range(2 * p + 1):
+            for dx in range(2 * q + 1):
+                for u in range(w):
+                    off = won_m[v + dy, u + dx] - won_m[v + p, u + q]
+                    joins = abs(off) <= gate_m[v, u]
+                    moved[u] += off if joins else zero
+                    total[u] += one if joins else zero
+                    heights[u] += won_height[v + dy, u + dx] if joins else zero
+        tall = min(v, p) + min(h - 1 - v, p) + 1
         for u in range(w):
-            centre, gate = won_m[v + 1, u + 1], gate_m[v + 1, u + 1]
-            moved, total, heights = zero, zero, zero
-            for dy in range(3):
-                for dx in range(3):
-                    weight = (one if dy == 1 else side) * (one if dx == 1 else side)
-                    off = won_m[v + dy, u + dx] - centre
-                    weight = weight if abs(off) <= gate else zero
-                    moved += weight * off
-                    total += weight
-                    heights += weight * won_height[v + dy, u + dx]
-            wide = one + (side if u > 0 else zero) + (side if u < w - 1 else zero)
-            everyone = tall * wide
-            support = heights / everyone
-            half = centre + moved / total + error_m
+            everyone = np.float32(tall * (min(u, q) + min(w - 1 - u, q) + 1))
+            support = heights[u] / everyone
+            half = won_m[v + p, u + q] + moved[u] / total[u] + error_m
             range_m = (np.float32(4) * half * half - e2) / (np.float32(4) * half - np.float32(2) * along_m[v, u])
             code = VALID if (range_m >= nearest) & (range_m <= farthest) else OUT_OF_RANGE
-            code = code if total >= alike * everyone else EDGE
+            code = code if total[u] >= alike * everyone else EDGE
             code = code if support >= least else LOW_AMPLITUDE
             code = SATURATED if saturated[v, u] else code
             rounded = np.floor(range_m * cosine[v, u] / step + np.float32(0.5)) * step

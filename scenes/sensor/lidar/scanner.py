@@ -124,16 +124,19 @@ class LidarScanner:
 
     def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the peaks, then the processing; ``error_m`` displaces the frame."""
-        camera, (h, w) = self.camera, exposure.noise.shape
-        won_m, won_height, won_deviation_m = np.zeros((3, h + 2, w + 2), f4)
-        won_m[:] = kernels.NOWHERE_M
+        camera, (h, w), (p, q) = self.camera, exposure.noise.shape, self.camera.half_window_px
+        bordered_m, bordered_height = (
+            np.full((h + 2 * p, w + 2 * q), kernels.NOWHERE_M),
+            np.zeros((h + 2 * p, w + 2 * q), f4),
+        )
+        inner = slice(p, p + h), slice(q, q + w)
+        won = bordered_m[inner], bordered_height[inner], np.empty((h, w), f4)
         # standard normals, correlated along columns, and the sweeps' errors
         normals, sweep_m, taps = np.zeros((3, h, w), f4), np.zeros(w, f4), self._noise_taps
         if self.config.effects.noise:
             normals = standard_normals(rng, (3, h + len(taps) - 1, w))
             kernels.correlate_along_columns(normals, taps)
             sweep_m = standard_normals(rng, (w,)) * f4(camera.scan.sweep_jitter_mm.value * MM)
-        won = won_m, won_height, won_deviation_m
         kernels.stronger_peak(
             exposure.height, exposure.half_m, exposure.deviation_m, exposure.noise, normals, sweep_m, *won
         )
@@ -141,13 +144,13 @@ class LidarScanner:
         bound_m = camera.unambiguous_m / (camera.period_s * camera.bandwidth_rad_s)
         rates = self.slope, bound_m, camera.unambiguous_m
         kernels.noise_peaks(exposure.weak, exposure.noise, rng.random((2, exposure.weak.size)), *rates, *won)
-        won_deviation_m *= f4(camera.engine.agree_deviations.value)
+        gate_m = won[2] * f4(camera.engine.agree_deviations.value)
 
         # smoothing, range, gates and rounding
         z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
         along_m, cosine = self._geometry
         kernels.smooth_and_gate(
-            *won, f4(camera.engine.side_weight.value), along_m, cosine, exposure.saturated, self._limits, f4(error_m),
+            bordered_m, bordered_height, gate_m, along_m, cosine, exposure.saturated, self._limits, f4(error_m),
             z_m, reason, strength,
         )  # fmt: skip
         return DecodedFrame(z_m, reason, strength)
