@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: sweep test test-all lint smoke validate check benchmarks strangers lock clean
+.PHONY: sweep test test-all lint smoke validate check benchmarks strangers docs lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
@@ -34,6 +34,14 @@ benchmarks: .venv/.ready
 # Recordings of many kinds of scene with known truth, answered by the default command: right, warned or wrong.
 strangers: .venv/.ready
 	PYTHONPATH=tests OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m strangers
+
+# The documentation as a site that needs no network: site/index.html.
+docs: .venv/.ready
+	$(BIN)/python -m harness.ls keys > docs/reference.md
+	cp README.md docs/index.md
+	sed -i "s#](docs/#](#g; s#](CONTRIBUTING.md)#](contributing.md)#g" docs/index.md
+	sed "s#](docs/#](#g" CONTRIBUTING.md > docs/contributing.md
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # Five minutes; needed after a change of pyproject.toml's dependencies only.
 lock: .venv/.ready

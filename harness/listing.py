@@ -205,6 +205,33 @@ def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tupl
             yield (*path, key), value
 
 
+def reference() -> str:
+    """Return every key of an experiment and every setting of tofpod's detectors, in Markdown: what is legal there, the
+    default, the meaning. Kinds with keys in common are told apart in the keys' names."""
+    from detectors import detector_type
+    from harness.experiment.schema import ExperimentConfig
+    from harness.vocabulary.declaration.shape import default_at, every_key, legal_at, plain
+
+    sections = {"Experiments": every_key(ExperimentConfig)}
+    for offer in plug_ins("detectors").offers():
+        if offer.built_in:
+            sections[f"Settings of the detector `{offer.name}`"] = every_key(detector_type(offer.name).settings_type)
+    lines = ["# Every key", "", "`key[]` is an item of a list; `key[kind=blind]` holds where `kind` is `blind`."]
+    for title, keys in sections.items():
+        lines += ["", f"## {title}"]
+        places: dict[str, list[str]] = {}
+        for path, slot in keys:
+            place, _, key = path.rpartition(".")
+            default, note = default_at(slot), (slot.field.description if slot.field else "") or ""
+            legal = "a mapping" if slot.models else (legal_at(slot) or "any value").removesuffix(f" ({note})")
+            cells = f"`{key}`", legal, plain(default[0]) if default else "required", note
+            row = "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+            places.setdefault(place, ["| key | legal | default | meaning |", "|---|---|---|---|"]).append(row)
+        for place, rows in places.items():
+            lines += ["", *([f"### `{place}`", ""] if place else []), *rows]
+    return "\n".join(lines)
+
+
 # ---------------------------------------------------------------- results
 
 

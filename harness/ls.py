@@ -13,7 +13,7 @@ from harness.vocabulary.errors import UserError, exit_code_of
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
     options = _parser().parse_args(arguments)
-    lists = {"results": _list_results, "cache": _list_cache}
+    lists = {"results": _list_results, "cache": _list_cache, "keys": _list_keys}
     return exit_code_of(lambda: lists.get(options.what, _list_offers)(options))
 
 
@@ -21,13 +21,14 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m harness.ls",
         description="List detectors and cameras: tofpod's own and those that installed packages offer through the "
-        "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, or the cache of renders.",
+        "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, the cache of renders, or every "
+        "key of an experiment.",
         epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
         "python -m harness.ls --json; python -m harness.ls results; python -m harness.ls results averaging; "
         "python -m harness.ls cache",
     )
     add = parser.add_argument
-    add("what", nargs="?", help="list one kind only (detectors, cameras, results or cache); or a detector or camera")
+    add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
     add("name", nargs="?", help="show everything that can be set of this one; of results, those of this experiment")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
     add("--fast", action="store_true", help="of the cache: do not read every render to find damaged ones")
@@ -54,7 +55,7 @@ def _list_offers(options: argparse.Namespace) -> int:
     named = [word] if word in SETTABLE else [kind for kind in SETTABLE if word in plug_ins(kind).names()]
     if not named or (name is not None and word not in SETTABLE):
         names = [] if name is not None else [each for kind in SETTABLE for each in plug_ins(kind).names()]
-        legal = [*SETTABLE, "results", "cache", *names]
+        legal = [*SETTABLE, "results", "cache", "keys", *names]
         near = nearest(word, legal)
         meant = f"; did you mean {near!r}?" if near else ""
         fix = "python -m harness.ls lists all"
@@ -98,6 +99,13 @@ def _list_results(options: argparse.Namespace) -> int:
         for run, line in zip(shown, table_lines(rows, indent="    "), strict=True):
             said = (limit_text(run["limits"]), differs_text(run["differs"]))
             print("\n".join([line, *(f"      {text}" for text in said if text)]))
+    return 0
+
+
+def _list_keys(options: argparse.Namespace) -> int:
+    from harness.listing import reference
+
+    print(reference())
     return 0
 
 

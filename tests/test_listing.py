@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from detectors import detector_type
 from harness import clean, ls
 from harness.engine.journal import Journal
 from harness.engine.work import Ended, locked
@@ -20,7 +22,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
 from scenes.render.cache import in_use, write_view
-from scenes.sensor.camera import load_camera
+from scenes.sensor.camera import EffectsConfig, load_camera
 
 ROOT = Path(__file__).resolve().parents[1]
 DAY_S = 86_400.0
@@ -438,3 +440,21 @@ def test_help_of_clean_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_reference_has_every_key_of_experiments_and_the_site_every_page(capsys):
+    assert ls.main(["keys"]) == 0
+    told = capsys.readouterr().out
+    for place, keys in (
+        ("## Experiments\n", ("name", "source", "study", "sweep")),
+        ("### `source[kind=simulated].target[name=drawn].damage[kind=blind]`\n", ("diameter_mm", "depth_mm")),
+        ("### `source[kind=simulated].camera.effects`\n", tuple(EffectsConfig.model_fields)),
+        ("## Settings of the detector `matched`\n", tuple(detector_type("matched").settings_type.model_fields)),
+    ):
+        section = told.partition(place)[2].partition("\n#")[0]
+        assert section and all(f"\n| `{key}` |" in section for key in keys), place
+    assert "| `per_board` | a whole number from 1 to" in told and "required" in told
+    made = {"index.md", "reference.md", "contributing.md"}
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | made
+    listed = set(re.findall(r"[a-z_]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert listed == pages

@@ -203,6 +203,24 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
     return f"{words} {' and '.join(f'{BOUNDS[name]} {bound}' for name, bound in bounds.items())}".strip()
 
 
+def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot]]:
+    """Yield every key below a model with its place: items of a list as ``key[]``, models of several kinds as
+    ``key[kind=name]``."""
+    for name, field in model.model_fields.items():
+        path, slot = f"{before}{name}", slot_of(field.annotation, field)
+        yield path, slot
+        for kind, _ in slot.branches:
+            if get_origin(kind) in (tuple, list):
+                path, slot = f"{path}[]", slot_of(get_args(kind)[0])
+                break
+        kinds = kinds_of(slot)
+        if kinds is not None:
+            for kind, chosen in kinds[1].items():
+                yield from every_key(chosen, f"{path}[{kinds[0]}={kind}].")
+        elif slot.models:
+            yield from every_key(slot.models[0], f"{path}.")
+
+
 def plain(value: Any) -> str:
     """Return a legal value as a user writes it."""
     return value if isinstance(value, str) else json.dumps(value)
