@@ -148,19 +148,10 @@ def _from_study(options: argparse.Namespace) -> GuessedCurve:
     whole rise where they do not hold its a50 or its a90."""
     from harness.evaluation.pod.design import RISE
     from harness.evaluation.study.limit import limit_of
-    from harness.evaluation.study.record import read_record
-    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.evaluation.study.record import read_record, set_up_named
 
     study = read_record(options.study)
-    by_label = {record.label: record for record in study.set_ups}
-    name, known = options.set_up or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
-    if name is None:
-        raise UserError(f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."')
-    if name not in by_label:
-        near = nearest(name, by_label)
-        meant = f"; did you mean {near!r}?" if near else ""
-        raise UserError(f"{study.name} has no set-up {name!r}{meant}", legal=known)
-    record = by_label[name]
+    record = set_up_named(study, options.set_up)
     limit = limit_of(record)
     if limit.statement is None:
         fix = "tell a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"

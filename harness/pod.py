@@ -17,6 +17,7 @@ LINKS = ("logit", "probit", "cloglog", "loglog")
 BOUNDED = ("none", "floor", "ceiling", "both")
 BOUNDS = ("likelihood-ratio", "profile", "wald")
 FILES = ("pod.json", "pod.png", "pod.html")
+MAPOD_FILES = ("mapod.json", "mapod.png", "mapod.html")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -58,12 +59,27 @@ def _parser() -> argparse.ArgumentParser:
     put("--left", type=float, metavar="Y", help="signals at or below this are known to be no more than that (noise)")
     put("--right", type=float, metavar="Y", help="signals at or above this are known to be no less (saturation)")
     put("--log-signal", action=switch, help=f"the straight line is of the signals' logarithm, or not {least}")
+    told = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
+    put = parser.add_argument_group(told).add_argument
+    put(
+        "--prior",
+        type=Path,
+        metavar="STUDY",
+        help="folder of a study, simulated or by virtual damage (harness.implant)",
+    )
+    put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
+    put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
+    scale = "factor by which the simulation may well be wrong"
+    put("--prior-size", type=float, metavar="FACTOR", help=f"{scale} in size (default: 1.5)")
+    put("--prior-width", type=float, metavar="FACTOR", help=f"{scale} in the width of the rise (default: 2)")
     return parser
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
     import json
 
+    if options.prior is not None:
+        return _corrected(options, command)
     statement = _stated(options)
     from harness.report.pod import pod_html, pod_parts, save_pod_png
     from harness.tables.text import show
@@ -80,10 +96,53 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
+def _corrected(options: argparse.Namespace, command: str) -> int:
+    """Correct a study's curve by the inspections; write the page, picture and data of MAPOD."""
+    import json
+
+    from harness.evaluation.pod import inspections as table
+    from harness.evaluation.pod.transfer import PRIOR_SIZE, PRIOR_WIDTH, Mapod
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record, set_up_named
+    from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION
+
+    for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log", "bounded", "bound"):
+        if getattr(options, name) is not None:
+            fix = "leave it out: the study's curve decides it"
+            raise UserError(f"--{name.replace('_', '-')} and --prior: not both", fix=fix)
+    if not options.hit or len(options.hit) != 1 or options.unit not in ("", "mm"):
+        legal = "--hit COL once, with sizes in mm, as a study's are"
+        raise UserError("--prior corrects a curve by hits and misses", legal=legal)
+    factors = (options.prior_size or PRIOR_SIZE, options.prior_width or PRIOR_WIDTH)
+    if not 1.01 <= min(factors) <= max(factors) <= 100:
+        raise UserError(f"--prior-size {factors[0]:g}, --prior-width {factors[1]:g}", legal="factors from 1.01 to 100")
+    limit = limit_of(set_up_named(read_record(options.prior), options.set_up))
+    read = table.read_inspections(options.file, options.size, options.hit, options.target)
+    table.require_positive(read, response=False, why="--prior")
+    if read.targets < len(read.size):
+        raise UserError(f"{options.file}: targets stand in it more than once", fix="keep one inspection of each target")
+    boards = table.texts_of(read, options.board) if options.board else None
+    found = Mapod.of(limit.record.label, limit.statement, limit.why, read, boards, *factors)
+    show(mapod_parts(found))
+    data, picture, page = (options.out / name for name in MAPOD_FILES)
+    told = {"results_version": RESULTS_VERSION, "prior": str(options.prior), **found.to_data(), "command": command}
+    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
+    save_mapod_png(picture, found)
+    write_text(page, mapod_html(found, command))
+    print(f"wrote {data}, {picture.name}, {page.name}")
+    return 0
+
+
 def _stated(options: argparse.Namespace) -> PodStatement:
     from harness.evaluation.pod import inspections as table
     from harness.evaluation.pod import statement as pod
 
+    for name in ("set_up", "board", "prior_size", "prior_width"):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out")
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
         said = "one of them, not both" if of_hits else "which column tells what was found?"

@@ -102,6 +102,14 @@ def read_inspections(
     return replace(read, unflawed=response[seen & ~flawed], notes=tuple(notes))
 
 
+def texts_of(read: Inspections, column: str) -> np.ndarray:
+    """Return (n,) the text of another column in the rows that were read. Raises UserError where there is none."""
+    (_, header), *rows = _rows(read.path)
+    header = [name.strip() for name in header]
+    at, row_of = _column(read.path, header, column, (column,)), dict(rows)
+    return np.array([row_of[line][at].strip() for line in read.line.tolist()], dtype=str)
+
+
 def _require_one_size(read: Inspections) -> None:
     """Refuse a target that stands in the file with two sizes."""
     assert read.target is not None

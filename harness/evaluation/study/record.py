@@ -25,7 +25,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from harness.vocabulary.declaration.diagnose import shown
+from harness.vocabulary.declaration.diagnose import nearest, shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.provenance import check_version
@@ -236,6 +236,19 @@ def read_record(path: Path) -> StudyRecord:
         return TypeAdapter(StudyRecord).validate_python(data)
     except ValidationError as error:
         raise UserError(f"{file}: is damaged: {_mistake(error, data)}", fix=AGAIN) from error
+
+
+def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
+    """Return the set-up with this label, or the only one. Raises UserError where there is none, or it is left open."""
+    by_label = {record.label: record for record in study.set_ups}
+    name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
+    if name is None:
+        raise UserError(f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."')
+    if name not in by_label:
+        near = nearest(name, by_label)
+        meant = f"; did you mean {near!r}?" if near else ""
+        raise UserError(f"{study.name} has no set-up {name!r}{meant}", legal=known)
+    return by_label[name]
 
 
 def _mistake(error: ValidationError, data: Any) -> str:

@@ -1,0 +1,267 @@
+"""Model-assisted probability of detection (MAPOD): a simulated curve, corrected by real hits and misses.
+
+The transfer function says that real damage of size a is as easily found as simulated damage of size a / k, and that the
+curve's rise is w times as wide. Prior: ln k and ln w have a bivariate Student distribution about 0 with `FREEDOM`
+degrees of freedom, whose heavy tails let data that contradict the simulation overrule it; its scale matrix adds the
+simulated curve's own covariance to the squares of the stated scales. Posterior: prior times the likelihood of the real
+hits and misses, on a grid. Sources: MIL-HDBK-1823A, appendix H (model-assisted POD); Thompson et al., Review of
+Progress in QNDE 28 (2009), 1685 (transfer functions); O'Hagan and Pericchi, Brazilian Journal of Probability and
+Statistics 26 (2012), 372 (heavy tails and conflict).
+
+Not modelled: a link other than the simulated curve's, a floor or a ceiling of the real inspections, and real targets
+that share a part; a simulation that is wrong in another way than in size and width is what the test of agreement is
+for."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from harness.evaluation.pod.curve import CELLS, PodCurve, link_ppf, logs_of_link
+from harness.evaluation.pod.inspections import Inspections
+from harness.evaluation.pod.statement import PodStatement, drawn_sizes, finite, state_hits
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.seeds import random_stream
+
+FREEDOM = 3.0
+PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
+"""Default scales: factors by which a simulation may well be wrong in size and in the width of the rise."""
+REACH, NODES = 8.0, (241, 61)
+"""Half the grid's side in scales, and its nodes along ln k and ln w."""
+DRAWS = 999
+"""Simulated campaigns behind the p-values of the tests of agreement: known to 0.7 % at 5 %."""
+ENOUGH = 1.2
+"""Stop rule: a90/95 is at most so many times a90, so that no further board can lower it by more."""
+
+
+@dataclass(frozen=True)
+class BoardStep:
+    """The knowledge after so many boards: ``a50``, ``a90`` posterior medians, ``a90_95`` the posterior's 95 % quantile
+    of a90; ``enough``: whether the stop rule says to stop."""
+
+    board: str
+    targets: int
+    hits: int
+    a50: float
+    a90: float
+    a90_95: float
+
+    @property
+    def enough(self) -> bool:
+        """Return whether more boards would lower the limit by less than the stop rule asks."""
+        return self.a90_95 <= ENOUGH * self.a90
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """A simulated ``curve``, the real inspections' ``size`` (n,), ``hit`` (n,) bool and ``board`` (n,) names, and the
+    prior's scales of k and w, both above 1. Sizes are in the simulation's unit."""
+
+    curve: PodCurve
+    size: np.ndarray
+    hit: np.ndarray
+    board: np.ndarray
+    prior_size: float = PRIOR_SIZE
+    prior_width: float = PRIOR_WIDTH
+
+    def __post_init__(self) -> None:
+        if not self.curve.size_at(0.5) > 0:
+            raise UserError("the simulated curve's a50 is not above 0: its sizes cannot be scaled")
+
+    @cached_property
+    def own_covariance(self) -> np.ndarray:
+        """(2, 2) covariance of the simulated curve's ln a50 and ln w, by the delta method from that of mu, sigma."""
+        curve, half = self.curve, float(link_ppf(self.curve.link, np.array(0.5)))
+        middle = curve.mu + half * curve.sigma
+        if curve.log_size:
+            slopes = np.array([[1.0, half], [0.0, 1.0 / curve.sigma]])
+        else:
+            slopes = np.array([[1.0, half], [-1.0, 1.0 / curve.sigma * middle - half]]) / middle
+        return np.asarray(slopes @ curve.covariance @ slopes.T)
+
+    @cached_property
+    def scale(self) -> np.ndarray:
+        """(2, 2) scale matrix of the prior of ln k, ln w."""
+        return np.diag([np.log(self.prior_size) ** 2, np.log(self.prior_width) ** 2]) + self.own_covariance
+
+    @cached_property
+    def grid(self) -> np.ndarray:
+        """(g, 2) nodes of ln k, ln w."""
+        reach = REACH * np.sqrt(np.diag(self.scale))
+        k, w = (np.linspace(-end, end, nodes) for end, nodes in zip(reach, NODES, strict=True))
+        return np.stack([each.ravel() for each in np.meshgrid(k, w, indexing="ij")], axis=1)
+
+    @cached_property
+    def logs(self) -> tuple[np.ndarray, np.ndarray]:
+        """(g, n) ln POD and ln(1 - POD) of each target at each node."""
+        return self._logs(self.grid)
+
+    def _logs(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        half = float(link_ppf(self.curve.link, np.array(0.5)))
+        k, w = np.exp(nodes.T)[..., None]
+        if self.curve.log_size:
+            above = np.log(self.size / k) - np.log(self.curve.size_at(0.5))
+        else:
+            above = self.size / k - self.curve.size_at(0.5)
+        found, missed, _ = logs_of_link(self.curve.link, half + above / (self.curve.sigma * w))
+        return found, missed
+
+    def sizes_at(self, pod: float) -> np.ndarray:
+        """(g,) sizes of this POD at each node."""
+        shift = float(link_ppf(self.curve.link, np.array(pod)) - link_ppf(self.curve.link, np.array(0.5)))
+        k, w = np.exp(self.grid.T)
+        middle = self.curve.size_at(0.5)
+        if self.curve.log_size:
+            return np.asarray(k * middle * np.exp(self.curve.sigma * w * shift))
+        return np.asarray(k * np.maximum(middle + self.curve.sigma * w * shift, 0.0))
+
+    @cached_property
+    def prior(self) -> np.ndarray:
+        """(g,) weights of the nodes before any real inspection; their sum is 1."""
+        density = stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM).pdf(self.grid)
+        return np.asarray(density / density.sum())
+
+    def posterior(self, rows: np.ndarray) -> np.ndarray:
+        """(g,) weights of the nodes after the inspections ``rows`` (n,) bool."""
+        found, missed = self.logs
+        value = found @ (rows & self.hit) + missed @ (rows & ~self.hit) + np.log(self.prior)
+        weight = np.exp(value - value.max())
+        return np.asarray(weight / weight.sum())
+
+    def steps(self) -> tuple[BoardStep, ...]:
+        """State the sizes before any board and after each, in the order of their rows."""
+        found, seen = [], np.zeros(len(self.size), bool)
+        for board in ("none", *dict.fromkeys(self.board.tolist())):
+            seen = seen | (self.board == board)
+            weight = self.posterior(seen) if seen.any() else self.prior
+            ends = [quantile(self.sizes_at(pod), weight, at) for pod, at in ((0.5, 0.5), (0.9, 0.5), (0.9, 0.95))]
+            found.append(BoardStep(board, int(seen.sum()), int(self.hit[seen].sum()), *ends))
+        return tuple(found)
+
+    def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the posterior's median POD at ``sizes`` (m,) and its 5 % and 95 % quantiles."""
+        weight = self.posterior(np.ones(len(self.size), bool))
+        kept = weight > weight.max() * 1e-6
+        at = Transfer(self.curve, sizes, np.zeros(len(sizes), bool), sizes)._logs(self.grid[kept])[0]
+        middle, low, high = (
+            np.array([quantile(column, weight[kept], share) for column in np.exp(at).T]) for share in (0.5, 0.05, 0.95)
+        )
+        return middle, low, high
+
+    def agreement(self, *, with_prior: bool, seed: int = 1) -> float:
+        """Return the probability, were the simulated curve right (``with_prior``: but for a transfer function drawn
+        from the prior), of real hits and misses as far from it as these or farther. The statistic is the ratio of the
+        largest likelihood over the grid to the mean one over the curves that the hypothesis allows; its distribution
+        is simulated at the same sizes."""
+        found, missed = self.logs
+        if with_prior:
+            weight = self.prior
+        else:
+            spread = self.own_covariance + np.diag(np.diff(self.grid, axis=0).max(axis=0) ** 2 / 12)
+            density = stats.multivariate_normal(np.zeros(2), spread).pdf(self.grid)
+            weight = density / density.sum()
+        stream = random_stream(seed, "agreement", int(with_prior), len(self.size))
+        nodes = stream.choice(len(weight), DRAWS, p=weight)
+        drawn = stream.random((DRAWS, len(self.size))) < np.exp(found[nodes])
+        campaigns = np.vstack([self.hit, drawn])
+        statistic = []
+        for some in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
+            value = some @ found.T + ~some @ missed.T
+            statistic.append(-np.log(np.exp(value - value.max(axis=1, keepdims=True)) @ weight))
+        own, *others = np.concatenate(statistic).tolist()
+        return float((1 + (np.array(others) >= own - 1e-9).sum()) / (1 + DRAWS))
+
+
+def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """Return the value (n,) below which the weights (n,) come to this share of their sum, interpolated."""
+    order = np.argsort(values, kind="stable")
+    sorted_weights = weights[order]
+    below = np.cumsum(sorted_weights) - sorted_weights / 2
+    return float(np.interp(share * sorted_weights.sum(), below, values[order]))
+
+
+DISAGREES = 0.05
+"""Probability of agreement below which the simulation counts as contradicted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mapod:
+    """A study's curve beside real hits and misses and the combination of both. ``set_up``: the study's, by name;
+    ``measured``: the real ones alone, None where no curve fits them, ``why``. ``steps``: what is known after each
+    board, before any first. ``agrees``: probability of data as far from the simulated curve as these, were it right;
+    ``covered``: the same, were it right but for a transfer function of the prior's kind."""
+
+    set_up: str
+    simulated: PodStatement
+    read: Inspections
+    measured: PodStatement | None
+    why: str
+    transfer: Transfer
+    steps: tuple[BoardStep, ...]
+    agrees: float
+    covered: float
+
+    @classmethod
+    def of(
+        cls,
+        set_up: str,
+        simulated: PodStatement | None,
+        why: str,
+        read: Inspections,
+        boards: np.ndarray | None,
+        prior_size: float,
+        prior_width: float,
+    ) -> Mapod:
+        """Correct a study's curve. Raises UserError where the study has no curve."""
+        if simulated is None:
+            raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another one with --set-up")
+        measured, none = None, ""
+        try:
+            measured = state_hits(read, unit="mm", tested=False)
+        except UserError as error:
+            none = error.message
+        names = np.full(len(read.size), "all") if boards is None else boards
+        transfer = Transfer(simulated.curve, read.size, read.response == 1, names, prior_size, prior_width)
+        p_values = transfer.agreement(with_prior=False), transfer.agreement(with_prior=True)
+        return cls(set_up, simulated, read, measured, none, transfer, transfer.steps(), *p_values)
+
+    @property
+    def contradicted(self) -> bool:
+        """Return whether the real hits and misses contradict the simulated curve."""
+        return self.agrees < DISAGREES
+
+    @property
+    def a90_95(self) -> float:
+        """The limit to quote: the combined one; where the simulation is contradicted, the larger of it and the measured
+        one, which is infinite where not demonstrated."""
+        combined = self.steps[-1].a90_95
+        if not self.contradicted:
+            return combined
+        return float("inf") if self.measured is None else max(combined, self.measured.bound.value)
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Sizes at which the curves are drawn."""
+        simulated = self.simulated.sizes
+        return drawn_sizes(np.append(self.read.size, simulated[[0, -1]]), self.simulated.curve.log_size, ())
+
+    def to_data(self) -> dict[str, Any]:
+        """Return the statement as JSON's types; an infinite size becomes None."""
+        middle, low, high = self.transfer.band(self.sizes)
+        return {
+            "set_up": self.set_up,
+            "file": str(self.read.path),
+            "prior": {"size": self.transfer.prior_size, "width": self.transfer.prior_width, "freedom": FREEDOM},
+            "simulated": self.simulated.to_data(),
+            "measured": None if self.measured is None else self.measured.to_data(),
+            "no_measured_curve": self.why,
+            "after_each_board": [{**asdict(step), "enough": step.enough} for step in self.steps],
+            "p_simulation_right": self.agrees,
+            "p_prior_covers": self.covered,
+            "a90_95": finite(self.a90_95),
+            "combined": {"size": self.sizes.tolist(), "pod": middle.tolist(), "p5": low.tolist(), "p95": high.tolist()},
+        }

@@ -1,0 +1,156 @@
+"""Model-assisted probability of detection: a simulated curve beside real hits and misses, and both combined."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.evaluation.pod.statement import POD
+from harness.evaluation.pod.transfer import ENOUGH, FREEDOM, BoardStep, Mapod
+from harness.report.blocks import (
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    RED,
+    bullets,
+    command_of,
+    figure,
+    heading,
+    page,
+    save_png,
+    svg,
+)
+from harness.report.pod import VALIDITY, draw_hits, hits_in_view, sized
+from harness.tables.schema import Column, Table
+from harness.tables.text import Grid
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+SIZE_IN = (11.0, 5.0)
+BOARDS = Table(
+    "boards",
+    "one row before any board, and one after each",
+    (
+        Column("", "after board", lambda row: row.board),
+        Column("", "targets", lambda row: f"{row.targets}"),
+        Column("", "hits", lambda row: f"{row.hits}"),
+        Column("", "a50 (mm)", lambda row: sized(row.a50, "")),
+        Column("", "a90 (mm)", lambda row: sized(row.a90, "")),
+        Column("", "a90/95 (mm)", lambda row: sized(row.a90_95, "")),
+        Column("", "stop", lambda row: "enough" if row.enough else "go on"),
+    ),
+    formats=(),
+)
+
+
+def answer(found: Mapod) -> str:
+    """The limit to quote, and whether simulation and reality agree, in two sentences."""
+    agrees = f"(p = {found.agrees:.2g})"
+    if found.contradicted:
+        first = f"The real hits and misses contradict the simulation {agrees}: the larger of both limits counts."
+    else:
+        first = f"The real hits and misses do not contradict the simulation {agrees}."
+    if not np.isfinite(found.a90_95):
+        return f"{first} a90/95 is not demonstrated by the real ones, so no limit is stated."
+    return f"{first} A flaw of {sized(found.a90_95, 'mm')} is found 90 % of the time, with 95 % confidence (a90/95)."
+
+
+def sizes_grid(found: Mapod) -> Grid:
+    """Simulated, measured and combined sizes."""
+    last, rows = found.steps[-1], list[tuple[str, ...]]()
+    for name, said in (("simulated", found.simulated), ("measured", found.measured)):
+        if said is not None:
+            bound = sized(said.bound.value, "") if said.bound.demonstrated else "not demonstrated"
+            rows.append((name, sized(said.a50, ""), sized(said.a90, ""), bound, said.counts))
+        else:
+            rows.append((name, "-", "-", "not demonstrated", found.why))
+    both = f"{found.set_up}, corrected by {last.targets} real targets"
+    rows.append(("combined", *(sized(one, "") for one in (last.a50, last.a90, last.a90_95)), both))
+    return Grid.of(("", "a50 (mm)", "a90 (mm)", "a90/95 (mm)", "from"), rows, left=1)
+
+
+def boards_grid(found: Mapod) -> Grid:
+    """One row for each board, with what the stop rule says."""
+    return BOARDS.grid(found.steps)
+
+
+def notes(found: Mapod) -> list[str]:
+    """Sentences on prior, tests and stop rule."""
+    prior = found.transfer
+    said = [
+        "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
+        f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
+        f"degrees of freedom, with scales of a factor {prior.prior_size:g} in k and {prior.prior_width:g} in w, and "
+        "the simulated curve's own uncertainty.",
+        "Combined: medians of the posterior, and for a90/95 its 95 % quantile, a credible limit. Over simulations that "
+        "are wrong as the prior says it covers the truth in 95 % of campaigns, with one that is far too optimistic in "
+        "fewer: where the simulation is contradicted, the larger of the combined and the measured limit counts.",
+        "Were the simulated curve right, hits and misses as far from it as these would come with probability "
+        f"{found.agrees:.2g}; with a transfer function of the prior's kind {found.covered:.2g}. Below 0.05 the first "
+        "is a contradiction, and the second says that the prior is too narrow: widen it (--prior-size, --prior-width).",
+        f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
+    ]
+    return [*said, *found.read.notes, VALIDITY]
+
+
+def mapod_parts(found: Mapod) -> list[str | Grid]:
+    """Return what a terminal shows; what makes the limit doubtful comes first."""
+    warning = ["warning: the real hits and misses contradict the simulation"] if found.contradicted else []
+    return [*warning, sizes_grid(found), "", boards_grid(found), "", *(f"note: {one}" for one in notes(found)), "",
+            answer(found)]  # fmt: skip
+
+
+def mapod_html(found: Mapod, command: str) -> str:
+    """The page as text; it needs no network."""
+    caption = (
+        "Left: the simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one "
+        "with its 90 % credible band. Right: what is known after each board."
+    )
+    drawn = svg("mapod", SIZE_IN, answer(found), _drawing(found))
+    body = [heading("Simulated, measured, combined"), sizes_grid(found).html()]
+    body += [figure({"mapod": drawn}, "mapod", caption), heading("After each board"), boards_grid(found).html()]
+    body += [heading("Notes"), bullets(notes(found)), *command_of(command)]
+    return page(f"Model-assisted probability of detection: {found.read.path.name}", answer(found), body)
+
+
+def save_mapod_png(path: Path, found: Mapod) -> None:
+    """The figure as a PNG at ``path``."""
+    save_png(path, SIZE_IN, _drawing(found))
+
+
+def _drawing(found: Mapod) -> Callable[[Figure], None]:
+    def draw(figure: Figure) -> None:
+        curves, boards = figure.subplots(1, 2, width_ratios=(3, 2))
+        middle, low, high = found.transfer.band(found.sizes)
+        curves.fill_between(found.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
+        curves.plot(found.sizes, middle, color=BLUE, lw=2.2, label="combined")
+        curves.plot(found.sizes, found.simulated.curve.pod(found.sizes), color=PURPLE, ls="--", label="simulated")
+        if found.measured is not None:
+            curves.plot(
+                found.sizes, found.measured.curve.pod(found.sizes), color=ORANGE, ls=":", lw=2, label="measured"
+            )
+        draw_hits(curves, found.read.size, found.read.response == 1, 0.6)
+        curves.axhline(POD, color=GREY, lw=0.8, ls=":")
+        if found.sizes[0] < found.a90_95 < found.sizes[-1]:
+            curves.plot([found.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(found.a90_95, 'mm')}")
+        hits_in_view(curves)
+        curves.set(xlim=(found.sizes[0], found.sizes[-1]), xlabel="size (mm)", ylabel="probability of detection")
+        at = np.arange(len(found.steps))
+        boards.plot(at, [step.a90 for step in found.steps], "o-", color=BLUE, label="a90")
+        boards.plot(at, [step.a90_95 for step in found.steps], "v-", color=RED, label="a90/95")
+        boards.set_xticks(at, [_named(step) for step in found.steps])
+        boards.set(xlabel="after board", ylabel="size (mm)", ylim=(0, None))
+        for axes in (curves, boards):
+            axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=3, borderaxespad=0)
+
+    return draw
+
+
+def _named(step: BoardStep) -> str:
+    return f"{step.board}\n{step.hits}/{step.targets}"

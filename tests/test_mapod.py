@@ -1,0 +1,123 @@
+"""Model-assisted POD: real hits and misses correct a simulated curve, also one of a camera that is wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_study import SetUp, Study, study_record
+
+from harness import pod
+from harness.evaluation.pod.curve import PodCurve
+from harness.evaluation.pod.design import curve_through, place_sizes
+from harness.evaluation.pod.inspections import Inspections
+from harness.evaluation.pod.statement import state_hits
+from harness.evaluation.pod.transfer import PRIOR_SIZE, PRIOR_WIDTH, Mapod, Transfer
+from harness.evaluation.study.record import record_text
+
+
+def simulated(log_size: bool = False) -> PodCurve:
+    """A curve with a50 = 5 and a90 = 7 mm as some 200 simulated targets give it."""
+    curve = curve_through(5.0, 7.0, log_size=log_size)
+    deviations = np.array([0.02 * (1.0 if log_size else curve.mu), 0.1 * curve.sigma])
+    return replace(curve, covariance=np.diag(deviations**2))
+
+
+def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
+    """The true curve of a simulation that is wrong by factors k in size and w in the width of the rise."""
+    if curve.log_size:
+        return replace(curve, mu=curve.mu + np.log(k), sigma=curve.sigma * w)
+    return replace(curve, mu=curve.mu * k, sigma=curve.sigma * k * w)
+
+
+def campaign(size: np.ndarray, hit: np.ndarray, curve: PodCurve) -> Transfer:
+    return Transfer(curve, size, hit, np.full(len(size), "all"))
+
+
+@pytest.mark.parametrize("log_size", [False, True])
+def test_many_real_targets_overrule_the_simulation(log_size: bool):
+    curve = simulated(log_size)
+    truth = wrong_by(curve, 1.6, 1.5)
+    size = np.linspace(1.0, 25.0, 300)
+    found = campaign(size, np.random.default_rng(1).random(300) < truth.pod(size), curve)
+    last = found.steps()[-1]
+    assert last.a50 == pytest.approx(truth.size_at(0.5), rel=0.1)
+    assert last.a90 == pytest.approx(truth.size_at(0.9), rel=0.1)
+    assert found.agreement(with_prior=False) < 0.01 < found.agreement(with_prior=True)
+
+
+def test_without_real_targets_the_prior_remains():
+    before = campaign(np.array([5.0]), np.array([True]), simulated()).steps()[0]
+    assert before.board == "none" and before.targets == 0
+    assert before.a50 == pytest.approx(5.0, rel=0.05)
+    assert before.a90_95 > 1.5 * before.a90
+
+
+def test_agreement_is_as_rare_as_it_says():
+    """P-values of campaigns whose truth is the simulated curve: 5 % and fewer lie below 0.05 (binomial, 3 sigma)."""
+    curve, size = simulated(), np.linspace(2.0, 12.0, 20)
+    random = np.random.default_rng(3)
+    below = sum(
+        campaign(size, random.random(20) < curve.pod(size), curve).agreement(with_prior=False, seed=seed) < 0.05
+        for seed in range(10)
+    )
+    assert below <= 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("k", "w", "least"), [(0.7, 1.0, 0.95), (1.0, 1.0, 0.9), (1.5, 1.0, 0.9), (1.5, 1.5, 0.9)])
+def test_the_limit_covers_the_truth_whatever_the_camera(k: float, w: float, least: float):
+    """Share of campaigns of 30 holes whose quoted limit is no less than the true a90; 0.95 is what it says, and 120
+    campaigns know it to 0.02."""
+    curve, truth = simulated(), wrong_by(simulated(), k, w)
+    size = place_sizes(curve, 30, (2.0, 12.0), "uniform")
+    random, covered, shorter = np.random.default_rng(5), [], []
+    for _ in range(120):
+        hit = (random.random(30) < truth.pod(size)).astype(float)
+        read = Inspections(Path("campaign"), "size", "hit", size, hit, None, np.arange(30))
+        found = Mapod.of("one", replace(statement_of(curve), curve=curve), "", read, None, PRIOR_SIZE, PRIOR_WIDTH)
+        covered.append(found.a90_95 >= truth.size_at(0.9))
+        if found.measured is not None:
+            shorter.append(found.steps[-1].a90_95 / found.measured.bound.value)
+    print(f"k {k}, w {w}: covered {np.mean(covered):.3f}, combined by measured {np.median(shorter):.2f}")
+    assert np.mean(covered) >= least
+    assert np.median(shorter) < 1.0
+
+
+def statement_of(curve: PodCurve):
+    size = np.linspace(2.0, 12.0, 60)
+    hit = (np.random.default_rng(1).random(60) < curve.pod(size)).astype(float)
+    return state_hits(Inspections(Path("s"), "size", "hit", size, hit, None, np.arange(60)), tested=False)
+
+
+def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
+    (tmp_path / "study.json").write_text(record_text(record))
+    truth, size = curve_through(6.0, 7.6), place_sizes(curve_through(5.0, 7.0), 24, (2.0, 12.0), "uniform")
+    hit = np.random.default_rng(2).random(24) < truth.pod(size)
+    rows = [f"{a:.3f},{'hit' if h else 'miss'},{'AB'[n % 2]}" for n, (a, h) in enumerate(zip(size, hit, strict=True))]
+    table = tmp_path / "real.csv"
+    table.write_text("\n".join(["size,found,board", *rows]) + "\n")
+    given = [str(table), "--size", "size", "--hit", "found", "--unit", "mm"]
+    prior = ["--prior", str(tmp_path), "--board", "board", "--out", str(tmp_path / "out")]
+    assert pod.main([*given, *prior]) == 0
+    said, printed = json.loads((tmp_path / "out" / "mapod.json").read_text()), capsys.readouterr().out
+    assert "simulated" in printed and "measured" in printed and "combined" in printed
+    assert [step["board"] for step in said["after_each_board"]] == ["none", "A", "B"]
+    assert [step["targets"] for step in said["after_each_board"]] == [0, 12, 24]
+    assert said["a90_95"] > truth.size_at(0.9) > said["simulated"]["a90"]
+    assert (tmp_path / "out" / "mapod.html").read_text().count("<svg") == 1
+
+    for wrong, word in (
+        (["--board", "board"], "--prior"),
+        (["--prior", str(tmp_path), "--link", "logit"], "--link"),
+        (["--prior", str(tmp_path), "--board", "bord"], "board"),
+        (["--prior", str(tmp_path), "--target", "board"], "one size"),
+        (["--prior", str(tmp_path / "no")], "no"),
+    ):
+        assert pod.main([*given, *wrong, "--out", str(tmp_path / "none")]) == 2
+        assert word in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
