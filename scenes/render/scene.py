@@ -111,7 +111,8 @@ def facing(interaction: Any) -> Any:
 @dataclass(frozen=True)
 class LitScene:
     """A Mitsuba scene with the emitter described beside it: a point with uniform intensity in a soft-edged cone.
-    ``names`` are the surfaces in order; `surface_index` maps a hit to them. Mitsuba supplies geometry, textures and
+    ``names`` are the surfaces in order; `surface_index` maps a hit to them. ``gloss``: share and exponent of their
+    lobes, None where nothing is glossy. Mitsuba supplies geometry, textures and
     visibility; the emitter stays outside so that its phase and its connection to each vertex are ours."""
 
     mi: Any
@@ -120,6 +121,7 @@ class LitScene:
     emitter_m: np.ndarray
     cos_full: float
     cos_cutoff: float
+    gloss: tuple[Any, Any] | None
     _identity: Any
     _first_triangle: Any
     _on_face: Any
@@ -138,9 +140,25 @@ class LitScene:
         first = dr.gather(self.mi.UInt32, self._first_triangle, self.surface_index(interaction), active)
         return dr.gather(self.mi.Bool, self._on_face, first + interaction.prim_index, active)
 
+    def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
+        """Return what a surface reflects from ``direction`` to ``viewer``, as a multiple of what a Lambertian one of
+        the same albedo would: 1 - share + share (exponent + 2) / 2 cos^exponent. All directions leave the surface."""
+        import drjit as dr
+
+        if self.gloss is None:
+            return 1.0
+        share, exponent = (dr.gather(self.mi.Float, each, surface) for each in self.gloss)
+        cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
+        return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
+
+    def reflected(self, interaction: Any, direction: Any) -> Any:
+        """Return `lobe` of hits, from ``direction`` back along the ray that met them."""
+        viewer = interaction.to_world(interaction.wi)
+        return self.lobe(self.surface_index(interaction), facing(interaction), viewer, direction)
+
     def arriving(self, interaction: Any, active: Any) -> tuple[Any, Any]:
         """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
-        irradiance = cone(direction) cos(incidence) / d^2, and 0 behind an occluder."""
+        irradiance = cone(direction) cos(incidence) / d^2, times `reflected`, and 0 behind an occluder."""
         import drjit as dr
 
         mi = self.mi
@@ -160,13 +178,13 @@ class LitScene:
         ray = mi.Ray3f(origin, way / reach)
         ray.maxt = reach - 2 * LIFT_M
         lit &= ~self.scene.ray_test(ray, lit)
-        return dr.select(lit, cone * cosine / squared, 0), distance
+        return dr.select(lit, cone * cosine / squared * self.reflected(interaction, towards), 0), distance
 
 
 def lit_scene(
     mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
 ) -> LitScene:
-    """Build the scene from a target's parts, each a Lambertian surface with its 850 nm albedo. ``on_face``: for each
+    """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss. ``on_face``: for each
     part which of its triangles (n,) lie on the undamaged face; None means none."""
     import drjit as dr
 
@@ -181,7 +199,9 @@ def lit_scene(
     first = np.cumsum([0, *(len(flags) for flags in triangles[:-1])]).astype(np.uint32)
     full, cutoff = (float(np.cos(np.deg2rad(a))) for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg))
     faces = mi.UInt32(identity), mi.UInt32(first), mi.Bool(np.concatenate(triangles))
-    return LitScene(mi, scene, names, optics.emitter_m, full, cutoff, *faces)
+    shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
+    gloss = (shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None
+    return LitScene(mi, scene, names, optics.emitter_m, full, cutoff, gloss, *faces)
 
 
 def _mesh(mi: Any, part: TargetPart) -> Any:

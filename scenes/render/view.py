@@ -53,17 +53,20 @@ def gather_at_points(
     lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int
 ) -> np.ndarray:
     """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
-    albedo. All points share their low-discrepancy numbers, so that what noise is left is smooth from point to point."""
+    albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
+    that what noise is left is smooth from point to point."""
     import drjit as dr
 
     mi = lit.mi
     columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
+    board = lit.names.index("board") if "board" in lit.names else 0
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         x, y, z, nx, ny, nz = (dr.gather(mi.Float, column, place) for column in columns)
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
-        return point, point + LIFT_M * normal, direction
+        seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
+        return point, point + LIFT_M * normal, direction, seen
 
     return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True)
 
@@ -78,11 +81,11 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int 
     firsts = mi.UInt32((np.cumsum(rays.count) - rays.count).astype(np.uint32))
     counts = mi.UInt32(rays.count.astype(np.uint32))
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
         which = first + dr.minimum(mi.UInt32(u1 * mi.Float(count)), count - 1)
         slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
-        return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0))
+        return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0)), 1.0
 
     return _gather(lit, start, np.broadcast_to(np.asarray(samples), rays.pixel.shape), work, on_surface=False)
 
@@ -115,10 +118,10 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
     """Walk ``samples`` (n,) paths from each place; returns the light (BATCHES, f + 1, n) complex64 of each batch,
     frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in `NoiseFreeView`, without the
     place's albedo where the start was a surface point, with it where the start was the lens. ``start`` (place, u1, u2):
-    point from which the path's length counts, origin of the first ray and its direction. ``on_surface``: light that
+    point from which the path's length counts, origin, direction and weight of the first ray. ``on_surface``: light that
     reaches the first hit directly counts (for a start at the lens it is the direct part), and all places share one
     rotation of the low-discrepancy points (modulo 1). Cosine-weighted directions cancel cos/pi of a Lambertian surface,
-    so each bounce multiplies by its albedo only."""
+    so each bounce multiplies by its albedo and, where it is glossy, by `LitScene.lobe`."""
     import drjit as dr
 
     mi, bounces, seed = lit.mi, work.bounces, work.seed
@@ -151,11 +154,11 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
             comes; ``length``: of the path up to there."""
             sample, vertex, before, before_normal, direction, length, throughput, totals = state
             fresh = vertex == 0
-            start_point, origin, start_direction = start(place, uniform(sample, 0), uniform(sample, 1))
+            start_point, origin, start_direction, weight = start(place, uniform(sample, 0), uniform(sample, 1))
             before = dr.select(fresh, start_point, before)
             origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
             direction = dr.select(fresh, start_direction, direction)
-            length, throughput = dr.select(fresh, 0, length), dr.select(fresh, 1, throughput)
+            length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
 
             hit = lit.scene.ray_intersect(mi.Ray3f(origin, direction))
             met, normal = hit.is_valid(), facing(hit)
@@ -169,6 +172,7 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
             dimension = START_DIMENSIONS + PER_VERTEX * vertex
             chosen = mi.Point2f(uniform(sample, dimension), uniform(sample, dimension + 1))
             direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(chosen))
+            throughput = throughput * lit.reflected(hit, direction)
             sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
             return sample, vertex, hit.p, normal, direction, length, throughput, totals
 

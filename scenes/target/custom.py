@@ -162,8 +162,20 @@ class TapeConfig(Config):
     thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = 0.15
 
 
+class GlossConfig(Config):
+    """A Phong lobe beside Lambert's: ``share`` of what the albedo returns goes into a lobe about the mirror direction,
+    (exponent + 2) / (2 pi) cos^exponent of the angle from it (Lafortune and Willems 1994). Reciprocal; at no angle does
+    more light leave than the albedo says. Not modelled: the growth at grazing angles (Fresnel)."""
+
+    share: Albedo
+    exponent: float = Field(
+        ge=1.0, le=500.0, description="a lobe 50 degrees wide at half its height has 7, one of 10 degrees 180"
+    )
+
+
 class MaterialConfig(Config):
-    """The board's reflectance: diffuse, with a grain along x that scales 850 nm and all colours alike."""
+    """The board's reflectance: diffuse, with a grain along x that scales 850 nm and all colours alike; glossy at the
+    camera's wavelength where ``gloss`` says so, on the face and in holes, never on tape."""
 
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.42, 0.28)
@@ -172,6 +184,7 @@ class MaterialConfig(Config):
     )
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
+    gloss: GlossConfig | None = None
 
 
 class BackingConfig(Config):

@@ -90,6 +90,7 @@ class DrawnMaterialConfig(Config):
     rgb: custom.Rgb = (0.55, 0.42, 0.28)
     grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = 0.05
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = 8.0
+    gloss: custom.GlossConfig | None = None
 
 
 class DrawnTargetConfig(Config):

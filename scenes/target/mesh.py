@@ -111,7 +111,8 @@ MAX_CELLS = 1_000_000
 class TargetPart:
     """A surface. ``mesh``: camera frame, metres, normals outwards; sharp edges share vertices, so use face normals.
     ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and ``texture_rgb`` (h, w, 3), float32
-    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None where the part is plain."""
+    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None where the part is plain.
+    ``gloss``: share and exponent of its Phong lobe (`scenes.target.custom.GlossConfig`)."""
 
     name: str
     mesh: trimesh.Trimesh
@@ -120,6 +121,7 @@ class TargetPart:
     texture_850: np.ndarray | None
     rgb: np.ndarray
     texture_rgb: np.ndarray | None
+    gloss: tuple[float, float] = (0.0, 1.0)
 
     def rgb_at(self, uv: np.ndarray) -> np.ndarray:
         """Return red, green and blue albedo (..., 3) at ``uv`` (..., 2); the mean where the part is plain."""
@@ -165,7 +167,8 @@ def build_target(config: TargetConfig) -> Target:
         texture_850 = reflectance(pattern, material.albedo_850, material.grain_contrast)
         texture_rgb = np.stack([reflectance(pattern, mean, material.grain_contrast) for mean in material.rgb], axis=-1)
     rgb = np.array(material.rgb)
-    parts = [TargetPart("board", mesh, uv, material.albedo_850, texture_850, rgb, texture_rgb)]
+    gloss = (material.gloss.share, material.gloss.exponent) if material.gloss else (0.0, 1.0)
+    parts = [TargetPart("board", mesh, uv, material.albedo_850, texture_850, rgb, texture_rgb, gloss)]
 
     def add(name: str, mesh: trimesh.Trimesh, albedo_850: float, rgb: tuple[float, float, float]) -> None:
         parts.append(TargetPart(name, mesh, None, albedo_850, None, np.array(rgb), None))

@@ -13,7 +13,17 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics
-from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, PositiveInt, checked
+from scenes.sensor.facts import (
+    CameraFacts,
+    Fact,
+    HalfAngle,
+    LengthPx,
+    NonNegative,
+    Positive,
+    PositiveInt,
+    Share,
+    checked,
+)
 
 
 class UnwrapTable(NamedTuple):
@@ -132,6 +142,16 @@ class EmitterFacts(Config):
                 what = "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
                 raise ValueError(what)
         return self
+
+
+class ScatterFacts(Config):
+    """Light that reaches other pixels than its own: ``blur_px``, the standard deviation of a Gaussian as which the lens
+    images a point; of the light that is left, ``stray_share`` is spread by a Gaussian of ``stray_px`` (reflections in
+    lens and sensor). A ghost image at a distance is not modelled."""
+
+    blur_px: NonNegative
+    stray_share: Share
+    stray_px: Positive
 
 
 class ModulationFacts(Config):
@@ -254,6 +274,7 @@ class AmcwCamera(CameraFacts):
 
     kind: Literal["amcw_imager"]
     emitter: EmitterFacts
+    scatter: ScatterFacts | None = None
     modulation: ModulationFacts
     photons: PhotonFacts
     converter: ConverterFacts
@@ -281,8 +302,9 @@ class AmcwCamera(CameraFacts):
 
     @property
     def margin_px(self) -> int:
-        """Pixels beyond a region whose light reaches it through the engine's windows."""
-        return self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0)
+        """Pixels beyond a region whose light reaches it through the engine's windows and the lens's blur."""
+        blur_px = int(np.ceil(3 * self.scatter.blur_px.value)) if self.scatter else 0
+        return self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px
 
     @property
     def z_step_m(self) -> float:

@@ -2,8 +2,8 @@
 
 Modelled: shot and read noise, the harmonics that the number of phases aliases, ambient light, companding, saturation,
 fixed pattern and drift, the phase-space joint bilateral filter, unwrapping of one to three frequencies, the engine's
-gates, the correction for the emitter beside the lens, rounding, the lens' natural fall-off of light. Not modelled: dark
-current, lens blur and stray light beyond the pixel's own footprint, motion, light that changes during a frame,
+gates, the correction for the emitter beside the lens, rounding, the lens' natural fall-off of light, its blur and stray
+light where the camera's file has them. Not modelled: dark current, motion, light that changes during a frame,
 cross-talk between pixels, in-pixel rejection of ambient light, gain switching and exposures of unequal length, errors
 of phase that differ between frequencies other than harmonics, any post-processing beyond this. Tables of a unit's lens,
 emitter and phase offsets are exact; what real ones leave is the fixed pattern and the unit's offset.
@@ -11,6 +11,7 @@ emitter and phase offsets are exact; what real ones leave is the fixed pattern a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.at_once import windows_of
-from scenes.sensor.amcw.facts import AmcwCamera, unwrap_table
+from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, unit_error_m
@@ -116,6 +117,19 @@ def ambient_electrons(
     return np.asarray(one_metre * gathered * intensity * range_m**2)
 
 
+def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
+    """Return light (..., h, w) as lens blur and stray light spread it. Beyond the view's region lies the light of its
+    border, as only the region was rendered. The light's fall-off towards the sensor's corners is taken as the same
+    where light comes from and where it goes."""
+    share = facts.stray_share.value
+
+    def spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
+        return ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1)) if sigma_px > 0 else light
+
+    sharp = spread(image, facts.blur_px.value)
+    return (1 - share) * sharp + share * spread(image, facts.stray_px.value) if share > 0 else sharp
+
+
 class AmcwImager:
     """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
@@ -163,6 +177,10 @@ class AmcwImager:
         # all errors of range that frames of this unit share before the filter, as far as they are on
         error_m = unit_error_m(self.camera, self.config, self.slopes[..., 0])
         error_m = error_m + self.fixed_pattern_m if self.config.effects.fixed_pattern else error_m
+        if self.camera.scatter is not None:
+            light, facts = (view.phasor, view.phasor_direct, view.intensity), self.camera.scatter
+            phasor, direct, intensity = (scattered(image, facts) for image in light)
+            view = replace(view, phasor=phasor, phasor_direct=direct, intensity=intensity)
         return exposure_of(self.camera, self.config, view, self.gathered, error_m)
 
     def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
