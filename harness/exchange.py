@@ -1,4 +1,5 @@
-"""Simulated captures in the forms that other people's programs read: TUM RGB-D sequences, ROS 2 bags, MCAP."""
+"""Simulated captures in the forms that other people's programs read: TUM RGB-D sequences, ROS 2 bags, MCAP; pictures
+and masks of data sets."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, invert, slopes_of
+from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert, slopes_of
 
 START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
@@ -52,9 +53,7 @@ class ExportedView:
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
-            whole = np.full((lens.height, lens.width, *values.shape[2:]), outside, values.dtype)
-            whole[region.row0 : region.row1, region.col0 : region.col1] = values
-            return whole
+            return on_window(values, region, lens.whole, outside)
 
         for number, frame in enumerate(self.source.frames()):
             rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
@@ -62,6 +61,13 @@ class ExportedView:
             z_m, amplitude = (on_sensor(each.astype(np.float32), np.nan) for each in (frame.z_m, amplitude))
             reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
             yield self.stamp_ns(number), Frame(frame.name, z_m, reason, rgb=on_sensor(rgb, 0), amplitude=amplitude)
+
+
+def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
+    """Return what values (h, w, ...) of a region of the sensor are on a ``window`` that holds it; else ``outside``."""
+    whole = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
+    whole[region.within(window)] = values
+    return whole
 
 
 def in_turn(
@@ -116,9 +122,7 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
             assert frame.rgb is not None
             time = seconds_text(stamp_ns)
             for name, picture in (("rgb", frame.rgb[..., ::-1]), ("depth", depth_units(frame.z_m))):
-                coded, content = cv2.imencode(".png", undistorted(lens, np.ascontiguousarray(picture)))
-                assert coded
-                (folder / name / f"{time}.png").write_bytes(content.tobytes())
+                (folder / name / f"{time}.png").write_bytes(picture_bytes(".png", undistorted(lens, picture)))
                 lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
             lines["associations.txt"].append(f"{time} rgb/{time}.png {time} depth/{time}.png")
             lines["groundtruth.txt"].append(f"{time} {place}")
@@ -139,7 +143,7 @@ def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
     0."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
-    return cv2.remap(picture, np.rint(u), np.rint(v), cv2.INTER_NEAREST)
+    return cv2.remap(np.ascontiguousarray(picture), np.rint(u), np.rint(v), cv2.INTER_NEAREST)
 
 
 def seconds_text(stamp_ns: int) -> str:
@@ -293,3 +297,41 @@ def _qos(latched: bool) -> tuple[Any, ...]:
     endless, history = QosTime(*FOREVER), (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     return (Qos(*history, durability, endless, endless, QosLiveliness.AUTOMATIC, endless, False),)
+
+
+# ---------------------------------------------------------------- pictures and masks of data sets
+
+
+def picture_bytes(kind: Literal[".png", ".tiff"], picture: np.ndarray) -> bytes:
+    """Return a picture (h, w[, 3]) as a file: PNG of 8 or 16 bits, or TIFF of float32 without compression; three
+    channels are stored in OpenCV's order, the last one first."""
+    plain = [cv2.IMWRITE_TIFF_COMPRESSION, 1] if kind == ".tiff" else []
+    coded, content = cv2.imencode(kind, np.ascontiguousarray(picture), plain)
+    assert coded
+    return content.tobytes()
+
+
+def run_lengths(mask: np.ndarray) -> list[int]:
+    """Return COCO's uncompressed run lengths of a mask (h, w) bool: pixels outside, inside, outside ..., by columns."""
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    runs = np.diff([0, *changes, flat.size]).tolist()
+    return [0, *runs] if flat[0] else runs
+
+
+def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: dict[str, Any]) -> dict[str, Any]:
+    """Return a COCO file's content. ``pictures``: ``file_name``, ``width``, ``height`` and ``damages`` each, which have
+    ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
+    numbers = {kind: number for number, kind in enumerate(kinds, start=1)}
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for number, picture in enumerate(pictures, start=1):
+        shape = {key: picture[key] for key in ("file_name", "width", "height")}
+        images.append({"id": number, **shape})
+        for damage in picture["damages"]:
+            mask = {"size": [picture["height"], picture["width"]], "counts": damage["run_lengths"]}
+            facts = {"area": damage["pixels"], "bbox": damage["bbox"], "segmentation": mask, "iscrowd": 0}
+            of = {"image_id": number, "category_id": numbers[damage["kind"]]}
+            annotations.append({"id": len(annotations) + 1, **of, **facts})
+    categories = [{"id": number, "name": kind} for kind, number in numbers.items()]
+    return {"info": about, "images": images, "annotations": annotations, "categories": categories}

@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    config = _declared(arguments.target, arguments.board)
+    config = declared(arguments.target, arguments.board)
 
     from scenes.target.mesh import build_target, write_mesh, write_truth
 
@@ -57,7 +57,7 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _declared(name_or_path: str, board: int) -> TargetConfig:
+def declared(name_or_path: str, board: int) -> TargetConfig:
     """Read a declaration, and draw the board asked for where it declares a family."""
     from harness.vocabulary.declaration.diagnose import read_as
     from harness.vocabulary.declaration.yaml_source import read_yaml

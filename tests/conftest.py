@@ -48,3 +48,13 @@ def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_sweep import STUDY, finished
 
     return finished(tmp_path_factory.mktemp("study"), STUDY)
+
+
+@pytest.fixture(scope="session")
+def dataset_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished data set of ten boards, ``set``; not to be changed."""
+    from tiny_dataset import write
+
+    home = tmp_path_factory.mktemp("dataset")
+    assert write(home, "set") == 0
+    return home

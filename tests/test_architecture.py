@@ -39,6 +39,8 @@ FRAGMENTS = {
 PROGRAMS = [
     "sweep",
     "detect",
+    "dataset",
+    "score",
     "export",
     "flatfield",
     "implant",

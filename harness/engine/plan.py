@@ -152,7 +152,7 @@ class Group:
         that cannot be judged."""
         if batch.role == "learning":
             for number in range(len(self.learners)) if repeats is None else repeats:
-                learner = (_point_task(self.learners[number], None, None),)
+                learner = (point_task(self.learners[number], None, None),)
                 task = TrialTask(batch.set_ups, self.seed, batch.role, 0, learner, self.poses)
                 yield self._key(batch, task), task
             return
@@ -161,7 +161,7 @@ class Group:
         points = [point for point in self.points if unjudged or given[point.digest] is not None]
         points = [point for point in points if point.digest not in without]
         learned = self.learned
-        asked = {one.digest: _point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
+        asked = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
@@ -190,7 +190,9 @@ def _name(path: str | None) -> str | None:
     return None if path is None else Path(path).name
 
 
-def _point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
+def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
+    """Return the demands of a point on trials. ``threshold`` None: it is being calibrated; ``learned`` as of
+    `PointTask`."""
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
     asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
     further = (point.config.mapping, capture.exact, learned, capture.flat_field)
@@ -236,8 +238,8 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
             made = []
             for board in range(count):
                 numbers = range(study.units or 0) if role == "damaged" else [board] if study.units else []
-                units = tuple(_unit(source.camera, seed, role, number) for number in numbers)
-                made.append(_batch(target.drawn(role, board), role, source, cache, board, units))
+                units = tuple(unit_of(source.camera, seed, role, number) for number in numbers)
+                made.append(batch_of(target.drawn(role, board), role, source, cache, board, units))
             return tuple(made)
 
         learning, first = batches("learning", LEARNING_BOARDS), batches("calibration", boards)
@@ -247,8 +249,8 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
         if not declared.damages:
             what = "the target has neither holes nor dents, so that there is nothing to find"
             raise UserError(what, fix="declare source.target.holes or source.target.dents")
-        learning = (_batch(declared, "learning", source, cache),) * LEARNING_BOARDS
-        first, then = ((_batch(declared, role, source, cache),) for role in ("hole_free", "damaged"))
+        learning = (batch_of(declared, "learning", source, cache),) * LEARNING_BOARDS
+        first, then = ((batch_of(declared, role, source, cache),) for role in ("hole_free", "damaged"))
     group = Group(points, (), first, then, seed, folder, source.views)
     if not group.learners:
         return group
@@ -257,13 +259,13 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
 
 
-def _unit(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
-    """The camera of a unit that was drawn for boards of a role."""
+def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
+    """Return the camera of a unit that is drawn for boards of a role."""
     stream = random_stream(seed, "unit of the camera", camera.unit_seed, role, number)
     return camera.model_copy(update={"unit_seed": int(stream.integers(2**32))})
 
 
-def _batch(
+def batch_of(
     declared: TargetConfig,
     role: Role,
     source: SimulatedSource,
@@ -271,6 +273,7 @@ def _batch(
     board: int | None = None,
     units: tuple[CameraConfig, ...] = (),
 ) -> Batch:
+    """Return the trials of a role before one declared target: with its damage where the role is "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
     renders, set_ups, damaged = [], [], role == "damaged"

@@ -172,7 +172,12 @@ Box = tuple[float, float, float, float]
 
 
 def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> None:
-    """Write the PNG: colour image (where known) above the residual in mm; without a pixel grid a plan view in mm."""
+    """Write `findings_figure` as a PNG."""
+    _save(path, findings_figure(cloud, evidence, detections, title))
+
+
+def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> Figure:
+    """Draw the colour image (where known) above the residual in mm; without a pixel grid a plan view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
     residual_mm, limit = evidence.residual_m / MM, SHOWN_SCORES * evidence.scale_m / MM
@@ -194,7 +199,7 @@ def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Seque
             _frame(one, cloud, box)
             _circle(one, cloud, enumerate(detections, start=1))
 
-    _save(path, title, panels * _height_in(box), draw)
+    return _figure(title, panels * _height_in(box), draw)
 
 
 def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
@@ -213,7 +218,7 @@ def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections
         _frame(axes, cloud, box)
         _circle(axes, cloud, ((n, one) for n, one in enumerate(detections, start=1) if one.kind == "no return"))
 
-    _save(path, f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw)
+    _save(path, _figure(f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw))
 
 
 def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
@@ -245,18 +250,22 @@ def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts:
             axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
         figure.legend(loc="outside lower center", fontsize=9, frameon=False)
 
-    _save(path, "", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw)
+    _save(path, _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw))
 
 
-def _save(path: Path, title: str, height_in: float, draw: Callable[[Figure], None]) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def _figure(title: str, height_in: float, draw: Callable[[Figure], None]) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH_IN, min(height_in + 0.4, 30.0)), dpi=DPI, layout="compressed")
-    canvas = FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=10, parse_math=False)  # a file may be called $x$
     draw(figure)
-    canvas.print_png(str(path))
+    return figure
+
+
+def _save(path: Path, figure: Figure) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure).print_png(str(path))
 
 
 def _height_in(box: Box) -> float:

@@ -194,6 +194,18 @@ LIMITS = Table(
     title="detection limits: found 50 and 90 % of the time, and 90 % with 95 % confidence",
 )
 
+SCORES = Table(
+    "scores",
+    "one row per category of a data set: anomaly maps by the measures of their own field, on the inspected pixels",
+    (
+        Column("category", "category", "category", "name of the category"),
+        Column("au_pro", "AU-PRO", "au_pro", "area under the mean overlap, up to 30 % false pixels, over 0.3"),
+        Column("pixel_auroc", "AUROC of pixels", "pixel_auroc", "area under the curve of damaged and other pixels"),
+        Column("board_auroc", "AUROC of boards", "board_auroc", "likewise of boards, by their highest pixels"),
+    ),
+    title="anomaly maps",
+)
+
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
     """Return the table for a page or a terminal; columns on units only where there are several, and with one unit its

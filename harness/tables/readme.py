@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from harness.tables.efficiency import EFFICIENCY_TABLES
+from harness.tables.limits import SCORES
 from harness.tables.outputs import FILES, JOURNAL, LATEST
 from harness.tables.schema import Table
 from harness.tables.study import STUDY_TABLES
@@ -54,6 +55,7 @@ def _lines() -> Iterator[str]:
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
+    yield from _tables("Anomaly maps on a data set (`harness.score`)", (SCORES,))
     yield from _tables("Real captures", (POINTS_OF_CAPTURES, FINDINGS_OF_CAPTURE))
     yield ""
 

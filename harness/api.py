@@ -1,0 +1,248 @@
+"""tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over what the programs do.
+
+Build a target, render what a camera sees of it, draw noisy frames, average them, look for damage:
+
+    >>> import tofpod
+    >>> board = tofpod.target(
+    ...     {
+    ...         "name": "custom",
+    ...         "board": {"width_mm": 160, "height_mm": 100, "thickness_mm": 20},
+    ...         "holes": [{"id": 1, "diameter_mm": 20, "centre_mm": [30, 0], "kind": "blind", "depth_mm": 12}],
+    ...     }
+    ... )
+    >>> unit = tofpod.render(board, "azure_kinect_nfov", bounces=0)
+    >>> cloud = tofpod.average(tofpod.frames(unit, 50))
+    >>> found = tofpod.detect(cloud, "thesis", threshold=8.0, crop={"kind": "auto", "inset_px": 4})
+    >>> len(found.findings), found.findings[0].kind
+    (1, 'hole')
+    >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
+
+Examples below go on from this one. A real capture goes the same way from `load`. Whole experiments, with calibrated
+thresholds and intervals, are run by `sweep`. What a program refuses with a message is a `UserError` here.
+Units are SI; where they are not, names say so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from detectors import load_detector
+from detectors.average import AverageConfig
+from detectors.average import average as averaged
+from detectors.recordings import open_capture
+from harness.evaluation.study.limit import SetUpLimit, limit_of
+from harness.evaluation.study.record import read_record
+from harness.experiment.load import load_experiment
+from harness.inspection.run import analysed, judged, threshold_of
+from harness.report.findings import Finding, Judged, findings_figure
+from harness.report.pod import limits_figure
+from harness.target import declared
+from harness.vocabulary.declaration.diagnose import settings_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Cloud, FrameSource
+from scenes.optics import RenderConfig
+from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.source import SimulatedUnit
+from scenes.target.custom import TargetConfig
+from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.thesis import TARGETS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "Cloud", "Finding", "Results", "UserError", "average", "detect", "findings_table", "frames", "load", "plot",
+    "plot_pod", "render", "results", "sweep", "target",
+]  # fmt: skip
+
+
+def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False) -> TargetConfig:
+    """Return a target: a named one, that of a YAML or JSON file, or that of a declaration as plain data. ``board``:
+    which damaged board of a family (``name: drawn``). Raises UserError with every mistake of the declaration.
+
+    >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
+    (11, 0)
+    >>> family = {"name": "drawn", "damage": {"kind": "through", "per_board": 3, "diameter_mm": [2, 8]}}
+    >>> len(tofpod.target(family, board=7).damages)
+    3
+    """
+    if not isinstance(what, Mapping):
+        config = declared(str(what), board)
+    elif what.get("name") not in TARGETS:
+        raise UserError(f"a target called {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}")
+    else:
+        told = settings_of(TARGETS[what["name"]], what, "target")
+        if board and not isinstance(told, DrawnTargetConfig):
+            raise UserError(f"board {board}: the declaration is of one board, not of a family", legal="board 0")
+        config = told.drawn("damaged", board) if isinstance(told, DrawnTargetConfig) else told.declare()
+    return config.hole_free() if hole_free else config
+
+
+def render(
+    target: TargetConfig,
+    camera: str = "azure_kinect_nfov",
+    *,
+    unit_seed: int = 1,
+    cache: Path | None = None,
+    **work: Any,
+) -> SimulatedUnit:
+    """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
+    ``cache``: a folder in which renders are kept; ``work``: settings of `scenes.optics.RenderConfig`, such as
+    ``bounces``. Raises UserError where the camera is unknown or does not see the target.
+
+    >>> unit = tofpod.render(board, "kinect_v2", bounces=0)
+    >>> unit.region.shape[1] > 50
+    True
+    """
+    from scenes.render.cache import cached_view
+    from scenes.render.view import render_view
+    from scenes.target.mesh import build_target
+
+    config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
+    facts, asked = camera_of(config), settings_of(RenderConfig, work, "render")
+    placed = target.at_wavelength(facts.optics.wavelength_nm)
+    if cache is not None:
+        view, _ = cached_view(placed, facts.optics, asked, Path(cache))
+    else:
+        view = render_view(build_target(placed), facts.optics, asked)
+    return SimulatedUnit(facts, config, view)
+
+
+def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
+    """Return ``count`` simulated frames; they are drawn while they are read. ``seed`` draws the noise.
+
+    >>> [frame.z_m.shape == unit.region.shape for frame in tofpod.frames(unit, 2).frames()]
+    [True, True]
+    """
+    if count < 1:
+        raise UserError(f"{count} frames", legal="1 or more")
+    return unit.capture(count, seed, "api")
+
+
+def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
+    """Open a real capture of any format that ``python -m harness.detect`` reads: files, or one folder. ``unit``: of
+    stored depth, such as ``mm`` or ``4000/m``, where the files do not say. Raises UserError as that program does.
+
+    >>> tofpod.load("no_such_capture")
+    Traceback (most recent call last):
+    ...
+    harness.vocabulary.errors.UserError: no_such_capture: no such file or folder
+    """
+    return open_capture([Path(path) for path in paths], unit=unit)
+
+
+def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
+    """Average all frames to one cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
+    ``settings`` as of `detectors.average.AverageConfig`. Raises UserError.
+
+    >>> tofpod.average(tofpod.frames(unit, 3), "median").n_frames
+    3
+    """
+    return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
+
+
+def detect(cloud: Cloud, detector: str = "thesis", threshold: float | None = None, **settings: Any) -> Judged:
+    """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
+    ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
+    ``settings``: the detector's. Raises UserError where the cloud cannot be judged.
+
+    >>> tofpod.detect(cloud, "thesis", threshold=-1)
+    Traceback (most recent call last):
+    ...
+    harness.vocabulary.errors.UserError: threshold -1
+    """
+    if threshold is not None and not 0 < threshold < float("inf"):
+        raise UserError(f"threshold {threshold:g}", legal="a number above 0")
+    finder = load_detector(detector, settings)
+    evidence = analysed(finder, cloud)
+    asked = argparse.Namespace(threshold=threshold, quiet_capture=None, false_calls=None)
+    used, _, evidence = threshold_of(asked, finder, cloud, evidence, lambda: (float("nan"), ""))
+    return judged(finder, cloud, evidence, used)
+
+
+def findings_table(found: Judged) -> pd.DataFrame:
+    """Return the findings of `detect` as a DataFrame, strongest first; columns as of `Finding`.
+
+    >>> tofpod.findings_table(found)[["kind", "size_from"]].values.tolist()
+    [['hole', 'model']]
+    """
+    import pandas as pd
+
+    return pd.DataFrame([asdict(finding) for finding in found.findings], columns=[*Finding.__dataclass_fields__])
+
+
+def plot(found: Judged, title: str = "") -> Figure:
+    """Draw the residual in mm with a numbered circle at each finding."""
+    return findings_figure(found.cloud, found.evidence, found.detections, title)
+
+
+@dataclass(frozen=True)
+class Results:
+    """A folder of results that a sweep wrote."""
+
+    folder: Path
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """The names of its tables; `results/README.md` explains their columns."""
+        return tuple(sorted(path.stem for path in self.folder.glob("*.parquet")))
+
+    def table(self, name: str) -> pd.DataFrame:
+        """Read a table. Raises UserError where there is none of that name."""
+        import pandas as pd
+
+        if name not in self.tables:
+            raise UserError(f"{self.folder}: has no table {name!r}", legal=", ".join(self.tables))
+        return pd.read_parquet(self.folder / f"{name}.parquet")
+
+    @cached_property
+    def limits(self) -> tuple[SetUpLimit, ...]:
+        """Detection limits of a study: ``a90_mm``, ``a90_95``, ``statement`` (the curve) and so on. Raises UserError
+        for what is no study."""
+        return tuple(limit_of(record) for record in read_record(self.folder).set_ups)
+
+
+def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Results:
+    """Run an experiment, or what is missing of it, and return its results. ``changes``: as of ``--set``, such as
+    ``"repeats=5"``. More than one of ``jobs`` are processes: a script then needs ``if __name__ == "__main__":``. Raises
+    UserError for a wrong experiment, and where trials failed.
+
+    >>> tofpod.sweep("averaging", "repeats=0")
+    Traceback (most recent call last):
+    ...
+    harness.vocabulary.declaration.yaml_source.DeclarationError: ...
+    """
+    from harness.engine.study import run_study
+    from harness.engine.work import EngineOptions
+    from harness.experiment.schema import SimulatedSource
+
+    found, out = load_experiment(Path(experiment), changes), Path(out)
+    if not isinstance(found.config.source, SimulatedSource):
+        raise UserError(f"{experiment}: is of a real capture", fix="use load, average and detect")
+    code = run_study(found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})")
+    if code == 130:
+        raise KeyboardInterrupt
+    if code:
+        failed = json.loads((found.folder(out) / "provenance.json").read_text())["failures"]
+        raise UserError(f"{experiment}: {len(failed)} trials failed, such as {failed[0]['what']}: {failed[0]['why']}")
+    return Results(found.folder(out))
+
+
+def results(folder: str | Path) -> Results:
+    """Open a folder of results, such as ``results/detection_limit/latest``. Raises UserError where it is none."""
+    if not (Path(folder) / "provenance.json").is_file():
+        raise UserError(f"{folder}: is no folder of results", legal="results/<experiment>/<digest>, or .../latest")
+    return Results(Path(folder))
+
+
+def plot_pod(limits: Iterable[SetUpLimit]) -> Figure:
+    """Draw curves of detection with their bands and the inspections behind them, for limits such as
+    ``Results.limits``."""
+    return limits_figure([limit for limit in limits if limit.statement is not None])

@@ -1,0 +1,177 @@
+"""``python -m harness.dataset EXPERIMENT --boards 500 --out DIR``: boards with masks, to train and to score on."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from harness.engine.boards import Sample
+    from harness.engine.work import Job, JobEngine
+    from harness.experiment.schema import Experiment
+
+MOST = 10_000
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.dataset " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.dataset",
+        description="Write a data set of simulated boards: organised clouds, depth, intensity, validity, masks and "
+        "truth, as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+        epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
+        "python -m harness.score states the detection limit of anybody's anomaly maps on it.",
+    )
+    add = parser.add_argument
+    add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, with random boards")
+    change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--boards", type=int, required=True, metavar="N", help="boards of each set-up: cameras, frames and so on")
+    add("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one that this command has begun")
+    add("--licence", default="CC-BY-4.0", metavar="NAME", help="the licence that the card states (default: CC-BY-4.0)")
+    results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
+    add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
+    add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
+    add("--serial", action="store_true", help="run everything in this process, for a debugger")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.engine.boards import FEWEST, INDEX, read_index, samples_of
+    from harness.engine.work import EngineOptions, engine_of, locked
+    from harness.experiment.load import load_experiment, resolved_yaml
+    from harness.vocabulary.files import write_text
+    from scenes.render.cache import in_use
+
+    if not FEWEST <= options.boards <= MOST or not 1 <= options.jobs <= 4096:
+        legal = f"{FEWEST} to {MOST} boards, 1 to 4096 processes"
+        raise UserError(f"--boards {options.boards} --jobs {options.jobs}", legal=legal)
+    experiment, out = load_experiment(options.experiment, options.overrides), options.out
+    cache = options.results / ".cache" / "renders"
+    samples = samples_of(experiment, options.boards, cache)
+    about = _about(experiment, options.licence, samples, command)
+    if (out / INDEX).exists():
+        if read_index(out)["content"] != about["content"]:
+            said = f"{out}: holds another data set: another experiment, number of boards or version of the code"
+            raise UserError(said, fix="name a new folder with --out")
+    elif out.is_dir() and any(out.iterdir()):
+        raise UserError(f"{out}: is not empty, and nothing is written over", fix="name a new folder with --out")
+    write_text(out / INDEX, json.dumps({**about, "samples": None}, indent=1) + "\n")
+    write_text(out / "experiment.yaml", resolved_yaml(experiment))
+    with in_use(cache), locked(out), engine_of(EngineOptions(jobs=options.jobs, serial=options.serial)) as engine:
+        failures = _written(out, samples, engine)
+    if failures:
+        print(f"{len(failures)} jobs failed, the first: {failures[0]}", file=sys.stderr)
+        print("the same command goes on with what is missing", file=sys.stderr)
+        return 1
+    _finish(out, samples, about)
+    print(f"wrote {out}: {len(samples)} boards in {len(about['categories'])} categories; README.md there explains them")
+    return 0
+
+
+def _about(experiment: Experiment, licence: str, samples: list[Sample], command: str) -> dict[str, Any]:
+    """Return what ``dataset.json`` says of the whole; ``content`` names what decides the files' content."""
+    from harness.engine.boards import DATASET_VERSION, categories_of
+    from harness.engine.plan import PACKAGES
+    from harness.vocabulary.provenance import record, source_digest
+    from harness.vocabulary.seeds import digest
+
+    categories: dict[str, Any] = {}
+    for name, point in categories_of(experiment).items():
+        own = [sample for sample in samples if sample.category == name]
+        cameras = [sample.task.set_ups[0].camera for sample in own]
+        categories[name] = {
+            "camera": cameras[0].name,
+            "units": len({camera.unit_seed for camera in cameras}),
+            "frames": point.config.capture.frames,
+            "boards": dict(Counter(f"{sample.split}/{sample.label}" for sample in own)),
+        }
+    calibrate = experiment.config.threshold.calibrate
+    asked = [[sample.name, sample.render.path.stem] for sample in samples]
+    points = [[point.frames_key, point.config.capture.to_data()] for point in experiment.points]
+    return {
+        "dataset_version": DATASET_VERSION,
+        "name": experiment.config.name,
+        "content": digest([source_digest(("harness.engine.boards",), PACKAGES), asked, points]),
+        "licence": licence,
+        "false_calls_per_m2": (calibrate and calibrate.false_calls_per_m2) or 1.0,
+        "hit_radius_mm": experiment.config.matching.radius_mm,
+        "categories": categories,
+        "provenance": record(command),
+    }
+
+
+def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
+    """Render what is missing and write the boards that are missing; returns why jobs failed. Progress: on stderr."""
+    from harness.engine.boards import TRUTH, joined, seen_region, write_board
+    from harness.engine.estimate import progress_display
+    from harness.engine.run import carried_out
+    from harness.engine.work import Job, Outcome, StageCounts
+
+    outcome, failures = Outcome(), list[str]()
+    renders = {sample.render.path: sample.render for sample in samples}
+    missing = [sample for sample in samples if not (out / "boards" / sample.name / TRUTH).exists()]
+    outcome.renders.total, outcome.trials.total = len(renders), len(samples)
+    outcome.trials.found = len(samples) - len(missing)
+    with progress_display() as show:
+
+        def carry_out(jobs: list[Job], counts: StageCounts) -> dict[str, Any]:
+            values = {}
+            for job, ended in carried_out(jobs, engine):
+                done = ended.state == "done"
+                counts.done, counts.failed = counts.done + done, counts.failed + (not done)
+                values[job.name] = ended.value
+                failures.extend([] if done else [f"{job.name}: {ended.why.strip()}"])
+                show(outcome)
+            return values
+
+        first = [Job(path.stem, "renders", seen_region, (job,)) for path, job in renders.items()]
+        regions = carry_out(first, outcome.renders)
+        if failures:
+            return failures
+        by_category: dict[str, list[Any]] = {}
+        for sample in samples:
+            by_category.setdefault(sample.category, []).append(regions[sample.render.path.stem])
+        windows = {category: joined(seen) for category, seen in by_category.items()}
+        boards = []
+        for sample in missing:
+            arguments = (out, sample, windows[sample.category])
+            boards.append(Job(sample.name, "trials", write_board, arguments, (sample.render.path,)))
+        carry_out(boards, outcome.trials)
+    return failures
+
+
+def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
+    """Write the COCO files and the card, and last the index that says that the data set is complete."""
+    from harness.engine.boards import INDEX, INSET_PX, SPLITS, read_truth
+    from harness.exchange import coco_data
+    from harness.report.blocks import template
+    from harness.vocabulary.files import write_text
+
+    truths = {sample.name: read_truth(out, sample.name) for sample in samples}
+    kinds = sorted({damage["kind"] for truth in truths.values() for damage in truth["damages"]})
+    info = {"description": about["name"], "license": about["licence"]}
+    for category in about["categories"]:
+        for split in dict.fromkeys(split for split, _, _ in SPLITS):
+            pictures = [truths[each.name] for each in samples if (each.category, each.split) == (category, split)]
+            text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
+            write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
+    write_text(out / "README.md", template("dataset_card.md").render(about=about, inset=INSET_PX))
+    write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""A pytest plug-in, loaded where tofpod is installed: the fixture ``tofpod_gate`` guards the limit of a detector.
+
+    def test_the_limit_holds(tofpod_gate):
+        tofpod_gate("limit.yaml")
+
+runs the study in ``limit.yaml`` beside the test and compares it with ``limit.baseline.json`` there, as `harness.check`
+does: the test fails where a limit or the rate of false calls got worse and not by chance. ``pytest --tofpod-update``
+writes the baseline. Renders and finished trials are kept in pytest's cache folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from harness.api import Results
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--tofpod-update``."""
+    help = "write the baselines of tofpod_gate anew; commit them with the reason"
+    parser.getgroup("tofpod").addoption("--tofpod-update", action="store_true", help=help)
+
+
+@pytest.fixture
+def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Results]:
+    """Return the gate: ``gate(experiment, *changes)`` runs a study (a YAML file beside the test, ``changes`` as of
+    ``--set``) and returns its results, or fails the test with what `harness.check` says."""
+
+    def gate(experiment: str, *changes: str) -> Results:
+        from harness import check
+        from harness.api import Results
+        from harness.experiment.load import load_experiment
+
+        path = Path(request.path).parent / experiment
+        assert request.config.cache is not None
+        out, said = request.config.cache.mkdir("tofpod"), io.StringIO()
+        arguments = [str(path), "--baseline", str(path.with_suffix(".baseline.json")), "--out", str(out)]
+        arguments += [word for change in changes for word in ("--set", change)]
+        arguments += ["--update"] if request.config.getoption("--tofpod-update") else []
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            code = check.main(arguments)
+        if code == 130:
+            raise KeyboardInterrupt
+        if code:
+            told = said.getvalue().replace("with --update", "with pytest --tofpod-update")
+            pytest.fail(told.strip(), pytrace=False)
+        return Results(load_experiment(path, changes).folder(out))
+
+    return gate

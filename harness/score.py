@@ -1,0 +1,300 @@
+"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of anybody's anomaly maps.
+
+A map is judged as a study judges a detector's score: the threshold is the lowest with the wanted rate of false calls on
+the good boards of ``validation``; pixels above it that chains of steps of at most `LINK_M` on the face join are a
+finding, which hits the damage whose centre lies within the hit radius; POD, a90 and a90/95 follow from hits and misses
+on ``test``, the rate of false calls from its good boards. Only the pixels that the data set calls inspected count.
+
+AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
+it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from harness.evaluation.study.limit import SetUpLimit
+
+ENDINGS = (".npy", ".tiff", ".tif")
+JUDGED = ("validation", "test")
+"""Splits of which every board needs a map."""
+LINK_M = 0.010
+"""Longest step within a finding, as in `detectors.score_map`."""
+PRO_LIMIT = 0.3
+MOST_NAMED = 3
+JUDGED_BY = ("inspected", "board_xy_m", "damage")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.score " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.score",
+        description="State the detection limit (a90, a90/95) of anomaly maps on a data set of harness.dataset, with "
+        "AU-PRO and AUROC. PREDICTIONS holds one map for each board of validation and test: "
+        "<category>/<split>/<label>/<number>.npy or .tiff, of the pictures' size, higher where damage is likelier.",
+        epilog="example: python -m harness.score maps --dataset boards --out scores; harness.compare compares two such "
+        "folders of results.",
+    )
+    add = parser.add_argument
+    add("predictions", type=Path, metavar="PREDICTIONS", help="a folder with the anomaly maps")
+    add("--dataset", type=Path, required=True, metavar="DIR", help="a folder that harness.dataset wrote")
+    rate = "wanted false calls a square metre, which sets the threshold (default: the data set's)"
+    add("--false-calls", type=float, metavar="RATE", help=rate)
+    add("--name", default="maps", help="of the method, for tables and comparisons (default: maps)")
+    add("--out", type=Path, default=Path("results/score"), metavar="DIR", help="default: results/score")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.engine.boards import read_index
+    from harness.evaluation.study.record import StudyRecord, record_text
+    from harness.report.pod import pod_html
+    from harness.tables.limits import LIMITS, SCORES
+    from harness.tables.schema import write_table
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import record
+    from harness.vocabulary.seeds import digest
+
+    index = read_index(options.dataset)
+    if index["samples"] is None:
+        raise UserError(f"{options.dataset}: is not finished", fix="run the command that wrote it again; it goes on")
+    rate = index["false_calls_per_m2"] if options.false_calls is None else options.false_calls
+    if not 0 < rate <= 1e6:
+        raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 a square metre")
+    maps = _found(options.predictions, options.dataset, index["samples"])
+    rows = [_judged(category, maps, options, index, rate) for category in index["categories"]]
+    limits, origin = [row.limit for row in rows], record(command)
+    study = StudyRecord(
+        name=index["name"],
+        digest=digest([index["content"], options.name, rate]),
+        hit_radius_mm=index["hit_radius_mm"],
+        false_calls_per_m2=rate,
+        provenance={key: origin[key] for key in ("commit", "dirty", "versions", "command")},
+        set_ups=tuple(limit.record for limit in limits),
+    )
+    write_text(options.out / "study.json", record_text(study))
+    for table, of in ((SCORES, rows), (LIMITS, limits)):
+        write_table(options.out, table, table.frame(of), origin)
+    for row in rows:
+        if row.limit.statement is not None:
+            write_text(options.out / f"{row.category}.html", pod_html(row.limit.statement, command))
+    single = [name for name, one in index["categories"].items() if one["units"] == 1]
+    warned = [f"warning: one unit of the camera, for which alone the limit holds: {', '.join(single)}"] * bool(single)
+    show([*warned, LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
+    print(f"wrote {options.out}: study.json, limits.csv, scores.csv, a page for each curve")
+    return 0
+
+
+def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
+    """The file of each board's map, every one of them of the right shape. Raises UserError that names all that is
+    missing, extra or wrong."""
+    from harness.engine.boards import read_arrays
+
+    wanted = {name for name in samples if name.split("/")[1] in JUDGED}
+    files: dict[str, list[Path]] = {}
+    for path in sorted(predictions.rglob("*")) if predictions.is_dir() else ():
+        if path.suffix.lower() in ENDINGS:
+            files.setdefault(path.relative_to(predictions).with_suffix("").as_posix(), []).append(path)
+    faults = {
+        "missing": sorted(wanted - files.keys()),
+        "of no board of validation or test": sorted(files.keys() - wanted),
+        "there twice": sorted(name for name, found in files.items() if len(found) > 1),
+        "not as they must be": [],
+    }
+    for name in sorted(wanted & files.keys()):
+        (inspected,) = read_arrays(dataset, name, "inspected")
+        if fault := _fault(files[name][0], inspected):
+            faults["not as they must be"].append(f"{name} ({fault})")
+    said = []
+    for what, names in faults.items():
+        if names:
+            more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+            said.append(f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{more}")
+    if said:
+        legal = (
+            "one .npy or .tiff of real numbers, height x width of the pictures, for each board of validation and test"
+        )
+        raise UserError(f"{predictions}: {'; '.join(said)}", legal=legal, fix="write maps for all boards anew")
+    return {name: files[name][0] for name in wanted}
+
+
+def _fault(path: Path, inspected: np.ndarray) -> str:
+    """Say what is wrong with a map; nothing where all is well."""
+    import numpy as np
+
+    scores = _read(path)
+    if scores is None:
+        return "cannot be read as an array of numbers"
+    if scores.shape != inspected.shape:
+        return f"{' x '.join(map(str, scores.shape))} instead of {' x '.join(map(str, inspected.shape))}"
+    lacking = int((~np.isfinite(scores[inspected])).sum())
+    return f"no finite number on {lacking} inspected pixels; give the lowest score there" if lacking else ""
+
+
+def _read(path: Path) -> np.ndarray | None:
+    """A map's numbers; None where it holds none."""
+    import cv2
+    import numpy as np
+
+    from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes
+
+    content = bounded_bytes(path, PICTURE_BYTES)
+    if path.suffix.lower() != ".npy":
+        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    else:
+        import io
+
+        try:
+            found = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            return None
+    return None if found is None or found.dtype.kind not in "fiu" else np.asarray(found, float)
+
+
+# ---------------------------------------------------------------- judging
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """The maps of one category: their limit; AU-PRO; AUROC of pixels and of boards (by the highest pixel)."""
+
+    category: str
+    limit: SetUpLimit
+    au_pro: float
+    pixel_auroc: float
+    board_auroc: float
+
+
+def _judged(
+    category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
+) -> MapScore:
+    """Judge the maps of a category, at a threshold that its good boards of ``validation`` set."""
+    import numpy as np
+
+    from harness.engine.boards import read_arrays, read_truth
+    from harness.engine.setup import highest_within, pixel_areas
+    from harness.evaluation.intervals import threshold_for_rate
+    from harness.evaluation.match import match
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+    from harness.vocabulary.geometry import MM
+    from harness.vocabulary.seeds import digest
+
+    def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
+        """Boards of a split: name, scores (NaN where not inspected), places, damage, area inspected."""
+        for each in sorted(one for one in maps if one.startswith(f"{category}/{split}/")):
+            inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
+            scores, places_m = np.where(inspected, np.asarray(_read(maps[each])), np.nan), places.astype(float)
+            yield each, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))
+
+    quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
+    highest, areas_m2 = np.array(quiet, float).T
+    threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
+    radius_m, truths = index["hit_radius_mm"] * MM, []
+    inspected: list[dict[str, Any]] = []
+    calls: dict[bool, list[tuple[int, int, float]]] = {False: [], True: []}
+    pixels: list[np.ndarray] = []
+    regions: list[np.ndarray] = []
+    tops: list[tuple[float, bool]] = []
+    for name, scores, places_m, damage, area_m2 in boards("test"):
+        truth = read_truth(options.dataset, name)
+        damages, board = truth["damages"], truth["board"]
+        truths.append([board, damages])
+        centres_m = np.array([(one["x_board_mm"], one["y_board_mm"]) for one in damages]).reshape(-1, 2) * MM
+        findings_m = _findings_m(places_m, scores > threshold)
+        pairs = match(centres_m, findings_m, radius_m)
+        signals = highest_within(places_m, scores, centres_m, radius_m)
+        calls["/good/" not in name].append((board, len(findings_m) - len(pairs), area_m2))
+        for number, one in enumerate(damages):
+            sizes = {key: one[key] for key in ("diameter_mm", "depth_mm")}
+            sizes |= {"x_mm": one["x_board_mm"], "y_mm": one["y_board_mm"], "signal": float(signals[number])}
+            inspected.append({"board": board, "hole": str(one["id"]), "repeat": 0, "hit": number in pairs, **sizes})
+        here = np.isfinite(scores)
+        pixels.append(scores[here])
+        regions.append(np.where(damage[here] > 0, damage[here].astype(int) + (len(truths) << 16), 0))
+        tops.append((float(np.nanmax(scores)), bool(damages)))
+
+    if not inspected:
+        raise UserError(f"{options.dataset}: {category} has no damage in view, so that there is no limit to state")
+
+    def unflawed(damaged: bool) -> Unflawed:
+        board, count, area_m2 = (np.array(column) for column in zip(*calls[damaged], strict=True))
+        return Unflawed(board=board, repeat=np.zeros_like(board), calls=count, area_m2=area_m2)
+
+    record = SetUpRecord(
+        variant=category,
+        frames=index["categories"][category]["frames"],
+        axes={},
+        detector=options.name,
+        detector_version=0,
+        threshold=float(threshold),
+        threshold_mm=float("nan"),
+        calibration_runs=len(highest),
+        failed=0,
+        targets_digest=digest(truths),
+        frames_digest=digest([index["content"], category]),
+        inspected=Inspected(**{key: np.array([row[key] for row in inspected]) for key in inspected[0]}),
+        unflawed=unflawed(False),
+        beside=unflawed(True),
+    )
+    scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
+    damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T
+    overlap = damaged / np.bincount(of)[of]
+    return MapScore(
+        category,
+        limit_of(record),
+        area_under(scores, overlap, 1 - damaged, PRO_LIMIT),
+        area_under(scores, damaged, 1 - damaged),
+        area_under(top, is_flawed, 1 - is_flawed),
+    )
+
+
+def _findings_m(places_m: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """Centres (m, 2) on the face of the findings that the pixels ``above`` (h, w) make."""
+    import numpy as np
+
+    from detectors.clusters import euclidean_clusters
+    from detectors.measure import extents
+
+    points = np.pad(places_m[above & np.isfinite(places_m[..., 0])], ((0, 0), (0, 1)))
+    labels = euclidean_clusters(points, LINK_M, 1)
+    return np.array([extents(points[labels == k])[1][:2] for k in range(labels.max(initial=-1) + 1)]).reshape(-1, 2)
+
+
+def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:
+    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of the weights
+    ``false`` (n,), up to ``limit`` of the latter and divided by it; NaN where either has no weight. Equal scores are
+    one threshold."""
+    import numpy as np
+
+    order = np.argsort(-scores, kind="stable")
+    last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
+    up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))
+    if not (up[-1] > 0 and across[-1] > 0):
+        return float("nan")
+    up, across = up / up[-1], across / across[-1]
+    inside = across <= limit
+    ends = np.append(up[inside], np.interp(limit, across, up)), np.append(across[inside], limit)
+    return float(np.trapezoid(*ends) / limit)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
