@@ -48,6 +48,7 @@ def template(name: str, folder: Path | None = None) -> Template:
     environment.globals |= {
         "generator": GENERATOR,
         "style": Markup((HERE / "style.css").read_text(encoding="utf-8")),
+        "script": Markup((HERE / "page.js").read_text(encoding="utf-8")),
         "figure": figure,
         "warnings": (),
         "closing": "",

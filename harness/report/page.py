@@ -1,4 +1,4 @@
-"""The report of a sweep: result tables in, one self-contained HTML page out. It needs no network and runs no script."""
+"""The report of a sweep: result tables in, one self-contained HTML page out. It needs no network."""
 
 from __future__ import annotations
 

@@ -65,6 +65,31 @@ def curves_figure(limits: Sequence[SetUpLimit]) -> str:
     return _panels("curves", limits, draw, " ".join(limit_sentence(limit) for limit in limits))
 
 
+def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
+    """Draw the curves of all set-ups with their bands on one axis of sizes, a mark at each a90/95 within it."""
+    span, names = _span(limits), [name_of(limit) for limit in limits]
+    across = 2 if max(map(len, names)) <= LONGEST_NAME * 2 // 3 else 1
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for number, limit in enumerate(limits):
+            statement, colour = limit.statement, COLOURS[number % len(COLOURS)]
+            if statement is None:
+                continue
+            style = STYLES[number // len(COLOURS) % len(STYLES)]
+            axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
+            name, pod = plain(fill(names[number], 2 * LONGEST_NAME)), statement.curve.pod(statement.sizes)
+            axes.plot(statement.sizes, pod, style, color=colour, label=name)
+            if is_within_sizes(limit):
+                axes.plot(limit.a90_95.value, 0.9, "o", color=colour, ms=6, mec="white", zorder=5)
+        axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
+        axes.set(xlim=span, ylim=(0, 1), xlabel=_size_axis(limits[0]), ylabel="probability of detection")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=across)
+
+    lines = sum(-(-len(name) // (2 * LONGEST_NAME)) for name in names) / across
+    return svg("overlay", (8.6, 4.0 + 0.2 * lines), " ".join(limit_sentence(limit) for limit in limits), draw)
+
+
 def signals_figure(limits: Sequence[SetUpLimit]) -> str:
     """Draw signals against size, their regression and the threshold, of set-ups that have a regression."""
 
@@ -326,6 +351,9 @@ def study_html(
     signals = [one.limit for one in shown if one.limit.signals is not None]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
+    curves = [limit for limit in inspected if limit.statement is not None]
+    if len({_size_axis(limit) for limit in curves}) == 1:  # a depth is not drawn beside a diameter
+        figures["overlay"] = overlay_figure(curves)
     figures |= {"curves": curves_figure(inspected)} if inspected else {}
     figures |= {"surface": surface_figure(surfaces)} if surfaces else {}
     figures |= {"depth-limits": depth_limits_figure(shown)} if surfaces else {}
@@ -346,6 +374,7 @@ def study_html(
     return template("study.html").render(
         title=title,
         answer=unbroken(study_answer(limits)),
+        conditions=result.conditions,
         rule="Fixed beforehand: a damage is found where the centre of a finding lies within "
         f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
         "board are no further targets.",

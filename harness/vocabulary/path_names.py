@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "
 """Endings of keys that name a unit, longer ones first."""
 CHOICES = ("name", "kind", "method")
 """Keys that say which of several; what it is of stands before them."""
+NAMED = ("camera", "detector", "damage")
+"""Axes whose values say by themselves what they are."""
 LONGEST = 60
 """Characters of a value that a table can show."""
 
@@ -40,6 +43,13 @@ def value_text(path: str, value: Any) -> str:
         return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
     text = on_one_line(Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value)
     return f"{value:g} {unit}" if _is_number(value) and unit else text
+
+
+def in_words(variant: str) -> str:
+    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "kinect v2, distance 0.5 m"."""
+    parts = [part.partition("=") for part in re.split(r", (?=[^=,]+=)", variant)]
+    said = (value.replace("_", " ") if name in NAMED else f"{name} {value}".strip() for name, _, value in parts)
+    return ", ".join(said)
 
 
 def differing(value: Any, others: Iterable[Any]) -> Any:

@@ -28,6 +28,7 @@ from pydantic_core import CoreSchema, core_schema
 from harness.vocabulary.declaration.diagnose import nearest, shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
 
 RECORD_VERSION = 2
@@ -188,7 +189,7 @@ class SetUpRecord:
     def label(self) -> str:
         """Set-up and frames, for tables."""
         frames = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
-        return frames if self.variant == "main" else f"{self.variant}, {frames}"
+        return frames if self.variant == "main" else f"{in_words(self.variant)}, {frames}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -258,6 +258,32 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     return _true(rules)
 
 
+CONDITIONS = (
+    ("source.camera.name", "{}"),
+    ("source.target.distance_m", "at {:g} m"),
+    ("source.target.tilt_deg", "tilted by up to {:g}°"),
+    ("source.target.backing.distance_mm", "with a surface {:g} mm behind"),
+    ("source.target.material.albedo_850", "albedo {:g}"),
+    ("detector.name", "detector {}"),
+    ("threshold.calibrate.false_calls_per_m2", "threshold for {:g} false calls per m²"),
+    ("threshold.k", "threshold {:g} deviations"),
+)
+"""Settings that every set-up shares, in words, where no axis varies them."""
+
+
+def conditions_of(facts: Mapping[str, Any]) -> str:
+    """Return what all set-ups of a study have in common, in one line; empty where nothing is known."""
+    said = []
+    for path, words in CONDITIONS:
+        value: Any = facts
+        for key in path.split("."):
+            value = value.get(key) if isinstance(value, Mapping) else None
+        varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
+        if value is not None and not varied:
+            said.append(words.format(value.replace("_", " ") if isinstance(value, str) else value))
+    return ", ".join(said)
+
+
 NOISE_SHARE = 0.95
 """Signals up to this quantile of those at unflawed places are noise's: censored in the regression of signals."""
 
@@ -281,13 +307,15 @@ class SetUpResult:
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """All set-ups in the record's order, lines of limits over the swept axes, and the limits of validity."""
+    """All set-ups in the record's order, lines of limits over the swept axes, the limits of validity, and the
+    conditions that all set-ups share."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
     limits: tuple[SetUpLimit, ...]
     axes: tuple[AxisLine, ...]
     validity: tuple[Section, ...]
+    conditions: str = ""
 
 
 def evaluate_study(
@@ -303,7 +331,7 @@ def evaluate_study(
     set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, diameters_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)
     validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
-    return StudyResult(record, set_ups, limits, axis_lines(limits), validity)
+    return StudyResult(record, set_ups, limits, axis_lines(limits), validity, conditions_of(facts))
 
 
 def _set_up(
