@@ -298,7 +298,8 @@ def local_sigma(
     sizes = np.abs(values).astype(np.float32)
     nodes = _local_medians(sizes, rows, columns, half, max(1, half // samples)) / 0.6745
     known = np.isfinite(nodes)
-    everywhere = float(np.median(nodes[known])) if known.any() else float(np.nanmedian(sizes)) / 0.6745
+    finite = nodes[known] if known.any() else sizes[np.isfinite(sizes)] / 0.6745
+    everywhere = median_of(finite) if len(finite) else floor
     nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)
     h, w = values.shape
     even = cv2.blur(nodes, (3, 3), borderType=cv2.BORDER_REPLICATE)

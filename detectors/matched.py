@@ -16,16 +16,17 @@ sees the shoulder of a neighbour's hole. What pixels along the target's outline 
 the edge, and light from beside, have a part in them.
 
 Not modelled: slots that no template fits, but for what they have in common with one; slots within `RIM_PX` of outlines
-and of what was taken out; missing returns (`detectors.missing` finds them); templates' distortion where a surface is
-steep. Tails that are heavier than Gaussian scale the narrow templates' scores as a whole. The denominator takes the
-share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely, which is
-exact where all of the template is seen; places where less than `LEAST_SEEN` of it is seen are not judged by that
-template. Scores of slots are taken on every second pixel.
+and of what was taken out; templates' distortion where a surface is steep; missing returns but for the few that are no
+findings by themselves (`detectors.missing`). Tails that are heavier than Gaussian scale the narrow templates' scores as
+a whole. The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle
+that spreads as widely, which is exact where all of the template is seen; places where less than `LEAST_SEEN` of it is
+seen are not judged by that template. Scores of slots are taken on every second pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import cv2
@@ -36,8 +37,9 @@ from pydantic import model_validator
 
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, local_sigma
+from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, local_sigma
 from detectors.masks import grown
+from detectors.missing import missing_evidence
 from detectors.whitening import (
     ALL_RADII_PX,
     CONVERGED,
@@ -103,6 +105,17 @@ class MatchedDetector(LocalDetector):
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
         super().__init__(settings)
         self._covariance = covariance
+
+    def analyse(self, cloud: Cloud) -> LocalEvidence:
+        """Score every pixel of the crop, by its depth and by the missing pixels round about: the logarithms of the two
+        likelihoods add up. Raises UserError on an empty crop and where no surface can be fitted."""
+        evidence = super().analyse(cloud)
+        lost = missing_evidence(cloud, evidence)
+        if lost is None:
+            return evidence
+        score, signed, there = np.sqrt(evidence.score**2 + lost), evidence.signed.copy(), evidence.cell >= 0
+        signed.ravel()[evidence.cell[there]] = np.copysign(score[there], signed.ravel()[evidence.cell[there]])
+        return replace(evidence, score=score, signed=signed)
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtri, ndtri_exp, owens_t
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
-from detectors.masks import grown, holes_filled
+from detectors.masks import grown, holes_filled, parts_with
 from detectors.measure import local_plane
 from harness.vocabulary.geometry import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
@@ -35,6 +35,8 @@ SIMULATED_PX, FEWEST_FIELDS, MOST_FIELDS = 1e6, 10, 100
 """Fields are simulated until they hold so many pixels: enough to reach well under one cluster a target."""
 TAIL_CLUSTERS = 60  # largest simulated clusters from which the fall of their number with size is taken
 SLOWEST_FALL = math.log(2.0)  # fall without simulated clusters to tell: each further pixel halves a cluster's chance
+DISCS_PX, LOUD_SIGMAS = (1.5, 2.5, 3.5), 3.0
+"""Radii of the discs in which missing pixels are counted, and scores beside which they are not taken for chance."""
 REACH_PX = 2  # A depth finding so near to pixels without return belongs to the same damage: half of a 5 x 5 window
 RING_PX = 4  # width of the ring of judged pixels that places the surface at a hole
 HIGHEST_SCORE = 37.0  # standard deviations; beyond it float64 knows no probability
@@ -49,9 +51,22 @@ REASONS: dict[int, str] = {
 }
 
 
-def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
-    """Look for missing returns inside the outline of what was judged: these pixels, gaps narrower than 3 pixels, and
-    all that they enclose. None for a cloud without a pixel grid. Deterministic."""
+class _Gaps(NamedTuple):
+    """Pixels without a return inside the target's ``outline`` (h, w): ``unseen`` (h, w) as in `MissingReturns`,
+    ``missing`` (h, w) bool; ``labels`` (h, w) and ``sizes`` by label of their clusters, and which are ``free`` of the
+    outline's edge."""
+
+    outline: np.ndarray
+    unseen: np.ndarray
+    missing: np.ndarray
+    labels: np.ndarray
+    sizes: np.ndarray
+    free: np.ndarray
+
+
+def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
+    """Return what is missing inside the outline of what was judged: these pixels, gaps narrower than 3 pixels, and all
+    that they enclose. None for a cloud without a pixel grid."""
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
@@ -62,11 +77,54 @@ def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
     else:
         unseen = 1.0 - np.clip(cloud.count / max(cloud.n_frames, 1), 0.0, 1.0)
     missing = (~cloud.valid | (unseen >= 1.0 - SELDOM)) & outline
-    blind = float((~cloud.valid)[outline].mean())
     labels, sizes = _clusters(missing)
     inner = cv2.erode(outline.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), borderValue=0)
     free = np.ones(len(sizes), dtype=bool)
     free[labels[outline & (inner == 0)]] = False
+    return _Gaps(outline, unseen, missing, labels, sizes, free)
+
+
+def missing_evidence(cloud: Cloud, evidence: Evidence) -> np.ndarray | None:
+    """Return (h, w), 0 and more, what missing pixels about each place add to the square of a score there: twice the
+    logarithm of the likelihood of so many in a disc, the best of several, over that at the local rate of dropouts,
+    which is taken where scores do not stand out. None where nothing is missing. Clusters that may be findings by
+    themselves do not count, and others little: one bad sample of a filter makes `LEAST_POINTS` missing pixels."""
+    gaps = _gaps(cloud, evidence)
+    if gaps is None:
+        return None
+    scattered = (gaps.free & (gaps.sizes > 0) & (gaps.sizes < LEAST_POINTS))[gaps.labels]
+    if not scattered.any():
+        return None
+    loud = grown(np.nan_to_num(evidence.score) > LOUD_SIGMAS, REACH_PX)
+    quiet = scattered & ~parts_with(scattered, loud, connectivity=4)
+    rate = max(float(quiet.sum()), 0.5) / gaps.outline.sum()
+    near, of = (_counted(each, np.ones((RATE_WINDOW_PX, RATE_WINDOW_PX))) for each in (quiet, gaps.outline))
+    local = np.where(gaps.outline, (near + RATE_PRIOR_PX * rate) / (of + RATE_PRIOR_PX), 0.0)
+    best = np.zeros(local.shape)
+    for radius in DISCS_PX:
+        reach = np.arange(-int(radius), int(radius) + 1)
+        disc = (np.hypot(reach[:, None], reach) <= radius).astype(float)
+        expected = np.maximum(_counted(local, disc), 1e-12)
+        spread = ((_counted(quiet, disc) - expected) ** 2)[gaps.outline].sum() / expected[gaps.outline].sum()
+        # counts are whole numbers: half of one less, as continuity asks
+        seen = np.maximum(_counted(scattered, disc) - 0.5, expected)
+        likelihood = seen * np.log(seen / expected) - (seen - expected)
+        best = np.maximum(best, 2.0 * likelihood / max(float(spread), float(LEAST_POINTS)))
+    return best
+
+
+def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.filter2D(image.astype(np.float64), -1, kernel, borderType=cv2.BORDER_CONSTANT))
+
+
+def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
+    """Look for missing returns inside the outline of what was judged. None for a cloud without a pixel grid.
+    Deterministic."""
+    gaps = _gaps(cloud, evidence)
+    if gaps is None:
+        return None
+    outline, unseen, missing, labels, sizes, free = gaps
+    blind = float((~cloud.valid)[outline].mean())
     if sizes[free].max(initial=0) < LEAST_POINTS:
         small = float(missing.sum() / outline.sum())
         return MissingReturns(outline, unseen, blind, small, LEAST_POINTS, 0.0, ())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection
+from detectors.local import LocalDetector
 from detectors.matched import MatchedDetector
 from detectors.measure import HoleFit, HolePatch, fit_hole, pictures, straight_sight
 from detectors.whitening import (
@@ -27,7 +28,7 @@ from detectors.whitening import (
     whitener,
     worths,
 )
-from harness.testing import SHAPE, plane
+from harness.testing import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 
 DETECTOR = MatchedDetector(MatchedDetector.settings_type.from_data({"crop": {"kind": "none"}}))
@@ -152,6 +153,24 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
         places_found = found(cloud_of(3e-4 * (noise + depth * slot)), 5.0)
         assert len(places_found) == 1
         assert np.hypot(*(np.array(np.unravel_index(places_found[0].pixels[0], SHAPE)) - (45.2, 60.4))) < 8.0
+
+
+def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
+    """Six pixels without a return in a hole whose depth alone is not enough; scattered ones change the noise's highest
+    score by less than 0.3, and six that stand alone stay below a threshold."""
+    noise = cloud_of(3e-4 * blurred(15))
+    gone = np.zeros(SHAPE, bool)
+    gone[44:46, 59:62] = True
+    faint = cloud_of(3e-4 * blurred(15) + hole(60, 44.5, 2.5, 1.1e-3))
+    with_depth, alone = without(faint, gone), without(noise, gone)
+    shown = np.flatnonzero(hole(60, 44.5, 2.5, 1.0) > 0)
+    without_channel = LocalDetector.analyse(DETECTOR, with_depth).score.ravel()[shown]
+    assert np.nanmax(without_channel) < 4.2
+    assert any(np.isin(each.pixels, shown).any() for each in found(with_depth, 4.5))
+    assert not any(np.isin(each.pixels, shown).any() for each in found(alone, 4.2))
+    scattered = without(noise, np.random.default_rng(16).random(SHAPE) < 0.01)
+    depth_only = np.nanmax(LocalDetector.analyse(DETECTOR, scattered).score)
+    assert abs(DETECTOR.quiet_threshold(scattered, DETECTOR.analyse(scattered)) - depth_only) < 0.3
 
 
 def test_light_along_the_rim_is_no_finding() -> None:

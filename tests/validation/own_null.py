@@ -85,7 +85,7 @@ def boards(camera_name: str, kind: str, number: int, cache: Path) -> dict[int, B
 def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
     """(h, w) bool: within `HIT_M` of a hole's centre, across the line of sight."""
     near = np.zeros(cloud.valid.shape, bool)
-    for damage in truth_of(target):
+    for damage in truth_of(target, target.pose.T_camera_board):
         centre = transform_points(target.pose.T_camera_board, damage.centre_board_m)
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
         with np.errstate(invalid="ignore"):
