@@ -87,6 +87,8 @@ class MissingReturns:
 class Measurement:
     """Size and place of one detection, camera frame, metres; NaN where an estimate could not be made (``model_note``).
 
+    ``length_m``, ``width_m``, ``along`` (3,): sides of a rectangle with the second moments of the residual, less the
+    camera's blur, and the direction of the longer one; of a slot its size, of a round hole of diameter d 0.87 d each.
     ``extent_*``: the thesis' measure from the extreme points. ``model_*``: from the model of a blurred hole, with
     standard errors. ``depth_m`` is measured along the viewing axis from the fitted surface, positive behind it.
     """
@@ -104,6 +106,9 @@ class Measurement:
     model_centre_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     model_centre_se_m: float = np.nan
     volume_m3: float = np.nan
+    length_m: float = np.nan
+    width_m: float = np.nan
+    along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     model_note: str = ""
 
 

@@ -349,7 +349,8 @@ def measure_detection(
     (ax, ay, _), (bx, by, _) = around.per_px_m
     # a pixel's area across the optical axis
     volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * float(abs(ax * by - ay * bx))
-    placed = replace(placed, volume_m3=volume)
+    length_m, width_m, along = _sides(around, near)
+    placed = replace(placed, volume_m3=volume, length_m=length_m, width_m=width_m, along=along)
     around = replace(around, patch=replace(around.patch, correlation=correlation))
     fit, doubt = _modelled(around, config)
     if fit is None:
@@ -366,6 +367,23 @@ def measure_detection(
         model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
         model_note="",
     )
+
+
+def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Return length and width of the rectangle on the surface that has the second moments of the residual within
+    ``near`` (h, w) bool, those of the blur taken off, and the direction (3,) of its length."""
+    residual = around.patch.residual_m[near] - around.offset_m
+    weight = np.maximum(around.sign * residual, 0.0)
+    v, u = np.nonzero(near)
+    if not weight.sum() > 0:
+        return np.nan, np.nan, np.full(3, np.nan)
+    moments = (
+        np.atleast_2d(np.cov(np.stack([u, v]), aweights=weight, ddof=0)) - np.diag(np.square(around.patch.blur_px)) / 12
+    )
+    variances, axes = np.linalg.eigh(around.per_px_m.T @ moments @ around.per_px_m)
+    # of the three the one nearest to 0 is that across the surface
+    width_m, length_m = (float(np.sqrt(12.0 * max(each, 0.0))) for each in (sorted(variances)[-2], variances[-1]))
+    return length_m, width_m, axes[:, -1]
 
 
 @dataclass(frozen=True)

@@ -239,6 +239,7 @@ def _judged(
         board, count, area_m2 = (np.array(column) for column in zip(*calls[damaged], strict=True))
         return Unflawed(board=board, repeat=np.zeros_like(board), calls=count, area_m2=area_m2)
 
+    columns: dict[str, Any] = {key: np.array([row[key] for row in inspected]) for key in inspected[0]}
     record = SetUpRecord(
         variant=category,
         frames=index["categories"][category]["frames"],
@@ -251,7 +252,7 @@ def _judged(
         failed=0,
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
-        inspected=Inspected(**{key: np.array([row[key] for row in inspected]) for key in inspected[0]}),
+        inspected=Inspected(**columns),
         unflawed=unflawed(False),
         beside=unflawed(True),
     )

@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
     add("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
     add("--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)")
-    add("--hole-free", action="store_true", help="leave out holes and dents")
+    add("--hole-free", action="store_true", help="leave out all damage")
     return parser
 
 
@@ -47,7 +47,7 @@ def _run(arguments: argparse.Namespace) -> int:
             write(target, path)
             print(f"wrote {path}")
     titles = ("id", "kind", "diameter mm", "depth mm", "volume mm3", "x camera mm", "y camera mm", "z camera mm")
-    print("  ".join(f"{title:>11}" for title in titles) if target.truth else "no holes, no dents")
+    print("  ".join(f"{title:>11}" for title in titles) if target.truth else "no damage")
     for damage in target.truth:
         row = damage.to_row()
         numbers = [row["diameter_mm"], row["depth_mm"], row["volume_mm3"], *(row[f"{a}_camera_mm"] for a in "xyz")]

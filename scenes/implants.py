@@ -76,8 +76,12 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
 
 
+KINDS = ("holes", "dents", "flaws")
+"""Lists of a declaration that hold damage."""
+
+
 def local_board(
-    target: custom.TargetConfig, damage: custom.DamageConfig, place_m: np.ndarray, normal: np.ndarray, side_mm: float
+    target: custom.TargetConfig, damage: custom.AnyDamage, place_m: np.ndarray, normal: np.ndarray, side_mm: float
 ) -> custom.TargetConfig:
     """Return a board of ``target``'s material with this damage alone at its centre, which lies at ``place_m`` (3,) in
     the camera's frame, its face towards ``normal`` (3,), a unit vector to the camera."""
@@ -90,7 +94,7 @@ def local_board(
         tilt_y_deg=float(np.degrees(np.arctan2(x, z))),
     )
     alone = damage.model_copy(update={"centre_mm": (0.0, 0.0)})
-    kept = {name: tuple(alone for each in getattr(target, name) if each.id == damage.id) for name in ("holes", "dents")}
+    kept = {name: tuple(alone for each in getattr(target, name) if each.id == damage.id) for name in KINDS}
     board = target.board.model_copy(update={"width_mm": side_mm, "height_mm": side_mm})
     backing = target.backing and target.backing.model_copy(update={"size_mm": None})
     return target.model_copy(update={**kept, "board": board, "backing": backing, "pose": pose})
@@ -145,11 +149,11 @@ def implant_of(
     return Implant(onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5, calmer)
 
 
-def side_mm(diameter_mm: float, distance_m: float, config: CameraConfig) -> float:
+def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:
     """Return the side of a board that holds a damage, what the camera's filter reaches of it, and a rim."""
     camera = camera_of(config)
     pitch_mm = distance_m / MM / min(camera.nominal_lens.fx, camera.nominal_lens.fy)
-    return diameter_mm + 2 * (camera.optics.margin_px + BEYOND_PX + AROUND_PX) * pitch_mm
+    return 2 * damage.reach_mm + 2 * (camera.optics.margin_px + BEYOND_PX + AROUND_PX) * pitch_mm
 
 
 def _near(unit: SimulatedUnit, board: custom.TargetConfig) -> np.ndarray:
@@ -161,7 +165,7 @@ def _near(unit: SimulatedUnit, board: custom.TargetConfig) -> np.ndarray:
     on_plane = rays * ((centre @ normal) / (rays @ normal))[..., None]
     lens = unit.camera.nominal_lens
     reach_m = (unit.camera.optics.margin_px + BEYOND_PX) * float(centre[2]) / min(lens.fx, lens.fy)
-    return np.asarray(np.linalg.norm(on_plane - centre, axis=-1) < damage.radius_m + reach_m)
+    return np.asarray(np.linalg.norm(on_plane - centre, axis=-1) < damage.reach_mm * MM + reach_m)
 
 
 def _corners_m(board: custom.TargetConfig) -> np.ndarray:

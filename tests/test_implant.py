@@ -53,7 +53,7 @@ def test_an_implanted_hole_is_the_hole_that_the_camera_would_have_seen(tmp_path:
     T = target.pose.T_camera_board
     place = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)
-    alone = local_board(target, target.holes[0], place, T[:3, 2], side_mm(7.0, 0.7, config))
+    alone = local_board(target, target.holes[0], place, T[:3, 2], side_mm(target.holes[0], 0.7, config))
     found = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
     assert same
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)

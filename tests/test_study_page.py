@@ -177,7 +177,7 @@ def test_the_limits_stand_in_their_table(whole: StudyResult, page: str) -> None:
 
 def test_false_calls_stand_beside_the_wanted_rate(page: str) -> None:
     text = section(page, "False calls and chance hits")
-    assert "Calibrated to 1 false call per m² on hole-free boards of their own" in text
+    assert "Calibrated to 1 false call per m² on undamaged boards of their own" in text
     assert "shuffled positions" in text
 
 
@@ -335,7 +335,7 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
     tables = replace(tables, sites=tables.sites.iloc[:0], **{n: t[t["role"] == "damaged"] for n, t in damaged.items()})
     page = html(evaluate_study(record, tables, {}, draws=40))
     text = section(page, "False calls and chance hits")
-    assert "No hole-free board was inspected" in text
+    assert "No undamaged board was inspected" in text
     assert "none: given" in text
     assert "Thresholds were given, not calibrated" in text
     assert "The thesis' holes" not in headings(page)

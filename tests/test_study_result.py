@@ -175,7 +175,7 @@ def test_set_ups_that_lack_a_board_are_not_paired(study):
     first, second = study_record(study).set_ups
     kept = second.inspected.board != 3
     told = {one.name: getattr(second.inspected, one.name) for one in dataclasses.fields(second.inspected)}
-    columns = {name: values[kept] for name, values in told.items() if values is not None}
+    columns = {name: values[kept] for name, values in told.items() if isinstance(values, np.ndarray)}
     lacking = dataclasses.replace(second, inspected=dataclasses.replace(second.inspected, **columns))
     whole, part = (difference(limit_of(first, draws=50), limit_of(one, draws=50)) for one in (second, lacking))
     assert first.targets_digest == lacking.targets_digest

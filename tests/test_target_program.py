@@ -90,7 +90,7 @@ def test_unwritable_folder(thesis: Target, tmp_path: Path) -> None:
 
 def test_hole_free(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["thesis", "--hole-free"]) == 0
-    assert "no holes, no dents" in capsys.readouterr().out
+    assert "no damage" in capsys.readouterr().out
 
 
 DECLARATION = """

@@ -149,7 +149,6 @@ def _signatures_m(set_up: SetUp, clear_z_m: np.ndarray, surface: np.ndarray, int
     residual_m, pitch_m = clear_z_m - fitted, max(set_up.pitch_mm) * MM
     signals = []
     for damage in set_up.truth:
-        apart_m = np.linalg.norm(set_up.board_xy_m - damage.centre_board_m[:2], axis=-1)
-        near = apart_m < damage.diameter_m / 2 + REACH_PX * pitch_m
+        near = damage.within(set_up.board_xy_m[..., 0], set_up.board_xy_m[..., 1], REACH_PX * pitch_m)
         signals.append(np.where(near, residual_m, 0.0))
     return np.array(signals)

@@ -29,7 +29,7 @@ from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
 from harness.vocabulary.seeds import digest, random_stream
-from scenes.implants import BEYOND_PX, Implant, implant_of, local_board, side_mm, unit_config
+from scenes.implants import BEYOND_PX, KINDS, Implant, implant_of, local_board, side_mm, unit_config
 from scenes.sensor.camera import camera_of
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
@@ -186,7 +186,7 @@ def placements(
         for damage in placed.damages:
             spot = scan.place(*damage.centre_m, 0.0)
             assert spot is not None  # `damages_placed` has looked
-            board = local_board(placed, damage, *spot, side_mm(damage.diameter_mm, float(spot[0][2]), config))
+            board = local_board(placed, damage, *spot, side_mm(damage, float(spot[0][2]), config))
             draw = int(random_stream(seed, "implant", number, damage.id).integers(2**31))
             implants.append(implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache))
         if implants:
@@ -200,10 +200,10 @@ def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: 
     the smallest as for the largest, so that size and place are independent."""
     drawn = family.drawn(purpose, number)
     pitch_m = math.sqrt(scan.area_m2 / max(scan.judged.sum(), 1))
-    rim_px = family.damage.diameter_mm[1] * MM / 2 / pitch_m + BEYOND_PX + scan.reach_px
+    rim_px = family.damage.widest_mm * MM / 2 / pitch_m + BEYOND_PX + scan.reach_px
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
     return drawn.model_copy(
-        update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in ("holes", "dents")}
+        update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
     )
 
 

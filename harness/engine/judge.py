@@ -13,15 +13,19 @@ import numpy as np
 
 from detectors import DETECTORS, load_detector
 from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
+from detectors.masks import grown
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
 from harness.engine.setup import KnownCloud, at_hand, highest_within
-from harness.evaluation.match import match
+from harness.evaluation.match import closest_pairs
 from harness.vocabulary.geometry import MM
+from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage
 
 Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
+SMEARED_PX = 2
+"""Pixels by which an outline is grown before findings are laid over it: half of a camera's window."""
 STEPS_PER_OCTAVE = 4
 FINDING_OCTAVES = (-2, 3)
 """Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
@@ -32,7 +36,8 @@ PIXEL_OCTAVES = (-6, 4)
 @dataclass(frozen=True)
 class JudgedCloud:
     """One detector on one cloud. ``run``: its row; ``holes``: one row per damage. ``places_m`` (m, 2): findings on the
-    face; ``pairs``: index into ``known.truth`` -> index into ``detections``, on a hole-free board at those places."""
+    face; ``pairs``: index into ``known.truth`` -> index into ``detections``, on a hole-free board at those places.
+    ``overlap``: the rule by which findings were matched beside the hit radius."""
 
     run: dict[str, Any]
     holes: list[dict[str, Any]]
@@ -42,6 +47,7 @@ class JudgedCloud:
     places_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     pairs: Mapping[int, int] = field(default_factory=dict)
     measured: tuple[Measurement, ...] = ()
+    overlap: float | None = None
 
 
 def judge(
@@ -51,11 +57,12 @@ def judge(
     threshold: float | None,
     radius_m: float,
     *,
+    overlap: float | None = None,
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge one detector on one cloud. Without a threshold only the quiet one is found. ``learned``: file of what the
-    detector has learned."""
+    """Judge one detector on one cloud. Without a threshold only the quiet one is found. ``radius_m``, ``overlap``: what
+    counts as a hit (`matched`). ``learned``: file of what the detector has learned."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)
@@ -76,16 +83,41 @@ def judge(
         return JudgedCloud(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
     places_m = _places_of(known, detections)
-    pairs = match(_centres_m(known), places_m, radius_m)
-    run |= {"detections": len(detections), "false_calls": len(detections) - (0 if hole_free else len(pairs))}
+    pairs, parts = matched(known, detections, radius_m, overlap)
+    of_damage = 0 if hole_free else len(pairs) + parts
+    run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}
     if hole_free:
-        return JudgedCloud(run, [], detector, evidence, detections, places_m, pairs)
+        return JudgedCloud(run, [], detector, evidence, detections, places_m, pairs, overlap=overlap)
     measured = tuple(detector.measure(cloud, evidence, detection) for detection in detections)
     largest = max(measured, key=lambda m: m.points, default=None)
     found = [measured[pairs[i]] if i in pairs else None for i in range(len(known.truth))]
     holes = [_hole_row(known, evidence, *of, largest) for of in zip(known.truth, found, strict=True)]
     holes = [{**row, "threshold": threshold} for row in holes]
-    return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, measured)
+    return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, measured, overlap)
+
+
+def matched(
+    known: KnownCloud, detections: Sequence[Detection], radius_m: float, overlap: float | None
+) -> tuple[dict[int, int], int]:
+    """Return the findings that count for damages, {index of damage: index of finding}, one for each, nearest first; and
+    how many others are parts of a damage and so no false calls. A finding may count for a damage where its centre lies
+    within the radius of the damage's centre, of long damage of its centre line; with an ``overlap`` also where at least
+    this share of its pixels lie on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside the
+    one that counts are its parts."""
+    lines, places_m = [damage.line_m for damage in known.truth], _places_of(known, detections)
+    if not lines or not len(detections):
+        return {}, 0
+    apart = np.array([from_line_m(line, places_m) for line in lines])
+    lies = np.zeros(apart.shape, bool)
+    if overlap is not None:
+        for i, damage in enumerate(known.truth):
+            on = np.zeros(known.cloud.valid.size, bool)
+            on[known.outlines[damage.id]] = True
+            if known.cloud.organised:
+                on = grown(on.reshape(known.cloud.valid.shape), SMEARED_PX).ravel()
+            lies[i] = [on[one.pixels].mean() >= overlap for one in detections]
+    pairs = closest_pairs(np.where(lies, np.fmin(apart, radius_m), apart), radius_m)
+    return pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))
 
 
 @lru_cache(maxsize=32)
@@ -117,11 +149,6 @@ def _places_of(known: KnownCloud, detections: Sequence[Detection]) -> np.ndarray
     return known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
 
 
-def _centres_m(known: KnownCloud) -> np.ndarray:
-    """(n, 2) true centres of the damage on the face."""
-    return np.array([damage.centre_board_m[:2] for damage in known.truth]).reshape(-1, 2)
-
-
 def _place(damage: Damage) -> dict[str, Any]:
     x_m, y_m = damage.centre_board_m[:2]
     return {
@@ -149,6 +176,10 @@ def _hole_row(
     lost = "invalid" if missing > 0.5 else "wrong depth" if abs(median_m) > evidence.scale_m else "invisible"
     row = _place(damage) | {
         "kind": damage.kind,
+        "size_of": damage.size_of,
+        "true_length_mm": damage.length_m / MM,
+        "true_width_mm": damage.width_m / MM,
+        "true_angle_deg": float(np.degrees(damage.angle_rad)),
         "seen_depth_mm": known.seen_depth_m[damage.id] / MM,
         "true_offset_mm": float(np.linalg.norm(damage.centre_board_m - last.centre_board_m)) / MM,
         "detected": found is not None,
@@ -160,7 +191,12 @@ def _hole_row(
     kinds = ("extent", "model")
     if found is None or largest is None:
         blank = (*names, *(f"{kind}_{what}" for kind in kinds for what in ("offset", "error")))
-        return row | {f"{name}_mm": np.nan for name in blank} | {"score": np.nan, "points": 0, "model_note": ""}
+        sides = dict.fromkeys(("length_mm", "width_mm", "angle_deg"), np.nan)
+        row |= {f"{name}_mm": np.nan for name in blank} | sides
+        return row | {"score": np.nan, "points": 0, "model_note": ""}
+    x, y, _ = known.T_board_cloud[:3, :3] @ found.along
+    row |= {"length_mm": found.length_m / MM, "width_mm": found.width_m / MM}
+    row |= {"angle_deg": float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90)}
     row |= {f"{name}_mm": float(getattr(found, f"{name}_m")) / MM for name in names}
     for kind in kinds:
         centre, reference = (getattr(one, f"{kind}_centre_m") for one in (found, largest))
@@ -189,7 +225,8 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
         run |= {"loudest_u_px": float(u_px), "loudest_v_px": float(v_px)}
         return {"runs": [run], "holes": []}
     without_return, run["no_return_calls"] = _without_return(known, judged, radius_m, hole_free=hole_free)
-    signals = highest_within(known.places_m, score, _centres_m(known), radius_m).tolist()
+    lines = [damage.line_m for damage in known.truth]
+    signals = highest_within(known.places_m, score, lines, radius_m).tolist()
     counts_for = {} if hole_free else {finding: str(known.truth[i].id) for i, finding in judged.pairs.items()}
     findings = [
         {
@@ -248,7 +285,7 @@ def _without_return(
     if missing is None or not missing.detections:
         return frozenset(), 0
     found = missing.detections
-    pairs = {} if hole_free else match(_centres_m(known), _places_of(known, found), radius_m)
+    pairs = {} if hole_free else matched(known, found, radius_m, judged.overlap)[0]
     hits = {id(found[number]) for number in pairs.values()}
     alone = one_damage_once(known.cloud.valid.shape, judged.detections, found)
     calls = sum(one.kind == "no return" and id(one) not in hits for one in alone)
@@ -261,10 +298,6 @@ def _operating(
     """Lists over the grid of thresholds: numbers of findings and of hits."""
     detector, evidence, cloud = judged.detector, judged.evidence, known.cloud
     thresholds = grid(threshold, FINDING_OCTAVES).tolist()
-    each = (detector.find(cloud, evidence, threshold) for threshold in thresholds)
-    found = [np.array([one.centre_m for one in detections]).reshape(-1, 3) for detections in each]
-    findings, hits = [len(centres) for centres in found], [0] * len(found)
-    if not hole_free:
-        places_m = np.split(known.on_board(np.concatenate(found)), np.cumsum(findings)[:-1])
-        hits = [len(match(_centres_m(known), places, radius_m)) for places in places_m]
-    return {"threshold": thresholds, "findings": findings, "hits": hits}
+    found = [detector.find(cloud, evidence, threshold) for threshold in thresholds]
+    hits = [0 if hole_free else len(matched(known, each, radius_m, judged.overlap)[0]) for each in found]
+    return {"threshold": thresholds, "findings": [len(each) for each in found], "hits": hits}

@@ -21,7 +21,7 @@ from harness.report.clouds import ExampleCloud, MappedExample, StudyExample, Whe
 from harness.report.view3d import Circle3d, Kind, Scene3d
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import canonical_json
-from scenes.target.truth import Damage
+from scenes.target.truth import Damage, face_of
 
 MOST_POINTS = 60_000  # points of a merged cloud in a picture
 SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}
@@ -94,13 +94,17 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
-    """(64, 2) columns and rows of a damage's rim on the cloud's grid: a circle in the face's tangent plane."""
+    """(n, 2) columns and rows of a damage's rim on the cloud's grid: its outline on the face, of a hole or dent a
+    circle in the face's tangent plane."""
     region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     along = np.cross(damage.axis_camera, across)
     turn = np.linspace(0, 2 * np.pi, 64)[:, None]
     rim = damage.centre_camera_m + damage.diameter_m / 2 * (np.cos(turn) * across + np.sin(turn) * along)
+    if (outline := damage.outline_board_m) is not None:
+        on_face = face_of(set_up.target.board).point(*outline.T)
+        rim = transform_points(set_up.T_camera_board, np.vstack([on_face, on_face[:1]]))
     return np.asarray(lens.project(rim) - [region.col0, region.row0])
 
 
@@ -230,11 +234,11 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     cloud = averages_of(capture, [asked.frames], asked.average, asked.exact, asked.flat_field)[asked.frames]
     known = known_view(set_up, cloud, hole_free=False)
     given = (asked.detector, asked.settings_json, asked.threshold, asked.radius_m)
-    judged = judge(known, *given, hole_free=False, learned=asked.learned)
+    judged = judge(known, *given, overlap=asked.overlap, hole_free=False, learned=asked.learned)
     damage = next(found for found in known.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))
-    half = int(np.ceil(half_m / MM / pitch_mm))
+    half = int(np.ceil(max(half_m, damage.reach_m + ROOM_MM * MM) / MM / pitch_mm))
     middle = np.round(rim.mean(axis=0)).astype(int)
 
     def window(image: np.ndarray, beyond: float | bool) -> np.ndarray:

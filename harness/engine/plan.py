@@ -195,7 +195,7 @@ def point_task(point: Point, threshold: float | None, learned: str | None) -> Po
     `PointTask`."""
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
     asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
-    further = (point.config.mapping, capture.exact, learned, capture.flat_field)
+    further = (point.config.mapping, capture.exact, learned, capture.flat_field, matching.overlap)
     return PointTask(point.digest, point.variant, capture.frames, *asked, *further)
 
 
@@ -247,8 +247,8 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     else:
         declared = target.declare()
         if not declared.damages:
-            what = "the target has neither holes nor dents, so that there is nothing to find"
-            raise UserError(what, fix="declare source.target.holes or source.target.dents")
+            what = "the target has no damage, so that there is nothing to find"
+            raise UserError(what, fix="declare source.target.holes, source.target.dents or source.target.flaws")
         learning = (batch_of(declared, "learning", source, cache),) * LEARNING_BOARDS
         first, then = ((batch_of(declared, role, source, cache),) for role in ("hole_free", "damaged"))
     group = Group(points, (), first, then, seed, folder, source.views)

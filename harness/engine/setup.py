@@ -5,7 +5,7 @@ The truth stays on this side: a detector is handed clouds only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from scenes.render.cache import read_view
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
+from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage, Face, face_of, truth_of
 
 INTACT_MARGIN_PX = 8
@@ -84,23 +85,23 @@ class SetUp:
         x, y = (np.ascontiguousarray(self.board_xy_m[..., axis]).ravel() for axis in (0, 1))
         inside = {}
         for damage in self.truth:
-            centre_x, centre_y = damage.centre_board_m[:2]
-            distance = np.sqrt((x - centre_x) ** 2 + (y - centre_y) ** 2)
-            within = np.flatnonzero(distance < damage.diameter_m / 2)
-            inside[damage.id] = within if within.size else np.array([int(np.nanargmin(distance))])
+            within = np.flatnonzero(damage.within(x, y))
+            inside[damage.id] = within if within.size else nearest_place(x, y, damage)
         return inside
 
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
         """Depth by damage at which the central rays through it end behind the face, along the optical axis: median of
-        those that come within 1 mm of the deepest (walls are seen in passing); behind a through-hole the backing's.
-        Strips of tape count as face."""
+        those that come within 1 mm of the deepest (walls are seen in passing), of what stands out of the highest, and
+        negative; behind a through-hole the backing's. Strips of tape count as face."""
         face_z_m = transform_points(self.T_camera_board, self.on_face_m)[..., 2]
         depth_m, found = (self.seen_z_m - face_z_m).ravel(), {}
         for damage in self.truth:
             inside = depth_m[self.outlines[damage.id]]
-            known = inside[np.isfinite(inside)]
-            found[damage.id] = float(np.median(known[known > known.max() - 1 * MM])) if known.size else float("nan")
+            sign = -1.0 if damage.raised else 1.0
+            known = sign * inside[np.isfinite(inside)]
+            middle = np.median(known[known > known.max() - 1 * MM]) if known.size else np.nan
+            found[damage.id] = sign * float(middle)
         return found
 
     @cached_property
@@ -135,6 +136,12 @@ class SetUp:
         intact = np.flatnonzero(self.intact)
         intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
+
+
+def nearest_place(x_m: np.ndarray, y_m: np.ndarray, damage: Damage) -> np.ndarray:
+    """Return the flat index (1,) of the place nearest to a damage's centre."""
+    apart = (x_m - damage.centre_board_m[0]) ** 2 + (y_m - damage.centre_board_m[1]) ** 2
+    return np.array([int(np.nanargmin(apart))])
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
@@ -247,11 +254,9 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
     outlines, intact = {}, bare.copy()
     x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
     for damage in first.truth:
-        apart_m2 = (x - damage.centre_board_m[0]) ** 2 + (y - damage.centre_board_m[1]) ** 2
-        with np.errstate(invalid="ignore"):
-            intact &= apart_m2 > (damage.diameter_m / 2 + margin_m) ** 2
-            within = np.flatnonzero(apart_m2.ravel() < (damage.diameter_m / 2) ** 2)
-        outlines[damage.id] = within if within.size else np.array([int(np.nanargmin(apart_m2))])
+        intact &= ~damage.within(x, y, margin_m)
+        within = np.flatnonzero(damage.within(x, y).ravel())
+        outlines[damage.id] = within if within.size else nearest_place(x, y, damage)
     undamaged = bare if hole_free and not intact.any() else intact
     return KnownCloud(cloud, T_board_cloud, first.target, first.truth, outlines, place, undamaged, first.seen_depth_m)
 
@@ -294,13 +299,18 @@ def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
 
 
-def highest_within(places_m: np.ndarray, score: np.ndarray, centres_m: np.ndarray, radius_m: float) -> np.ndarray:
-    """Return (n,) the highest of the finite scores (h, w) within a radius of each centre (n, 2); NaN where there is
-    none. ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere."""
+def highest_within(
+    places_m: np.ndarray, score: np.ndarray, lines_m: Sequence[np.ndarray] | np.ndarray, radius_m: float
+) -> np.ndarray:
+    """Return (n,) the highest of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN where
+    there is none. ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere."""
     finite = np.isfinite(score)
-    places, scores = places_m[finite], score[finite]
-    near = (np.sqrt(((places - centre) ** 2).sum(axis=-1)) <= radius_m for centre in centres_m)
-    return np.array([scores[each].max() if each.any() else np.nan for each in near])
+    places, scores, found = places_m[finite], score[finite], []
+    for line in map(np.atleast_2d, lines_m):
+        about = ((places >= line.min(axis=0) - radius_m) & (places <= line.max(axis=0) + radius_m)).all(axis=-1)
+        near = scores[about][from_line_m(line, places[about]) <= radius_m]
+        found.append(near.max() if near.size else np.nan)
+    return np.array(found)
 
 
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:

@@ -147,7 +147,9 @@ def _write_study(
     write_text(folder / STUDY.name, record_text(study))
     # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
     targets = [cast("SimulatedSource", point.config.source).target for point in experiment.points]
-    drilled = any(isinstance(target, DrawnTargetConfig) and target.damage.kind != "dent" for target in targets)
+    drilled = any(
+        isinstance(target, DrawnTargetConfig) and target.damage.kind in ("through", "blind") for target in targets
+    )
     diameters_mm = [size_in * INCH / MM for size_in in DIAMETERS_IN] if drilled else []
     result = evaluate_study(study, tables, experiment.data, diameters_mm=diameters_mm)
     shown = list(shown_in(plan, result.limits))
@@ -289,6 +291,7 @@ def record_of(
         name=experiment.config.name,
         digest=experiment.digest,
         hit_radius_mm=experiment.config.matching.radius_mm,
+        hit_overlap=experiment.config.matching.overlap,
         false_calls_per_m2=None if calibrate is None else calibrate.false_calls_per_m2,
         provenance={key: provenance[key] for key in ("commit", "dirty", "versions", "seed", "command")},
         set_ups=tuple(one for one in set_ups if one is not None),
@@ -365,6 +368,7 @@ def judged_facts(holes: pd.DataFrame, runs: pd.DataFrame) -> dict[str, Any]:
             hit=by_depth | by_no_return,
             by_depth=by_depth,
             by_no_return=by_no_return,
+            size_of=str(holes["size_of"].iloc[0]),
         ),
         "unflawed": false_calls("hole_free"),
         "beside": false_calls("damaged"),

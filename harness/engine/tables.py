@@ -198,7 +198,7 @@ def _walls(experiment: Experiment) -> pd.DataFrame:
     emitters = np.array([transform_points(T_board_camera, emitter_m) for T_board_camera in boards])
     rows = []
     for damage in truth_of(target, invert(boards[0])):
-        if damage.kind != "dent":
+        if damage.kind in ("through", "blind"):
             mouth = (damage.centre_board_m, damage.diameter_m, damage.depth_m)
             shares = shadowed_shares(lenses, emitters, *mouth, counts)
             rows += [{"hole": str(damage.id), **row} for row in shares]

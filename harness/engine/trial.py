@@ -354,6 +354,7 @@ class PointTask:
     exact: bool = False
     learned: str | None = None
     flat_field: FlatFieldConfig | None = None
+    overlap: float | None = None
 
 
 @dataclass(frozen=True)
@@ -453,7 +454,7 @@ def _point_rows(
         of_map["seconds_map"] = maps.seconds(mapping, point.frames)
         source = maps.key(mapping, point.frames)
     asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
-    key = canonical_json([source, *asked, point.learned])
+    key = canonical_json([source, *asked, point.learned, point.overlap])
     if key not in done:
         if maps is None or mapping is None:
             known = known_view(first, views[point.frames], hole_free=task.hole_free)
@@ -463,7 +464,7 @@ def _point_rows(
                 errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
                 probes = [{"error_tenth_um": _tenth_um(errors_m)}]
         began = time.perf_counter()
-        judged = judge(known, *asked, hole_free=task.hole_free, learned=point.learned)
+        judged = judge(known, *asked, overlap=point.overlap, hole_free=task.hole_free, learned=point.learned)
         judged.run["seconds_detect"] = time.perf_counter() - began
         if task.board is None:
             done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}

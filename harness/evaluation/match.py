@@ -1,4 +1,4 @@
-"""Match detections to damage: nearest centre within a stated radius, one to one; the rest are false calls."""
+"""Match detections to damage: nearest within a stated distance, one to one; the rest are false calls."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import numpy as np
 
 
 def match(truth_m: np.ndarray, found_m: np.ndarray, radius_m: float) -> dict[int, int]:
-    """Pairs {index of truth: index of finding}, closest pairs first, none farther apart than ``radius_m``. ``truth_m``
-    (n, d) and ``found_m`` (m, d) are centres in one frame; findings with NaN match nothing. Ties: lower index first."""
-    if len(truth_m) == 0 or len(found_m) == 0:
-        return {}
-    distance = np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1)
+    """Pairs {index of truth: index of finding} of centres (n, d) and (m, d) in one frame, as `closest_pairs` has it."""
+    return closest_pairs(np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1), radius_m)
+
+
+def closest_pairs(apart: np.ndarray, most: float) -> dict[int, int]:
+    """Pairs {index of truth: index of finding} from the distances (n, m) between damages and findings: closest pairs
+    first, each once, none farther apart than ``most``; NaN matches nothing. Ties: lower index first."""
     pairs: dict[int, int] = {}
     taken: set[int] = set()
-    near = np.flatnonzero(distance <= radius_m)
-    for flat in near[np.argsort(distance.reshape(-1)[near], kind="stable")]:
-        t, f = divmod(int(flat), len(found_m))
+    near = np.flatnonzero(apart <= most)
+    for flat in near[np.argsort(apart.reshape(-1)[near], kind="stable")]:
+        t, f = divmod(int(flat), apart.shape[1])
         if t not in pairs and f not in taken:
             pairs[t] = f
             taken.add(f)

@@ -94,7 +94,8 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     places: list[KeyPath] = [("source", "paths", k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     if isinstance(lens, str) and lens not in camera_names():
         places.append(("source", "intrinsics"))
-    for at in places if shape.get(data, ("source", "kind")) == "capture" else ():
+    places = places if shape.get(data, ("source", "kind")) == "capture" else []
+    for at in (*places, (*checks.TARGET, "file"), (*checks.TARGET, "board", "shape", "file")):
         name = shape.get(data, at)
         if isinstance(name, str) and name:
             start = Path.cwd() if source.place_of(at).origin == OPTION else folder

@@ -135,9 +135,15 @@ class ThresholdConfig(Config):
 
 
 class MatchingConfig(Config):
-    """Rule by which a detection counts for a damage: the nearest centre within this radius on the face, one to one."""
+    """Rule by which a detection counts for a damage: the nearest centre within this radius on the face, one to one; of
+    long damage (slot, gouge, chip) the distance counts from its centre line."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
+    overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
+        None,
+        description="share of a detection's pixels on the damage (outline grown by two pixels) from which on it counts "
+        "too, wherever its centre lies; further ones that lie so are parts of the damage, no false calls",
+    )
 
 
 class ValuesVariation(Config):

@@ -124,9 +124,9 @@ def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
         axes.scatter(seen.diameter_mm[hit], seen.depth_mm[hit], s=9, color=BLUE, lw=0, alpha=0.8, label="found")
         missed: dict[str, Any] = {"s": 11, "facecolor": "white", "edgecolor": INK, "lw": 0.6, "alpha": 0.8}
         axes.scatter(seen.diameter_mm[~hit], seen.depth_mm[~hit], label="missed", **missed)
-        axes.set(xlabel="diameter (mm)", ylabel="depth of removed material (mm)", xlim=(left, right), ylim=(low, high))
+        axes.set(xlabel=f"{seen.size_of} (mm)", ylabel="depth (mm)", xlim=(left, right), ylim=(low, high))
 
-    alt = "Probability of detection over diameter and depth."
+    alt = "Probability of detection over size and depth."
     return _panels("surface", [limit for limit, _ in surfaces], draw, alt, one_legend=True)
 
 
@@ -145,11 +145,12 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
             axes.fill_between(surface.diameter_mm, *band, where=inside, color=colour, alpha=0.15, lw=0)
             name = plain(fill(name_of(limit), LONGEST_NAME))
             axes.plot(surface.diameter_mm, np.where(inside, surface.d90_mm, np.nan), color=colour, label=name)
-        axes.set(xlabel="diameter (mm)", ylabel="depth found 90 % of the time (mm)", ylim=(0, deepest))
+        sizes = " or ".join(dict.fromkeys(limit.record.inspected.size_of for limit, _ in surfaces))
+        axes.set(xlabel=f"{sizes} (mm)", ylabel="depth found 90 % of the time (mm)", ylim=(0, deepest))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center")
 
     lines = sum(-(-len(name_of(limit)) // LONGEST_NAME) for limit, _ in surfaces)
-    alt = "Smallest depth found 90 % of the time against diameter, as depth_limits.csv says."
+    alt = "Smallest depth found 90 % of the time against size, as depth_limits.csv says."
     return svg("depth-limits", (8.6, 4.4 + 0.17 * lines), alt, draw)
 
 
@@ -223,7 +224,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
         left.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls=":")
         left.set(xlabel="share of unflawed places above", ylabel="share of damages above", xlim=(-0.02, 1))
         left.set_title("ROC over places" + ("" if by_size else ", all sizes"))
-        middle.set(xscale="log", xlabel="false calls per m², hole-free", ylabel="share of damages found")
+        middle.set(xscale="log", xlabel="false calls per m², undamaged", ylabel="share of damages found")
         plain_numbers(middle.xaxis, (1,))
         middle.plot([], [], "o", color=GREY, ms=6, label="threshold in use")
         middle.set_title("Free-response curve")
@@ -375,9 +376,8 @@ def study_html(
         title=title,
         answer=unbroken(study_answer(limits)),
         conditions=result.conditions,
-        rule="Fixed beforehand: a damage is found where the centre of a finding lies within "
-        f"{result.record.hit_radius_mm:g} mm of its own, and no finding counts for two. Repeats of the noise on one "
-        "board are no further targets.",
+        rule=f"Fixed beforehand: a damage is found {result.record.hit_rule}, and no finding counts for two. Repeats of "
+        "the noise on one board are no further targets.",
         limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(note) for note in limit_notes(limits)],
         set_ups=len(limits),

@@ -56,7 +56,7 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
-OF = "what these sizes are: the diameter, or the depth where all damage has one diameter"
+OF = "what these sizes are: the diameter (of long damage its width or length), or the depth where all have one"
 EFFECT = "variance of a90 with boards as units over that with damages as units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (
@@ -64,11 +64,11 @@ CALLS = (
         "false_calls_per_m2",
         "calls/m² (95 %)",
         ("false_calls.rate_per_m2", "false_calls.interval_per_m2"),
-        "false calls on hole-free boards, with the exact 95 % Poisson interval",
+        "false calls on undamaged boards, with the exact 95 % Poisson interval",
         lambda rate: "none inspected" if np.isnan(rate.value) else rate.text(),
     ),
     Column("false_calls", "", "false_calls.calls", "false calls counted"),
-    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "hole-free face inspected"),
+    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "undamaged face inspected"),
 )
 
 
@@ -165,10 +165,11 @@ LIMITS = Table(
             "size_error_mm",
             "size error (mm)",
             ("size_error_mm", "size_error_interval_mm"),
-            "median size of the error of the diameter by the model, of hits, with its 95 % interval over boards",
+            "median size of the error of the measured size of hits (the diameter by the model, of long damage its "
+            "width or length), with its 95 % interval over boards",
             brief=False,
         ),
-        Column("sized", "", "sized", "hits with a diameter by the model"),
+        Column("sized", "", "sized", "hits whose size was measured"),
         Column(
             "seconds_detect",
             "ms a cloud",
@@ -185,7 +186,7 @@ LIMITS = Table(
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
         Column("threshold", "", "record.threshold", "in the detector's units"),
         Column("threshold_mm", "", "record.threshold_mm", "the same times the mean scale"),
-        Column("calibration_runs", "", "record.calibration_runs", "hole-free runs that set it; 0: given"),
+        Column("calibration_runs", "", "record.calibration_runs", "undamaged runs that set it; 0: given"),
         Column("detector", "", "record.detector", "name of the detector"),
         Column("detector_version", "", "record.detector_version", "its version"),
         Column("failed", "", "record.failed", "trials that failed"),
@@ -265,7 +266,9 @@ def limit_sentence(limit: SetUpLimit) -> str:
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
     else:
         confidence, size = f"{100 * quote.confidence:.0f} %", text.size(quote.value)
-        size = f"{size} mm deep" if limit.record.inspected.limit_of == "depth" else f"of {size} mm"
+        size = {"depth": "{} mm deep", "width": "{} mm wide", "length": "{} mm long"}.get(
+            limit.record.inspected.limit_of, "of {} mm"
+        ).format(size)
         found = f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
     calls, rate = limit.false_calls, ""
     if calls is not None:

@@ -77,7 +77,7 @@ def _ends_text(rate: Estimate) -> str:
     return text.UNKNOWN_TEXT if np.isnan(rate.low) else text.interval(rate.low, rate.high)
 
 
-GIVEN = "hole-free runs that set it; 0: given"
+GIVEN = "undamaged runs that set it; 0: given"
 OVER_BOARDS = ("false_calls.rate_per_m2", "false_calls_interval_per_m2")
 THRESHOLDS = Table(
     "thresholds",
@@ -91,7 +91,7 @@ THRESHOLDS = Table(
         ),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
-        replace(CALLS[2], label="hole-free m²"),
+        replace(CALLS[2], label="undamaged m²"),
         Column("no_return_calls", "without return", _unseen, "false calls without return"),
         Column("over_boards_per_m2", "over boards (95 %)", OVER_BOARDS, "the rate, interval over boards", _ends_text),
     ),
@@ -137,7 +137,7 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 
 SET_BY = Table(
     "threshold_runs",
-    "one row per calibrated threshold: the hole-free finding that set it",
+    "one row per calibrated threshold: the finding on an undamaged board that set it",
     (
         SET_UP_OF,
         Column("threshold", "threshold (deviations)", "limit.record.threshold", "in the detector's units"),
@@ -186,7 +186,7 @@ def threshold_note(record: StudyRecord) -> str:
         return "Thresholds were given, not calibrated: the rates beside them are what came of it."
     wanted = record.false_calls_per_m2
     return (
-        f"Calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on hole-free boards of their own: the "
+        f"Calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on undamaged boards of their own: the "
         "threshold is the lowest of their runs' highest scores that, by order statistics (Wilks 1941), keeps to that "
         "rate. It is itself an estimate: the rate on other boards scatters about the wanted one."
     )

@@ -48,6 +48,12 @@ TRUTH = _columns(
     true_y_mm="likewise",
     true_offset_mm="distance from the largest hole",
 )
+SHAPE = _columns(
+    size_of="what true_diameter_mm is: the diameter, or of long damage its width or length",
+    true_length_mm="length, of round damage the diameter",
+    true_width_mm="width, of round damage the diameter",
+    true_angle_deg="angle of the length from the board's x",
+)
 SIZES = _columns(
     extent_diameter_mm="diameter by the thesis' measure",
     extent_offset_mm="distance from the largest cluster's centre by the thesis' measure",
@@ -58,6 +64,9 @@ SIZES = _columns(
     model_depth_se_mm="its standard error as the fit states it",
     model_offset_mm="distance from the largest cluster's centre by the model",
     model_error_mm="distance from the true centre by the model",
+    length_mm="length of the rectangle that has the second moments of the residual, less the blur",
+    width_mm="its width",
+    angle_deg="angle of its length from the board's x, -90 to 90",
     model_note="what the fit says of itself",
 )
 STATISTICS = {
@@ -88,7 +97,7 @@ TRIALS = Table(
     "trials",
     "one row per trial on a damaged board and hole",
     (
-        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the hole"), *TRUTH),
+        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the hole"), *TRUTH, *SHAPE),
         *_columns(
             detected="whether a finding counts for it",
             threshold="threshold in use, in the detector's units",

@@ -36,6 +36,8 @@ FLOATS_AT_ONCE = 1 << 26
 """Results held on the device at once: 0.25 GB."""
 FACE_WITHIN_M = 0.001 * MM
 """The board's vertices so near its undamaged face lie on it: Booleans in double precision leave them within 1 nm."""
+MESH_WITHIN_M = 0.05 * MM
+"""The same of a part from a mesh, whose heights stand on a grid."""
 ABOVE_FACE_M = 1 * MM
 """Height of the nodes, so that tape does not bury them."""
 
@@ -220,7 +222,8 @@ def face_triangles(target: Target) -> list[np.ndarray]:
         on_face = np.full(len(part.mesh.faces), part.name.startswith("tape"))
         if part.name == "board":
             board = transform_points(invert(target.T_camera_board), part.mesh.vertices)
-            near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < FACE_WITHIN_M
+            within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
+            near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < within_m
             on_face = np.asarray(near[part.mesh.faces].all(axis=1))
         found.append(on_face)
     return found
@@ -393,14 +396,18 @@ def _samples_inside(
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """Find pixels (h, w) bool whose central ray goes through a hole's mouth, or HOLE_RIM_PX beside it."""
+    """Find pixels (h, w) bool whose central ray goes through a hole's or slot's mouth, or HOLE_RIM_PX beside it."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     found = np.zeros(slopes.shape[:2], bool)
     for hole, declared in zip(target.truth, target.config.damages, strict=True):
-        if hole.kind != "dent":
+        if hole.kind in ("through", "blind", "slot"):
             centre = hole.centre_camera_m
             rim_m = HOLE_RIM_PX * float(centre[2]) / min(optics.lens.fx, optics.lens.fy)
             with np.errstate(divide="ignore", invalid="ignore"):
                 on_plane = rays * ((centre @ hole.axis_camera) / (rays @ hole.axis_camera))[..., None]
-            found |= np.linalg.norm(on_plane - centre, axis=-1) < declared.mouth_m + rim_m
+            if hole.outline_board_m is None:
+                found |= np.linalg.norm(on_plane - centre, axis=-1) < declared.reach_mm * MM + rim_m
+            else:
+                on_board = transform_points(invert(target.T_camera_board), on_plane)
+                found |= hole.within(on_board[..., 0], on_board[..., 1], rim_m)
     return found

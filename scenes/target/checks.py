@@ -9,7 +9,9 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, transform_points
 from scenes.target import custom
-from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, widest_rim_m
+from scenes.target.flaws import ChipConfig, FlawConfig, PressedConfig, border, outside_m
+from scenes.target.part import part_of
+from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, relief_points, widest_rim_m
 
 STEEPEST_SLOPE = 4 / 3
 """dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius. Steeper, the size in plan misleads."""
@@ -19,6 +21,8 @@ WIDEST_BEND = 0.25
 """A damage's radius over the smallest radius of curvature at its centre: the truth's volumes are good to its square."""
 SHALLOWEST_BEND = 0.5
 """The radius of a dent's ball over that: at 1 a face that bends away from the camera has no rim."""
+MOST_TURN = 0.8
+"""Cosine between the face's normals at a flaw's centre and at its rim: depth counts along the first."""
 LEAST_WEB_MM = 0.01
 """Web between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in."""
 NEAREST_M = 0.05
@@ -38,14 +42,15 @@ def check_target(config: custom.TargetConfig) -> None:
     if problems:
         raise UserError(
             "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems),
-            legal="holes, dents and tape lie on the board, apart from one another, and no deeper than it is thick",
+            legal="damage and tape lie on the board, apart from one another, and no deeper than it is thick",
             fix="change the numbers named above in the target's declaration",
         )
 
 
-def _name(damage: custom.HoleConfig | custom.DentConfig) -> str:
-    kind, (x, y) = "dent" if damage.kind == "dent" else "hole", damage.centre_mm
-    return f"{kind} {damage.id} (diameter {damage.diameter_mm:g} mm at ({x:g}, {y:g}) mm)"
+def _name(damage: custom.AnyDamage) -> str:
+    kind, (x, y) = "hole" if isinstance(damage, custom.HoleConfig) else damage.kind.replace("_", " "), damage.centre_mm
+    size = damage.size_of if isinstance(damage, FlawConfig) else "diameter"
+    return f"{kind} {damage.id} ({size} {damage.size_mm:g} mm at ({x:g}, {y:g}) mm)"
 
 
 def _size(board: custom.BoardConfig) -> str:
@@ -55,6 +60,12 @@ def _size(board: custom.BoardConfig) -> str:
 def _board_problems(board: custom.BoardConfig) -> list[str]:
     """Find a face too steep or too tightly bent for its size."""
     shape, half_x, half_y = board.shape, board.width_mm / 2, board.height_mm / 2
+    if isinstance(shape, custom.MeshConfig):
+        vertices = part_of(shape)[0]
+        sizes = (vertices.max(axis=0) - vertices.min(axis=0)) / MM
+        said = "width_mm: {:.6g}, height_mm: {:.6g}, thickness_mm: {:.6g}".format(*sizes)
+        off = np.abs(sizes - (board.width_mm, board.height_mm, board.thickness_mm)).max() > LEAST_WEB_MM
+        return [f"board: its sizes are not those of {shape.file}, which has {said}"] if off else []
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         reach = float(np.hypot(half_x, half_y))
         if isinstance(shape, custom.CylinderConfig):
@@ -70,7 +81,10 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
     # A sphere at 0.8 of its radius has this slope exactly, hence the allowance for rounding.
     if steepest > STEEPEST_SLOPE * (1 + 1e-9):
         return [f"board: its face is too steep: slope {steepest:.3g}, the limit is {STEEPEST_SLOPE:.3g}"]
-    if board.thickness_mm * MM * tightest > THICKEST_BEND:
+    if face.rough:  # its back is flat
+        if board.thickness_mm * MM <= 2 * (depth_m := float(-face.height_m(x, y).min())):
+            return [f"board: {board.thickness_mm:g} mm is too thin for a rough face of {depth_m / MM:.3g} mm depth"]
+    elif board.thickness_mm * MM * tightest > THICKEST_BEND:
         return [
             f"board: radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of "
             f"{board.thickness_mm:g} mm; it must be {board.thickness_mm / THICKEST_BEND:g} mm or more"
@@ -78,19 +92,38 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
     return []
 
 
-def _damage_problems(damage: custom.HoleConfig | custom.DentConfig, board: custom.BoardConfig, face: Face) -> list[str]:
+def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
     name, (x, y), depth_mm, problems = _name(damage), damage.centre_m, damage.depth_mm, []
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    if not (abs(x) < half_x and abs(y) < half_y):
+    outward = np.zeros(2)
+    if isinstance(damage, ChipConfig):
+        outward = np.round([-np.sin(damage.turn_rad), np.cos(damage.turn_rad)])
+        off_mm = float(np.abs(outward @ ((x, y) - outward * (half_x, half_y)))) / MM
+        if off_mm > LEAST_WEB_MM:
+            return [f"{name}: its centre is {off_mm:g} mm off the edge that angle_deg names"]
+    elif not (abs(x) < half_x and abs(y) < half_y):
         return [f"{name}: its centre is off {_size(board)}"]
     tightest = float(np.abs(face.curvatures(x, y)).max())
-    if damage.radius_m * tightest > WIDEST_BEND:
+    if isinstance(damage, FlawConfig):
+        rim, _, axis, _ = relief_points(damage, face, board.thickness_mm * MM)
+        rim = border(rim)
+        if isinstance(board.shape, custom.MeshConfig):
+            if isinstance(damage, ChipConfig | PressedConfig):
+                return [f"{name}: a part from a mesh has no declared edges and no sheet's back"]
+            if np.isnan(face.normal(rim[:, 0], rim[:, 1])).any():
+                return [f"{name}: leaves the part's front"]
+        if not (face.normal(rim[:, 0], rim[:, 1]) @ axis).min() > MOST_TURN:
+            return [f"{name}: too large for the face, which turns by more than 37 degrees within it"]
+    elif face.rough or isinstance(board.shape, custom.MeshConfig):
+        return [f"{name}: holes and dents need a smooth face; this one takes target.flaws (a slot, corrosion ...)"]
+    elif damage.radius_m * tightest > WIDEST_BEND:
         return [f"{name}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
     if isinstance(damage, custom.DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
         ball = f"{damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm"
         return [f"{name}: too shallow ({ball}) for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
-    if depth_mm is not None and depth_mm >= board.thickness_mm:
+    stands_or_bends = isinstance(damage, PressedConfig) or damage.kind == "protrusion"
+    if depth_mm is not None and depth_mm >= board.thickness_mm and not stands_or_bends:
         problems.append(
             f"{name}: depth {depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
         )
@@ -106,16 +139,19 @@ def _damage_problems(damage: custom.HoleConfig | custom.DentConfig, board: custo
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
-    rim = widest_rim_m(damage, face) * (np.cos(angle) * across + np.sin(angle) * np.cross(axis, across))
+    if not isinstance(damage, FlawConfig):
+        rim = centre + widest_rim_m(damage, face) * (np.cos(angle) * across + np.sin(angle) * np.cross(axis, across))
     over = []
     for depth_m in (0.0, _reach_m(damage, board)):
-        points = centre - depth_m * axis + rim
+        points = rim - depth_m * axis
         for along, side, edge in (
             (0, 1, (half_x, y)),
             (0, -1, (-half_x, y)),
             (1, 1, (x, half_y)),
             (1, -1, (x, -half_y)),
         ):
+            if outward[along] == side:
+                continue
             limit = (face.point(*edge) - depth_m * face.normal(*edge))[along]
             over.append(float((side * (points[:, along] - limit)).max()) / MM)
     if max(over) > -LEAST_WEB_MM:
@@ -123,17 +159,16 @@ def _damage_problems(damage: custom.HoleConfig | custom.DentConfig, board: custo
     return problems
 
 
-def _reach_m(damage: custom.HoleConfig | custom.DentConfig, board: custom.BoardConfig) -> float:
-    """Return the depth to which a damage keeps its full width: a dent narrows from the face on."""
-    if damage.kind == "dent":
+def _reach_m(damage: custom.AnyDamage, board: custom.BoardConfig) -> float:
+    """Return the depth to which a damage keeps its full width: holes and slots alone do not narrow from the face on."""
+    if damage.kind not in ("through", "blind", "slot"):
         return 0.0
     return (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM
 
 
-def _overlap_problems(
-    damages: list[custom.HoleConfig | custom.DentConfig], board: custom.BoardConfig, face: Face
-) -> list[str]:
-    """Find pairs without a web between them, at the face or at the depth that both reach."""
+def _overlap_problems(damages: list[custom.AnyDamage], board: custom.BoardConfig, face: Face) -> list[str]:
+    """Find pairs without a web between them, at the face or at the depth that both reach; of outlines that are no
+    circles at the face, in plan."""
     x, y = np.array([damage.centre_m for damage in damages]).reshape(-1, 2).T
     centres, axes = face.point(x, y), face.normal(x, y)
     rims_m = np.array([widest_rim_m(damage, face) for damage in damages])
@@ -143,11 +178,24 @@ def _overlap_problems(
     at_face, turn = centres[first] - centres[second], axes[first] - axes[second]
     apart_m = np.minimum(np.linalg.norm(at_face, axis=-1), np.linalg.norm(at_face - shared_m * turn, axis=-1))
     web_m = apart_m - rims_m[first] - rims_m[second]
+    for i in np.flatnonzero(web_m < LEAST_WEB_MM * MM):
+        one, two = damages[first[i]], damages[second[i]]
+        if isinstance(one, FlawConfig) or isinstance(two, FlawConfig):
+            a, b = (_outline_m(damage, face) for damage in (one, two))
+            web_m[i] = min(outside_m(a, b).min(), outside_m(b, a).min())
     return [
         f"{_name(damages[first[i]])} and {_name(damages[second[i]])} meet: centres {apart_m[i] / MM:.6g} mm apart, "
         f"web {round(web_m[i] / MM, 3) + 0.0:g} mm"
         for i in np.flatnonzero(web_m < LEAST_WEB_MM * MM)
     ]
+
+
+def _outline_m(damage: custom.AnyDamage, face: Face) -> np.ndarray:
+    """Return the outline (n, 2) of a damage in plan."""
+    if isinstance(damage, FlawConfig):
+        return border(relief_points(damage, face, 0.0)[0])[:, :2]
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    return damage.centre_m + widest_rim_m(damage, face) * np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 def _turn(tape: custom.TapeConfig) -> np.ndarray:
@@ -175,7 +223,7 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
         if over > 0:
             problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")
         for damage in config.damages:
-            gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.mouth_m / MM
+            gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.reach_mm
             if gap <= 0:
                 problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
     for (first, strip), (second, other) in combinations(enumerate(config.tapes, start=1), 2):

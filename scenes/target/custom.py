@@ -7,6 +7,9 @@ fields are checked here; what concerns several together (a hole that leaves the 
 
 from __future__ import annotations
 
+import hashlib
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,16 +18,14 @@ from pydantic import Field, model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotation_xyz_deg
+from scenes.target.flaws import AnyFlawConfig, Coordinate, DamageId, FlawConfig, PlaceMm
 
 NEAR_NM = 20.0
 """An albedo holds this far around its wavelength: over it wood and paint change by a per cent or two (a guess)."""
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
-Coordinate = Annotated[float, Field(ge=-5e3, le=5e3)]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
-PlaceMm = tuple[Coordinate, Coordinate]
 SizeMm = tuple[Length, Length]
-DamageId = Annotated[int, Field(ge=1, le=9999)]
 Chamfer = Annotated[
     float,
     Field(ge=0.0, le=100.0, description="leg of a chamfer of 45 degrees that widens the hole's edge on the face"),
@@ -76,8 +77,81 @@ class PolynomialConfig(Config):
     terms: Annotated[tuple[TermConfig, ...], Field(min_length=1, max_length=45)]
 
 
+class CorrugatedConfig(Config):
+    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), s the co-ordinate across the straight direction."""
+
+    kind: Literal["corrugated"]
+    period_mm: Annotated[float, Field(ge=5.0, le=1e3)] = 76.0
+    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(18.0, description="from crest to valley")
+    straight_along: Literal["x", "y"] = "y"
+
+
+class PanelConfig(Config):
+    """A panel like a car door's: bent in both directions, with a swage line along x at which the face steps by
+    ``swage_mm`` as a hyperbolic tangent: z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 /
+    w)). Its radii and step are guesses of what a door looks like."""
+
+    kind: Literal["panel"]
+    radius_x_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 4000.0
+    radius_y_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 1500.0
+    swage_mm: Annotated[float, Field(ge=-50.0, le=50.0)] = 4.0
+    swage_y_mm: Annotated[float, Field(ge=-5e3, le=5e3)] = 40.0
+    swage_width_mm: Annotated[float, Field(ge=1.0, le=1e3)] = 12.0
+
+
+class RoughConfig(Config):
+    """A flat face with random roughness, as of concrete, and a flat back. Heights are Gaussian; their power spectrum in
+    two dimensions is (k^2 + k_outer^2)^-(1 + H), k_outer = 2 pi / ``outer_mm``, up to 2 pi / ``inner_mm``: self-affine
+    between the two lengths (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel are not modelled.
+    """
+
+    kind: Literal["rough"]
+    deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
+    outer_mm: Annotated[float, Field(ge=2.0, le=1e3)] = 60.0
+    inner_mm: Annotated[float, Field(ge=1.0, le=100.0)] = 6.0
+    hurst: Annotated[float, Field(gt=0.0, le=1.0)] = Field(0.8, description="H")
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="drawn anew for every board of a family")
+
+
+FrontAxis = Annotated[
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points to the camera")
+]
+
+
+class MeshConfig(Config):
+    """The front of a part from a mesh file (`scenes.target.part`); the board's sizes are then those of its bounds."""
+
+    kind: Literal["mesh"]
+    file: Annotated[str, Field(min_length=1, max_length=1000)]
+    unit: Literal["mm", "cm", "m", "in"] = "mm"
+    front: FrontAxis = "+z"
+    content: str = Field("", max_length=16, description="the file's digest; filled in, so that results know the file")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _digest_of_file(cls, data: Any) -> Any:
+        path = Path(str(data.get("file", ""))) if isinstance(data, dict) else Path()
+        if not path.is_file() or data.get("content"):
+            return data
+        return {**data, "content": _file_digest(path, path.stat().st_size, path.stat().st_mtime_ns)}
+
+
+@lru_cache(maxsize=64)
+def _file_digest(path: Path, size: int, changed_ns: int) -> str:
+    """Return the digest of a file; size and time of change are arguments so that a changed file is read again."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
+
+
 ShapeConfig = Annotated[
-    FlatConfig | CylinderConfig | SphereConfig | PolynomialConfig,
+    FlatConfig
+    | CylinderConfig
+    | SphereConfig
+    | PolynomialConfig
+    | CorrugatedConfig
+    | PanelConfig
+    | RoughConfig
+    | MeshConfig,
     Field(discriminator="kind", default_factory=FlatConfig),
 ]
 
@@ -112,6 +186,16 @@ class DamageConfig(Config):
     def mouth_m(self) -> float:
         """Radius in metres of what is missing of a flat face."""
         return self.radius_m
+
+    @property
+    def size_mm(self) -> float:
+        """The size in plan that limits are of, as `scenes.target.flaws` has it."""
+        return self.diameter_mm
+
+    @property
+    def reach_mm(self) -> float:
+        """Radius of a circle about the centre that holds the outline."""
+        return self.mouth_m / MM
 
 
 class HoleConfig(DamageConfig):
@@ -149,6 +233,9 @@ class DentConfig(DamageConfig):
     def ball_m(self) -> float:
         """Radius of the ball whose cap on a flat face has this rim and depth."""
         return (self.radius_m**2 + (self.depth_mm * MM) ** 2) / (2 * self.depth_mm * MM)
+
+
+AnyDamage = HoleConfig | DentConfig | FlawConfig
 
 
 class TapeConfig(Config):
@@ -251,6 +338,7 @@ class TargetConfig(Config):
     board: BoardConfig
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
+    flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
     material: MaterialConfig = MaterialConfig()
     backing: BackingConfig | None = None
@@ -265,21 +353,21 @@ class TargetConfig(Config):
         ids = [damage.id for damage in self.damages]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
-            raise ValueError(f"ids of holes and dents must differ; given more than once: {', '.join(map(str, twice))}")
+            raise ValueError(f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}")
         return self
 
     @property
-    def damages(self) -> tuple[HoleConfig | DentConfig, ...]:
-        """Holes, then dents."""
-        return self.holes + self.dents
+    def damages(self) -> tuple[AnyDamage, ...]:
+        """Holes, then dents, then all other kinds."""
+        return self.holes + self.dents + self.flaws
 
     def declare(self) -> TargetConfig:
         """Return itself: every kind of target answers ``declare()`` with the full declaration."""
         return self
 
     def hole_free(self) -> TargetConfig:
-        """Return the same set-up with neither holes nor dents; a threshold is calibrated on it."""
-        return self.model_copy(update={"holes": (), "dents": ()})
+        """Return the same set-up without any damage; a threshold is calibrated on it."""
+        return self.model_copy(update={"holes": (), "dents": (), "flaws": ()})
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.

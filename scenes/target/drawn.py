@@ -6,23 +6,24 @@ purpose and its number. So a board is the same however many others there are, an
 nothing else: at another distance, albedo, kind of hole or depth the boards keep their places, sizes and tilts, and
 their results are paired.
 
-Not modelled: damage that is not round, damage that is correlated (a row, a cluster), several kinds on one board."""
+Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert
 from harness.vocabulary.seeds import random_stream
-from scenes.target import custom
+from scenes.target import custom, flaws
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
@@ -50,19 +51,46 @@ Depths = Annotated[tuple[Depth, Depth], AfterValidator(_ascending)]
 Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
-class DrawnThrough(Config):
-    """Holes drilled through: number and sizes, as of every kind of drawn damage. The range of sizes is parted into
-    ``per_board`` equal parts, and every board has one size from each, uniform within it: over all boards sizes are
-    uniform, and each board covers the range evenly."""
+class _Drawn(Config):
+    """Number and sizes, as of every kind of drawn damage. The range of sizes is parted into ``per_board`` equal parts,
+    and every board has one size from each, uniform within it: over all boards sizes are uniform, and each board covers
+    the range evenly."""
 
-    kind: Literal["through"]
     per_board: Annotated[int, Field(ge=1, le=100)]
-    diameter_mm: Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
     sizes: Literal["uniform", "log"] = Field(
         default="uniform",
-        description="uniform in the diameter, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
+        description="uniform in the size, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
     )
+    size_of: ClassVar[str] = "diameter"
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Ends of the size that ``size_of`` names."""
+        low, high = getattr(self, f"{self.size_of}_mm")
+        return float(low), float(high)
+
+    @property
+    def depths_mm(self) -> tuple[float, float] | None:
+        """Ends of the depths; None of what goes through the board."""
+        return getattr(self, "depth_mm", None)
+
+    @property
+    def widest_mm(self) -> float:
+        """Diameter of a circle in plan that holds the largest."""
+        return self.size_mm[1]
+
+
+class DrawnThrough(_Drawn):
+    """Holes drilled through."""
+
+    kind: Literal["through"]
+    diameter_mm: Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
     chamfer_mm: custom.Chamfer = 0.0
+
+    @property
+    def widest_mm(self) -> float:
+        """Diameter of a circle in plan that holds the largest, its chamfer included."""
+        return self.diameter_mm[1] + 2 * self.chamfer_mm
 
 
 class DrawnBlind(DrawnThrough):
@@ -79,6 +107,89 @@ class DrawnDents(DrawnThrough):
 
     kind: Literal["dent"]  # type: ignore[assignment]
     depth_mm: Depths
+
+
+Extents = Annotated[tuple[flaws.Extent, flaws.Extent], AfterValidator(_ascending)]
+FlawDepths = Annotated[tuple[flaws.Depth, flaws.Depth], AfterValidator(_ascending)]
+Angles = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(_ascending)]
+
+
+class _DrawnFlaws(_Drawn):
+    """Kinds of `scenes.target.flaws`. Each pair is a range: of the size that ``size_of`` names and of the depth as of
+    holes, of every other quantity uniform and independent; what is one number is the same on all boards."""
+
+    def declare(self, facts: dict[str, Any], stream: Callable[[str], np.random.Generator]) -> dict[str, Any]:
+        """Return the declaration of a flaw: ``facts`` (id, place, size and depth) and what else is drawn for it."""
+        own = {name for name in type(self).model_fields if name not in _Drawn.model_fields}
+        held = {name: value for name in own if (value := getattr(self, name)) is not None} | facts
+        number = facts["id"]
+        for name, value in held.items():
+            if isinstance(value, tuple) and name != "centre_mm":
+                held[name] = float(value[0] + (value[1] - value[0]) * stream(name).random(number)[-1])
+        seed = {"seed": int(stream("shapes").integers(2**32, size=number)[-1])}
+        return held | (seed if self.kind in ("slot", "gouge", "corrosion") else {})  # type: ignore[attr-defined]
+
+
+class _DrawnLong(_DrawnFlaws):
+    length_mm: Extents
+    width_mm: Extents
+    angle_deg: Angles = (-90.0, 90.0)
+    wander_mm: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
+
+    @property
+    def widest_mm(self) -> float:
+        """Diameter of a circle in plan that holds the largest."""
+        return math.hypot(self.length_mm[1], self.width_mm[1] + 6 * self.wander_mm)
+
+
+class DrawnSlots(_DrawnLong):
+    """Slots or open cracks, by their width."""
+
+    kind: Literal["slot"]
+    size_of: ClassVar[str] = "width"
+    depth_mm: FlawDepths | None = Field(None, description="none: through the board")
+
+
+class DrawnGouges(_DrawnLong):
+    """Scratches or gouges, by their length, or by their depth where all are as long."""
+
+    kind: Literal["gouge"]
+    size_of: ClassVar[str] = "length"
+    depth_mm: FlawDepths
+    section: Literal["v", "round"] = "v"
+    run_out_mm: Annotated[float, Field(ge=0.1, le=1e3)] = 5.0
+
+
+class DrawnRound(_DrawnFlaws):
+    """Pressed dents or bumps, spatter or rivets, by their diameter, or by their depth where all are as wide."""
+
+    kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
+    diameter_mm: Extents
+    depth_mm: FlawDepths
+
+
+class DrawnCorrosion(DrawnRound):
+    """Corroded patches, by the diameter of a circle of their area, or by their mean depth where all are as large."""
+
+    kind: Literal["corrosion"]  # type: ignore[assignment]
+    rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
+    grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
+    uneven: Annotated[float, Field(ge=0.0, le=0.3)] = 0.12
+
+
+class DrawnChips(_DrawnFlaws):
+    """Chips anywhere along the board's edges, by their length."""
+
+    kind: Literal["chip"]
+    size_of: ClassVar[str] = "length"
+    length_mm: Extents
+    width_mm: Extents
+    depth_mm: FlawDepths
+
+
+_Drilled = DrawnThrough | DrawnBlind | DrawnDents
+_Flawed = DrawnSlots | DrawnGouges | DrawnRound | DrawnCorrosion | DrawnChips
+AnyDrawn = Annotated[_Drilled | _Flawed, Field(discriminator="kind")]
 
 
 class DrawnMaterialConfig(Config):
@@ -101,7 +212,7 @@ class DrawnTargetConfig(Config):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
         default=1, description="of the boards; an experiment's own seed draws the noise, and another keeps the boards"
     )
-    damage: Annotated[DrawnThrough | DrawnBlind | DrawnDents, Field(discriminator="kind")]
+    damage: AnyDrawn
     board: custom.BoardConfig = Field(
         default_factory=lambda: custom.BoardConfig(
             width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
@@ -146,26 +257,28 @@ class DrawnTargetConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         damage, board, bend_per_mm, problems = self.damage, self.board, _tightest_per_mm(self.board), []
-        thick, (low_mm, widest_mm), jitter_mm = board.thickness_mm, damage.diameter_mm, self.distance_jitter_mm
-        if isinstance(damage, DrawnBlind | DrawnDents) and damage.depth_mm[1] >= thick:
-            deep = f"{damage.depth_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
+        thick, (low_mm, widest_mm), jitter_mm = board.thickness_mm, damage.size_mm, self.distance_jitter_mm
+        depths_mm = None if damage.kind in ("pressed_dent", "pressed_bump", "protrusion") else damage.depths_mm
+        if depths_mm is not None and depths_mm[1] >= thick:
+            deep = f"{depths_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
         # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
         ends = {low_mm: _dent_depths_mm(low_mm, bend_per_mm), widest_mm: _dent_depths_mm(widest_mm, bend_per_mm)}
-        declared = damage.depth_mm if isinstance(damage, DrawnDents) else (0.0, math.inf)
-        for diameter_mm, (least_mm, most_mm) in ends.items():
+        declared = damage.depths_mm or (0.0, math.inf)
+        for diameter_mm, (least_mm, most_mm) in ends.items() if isinstance(damage, DrawnDents) else ():
             if max(declared[0], least_mm) > min(declared[1], most_mm):
                 can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
         if isinstance(damage, DrawnDents) and damage.chamfer_mm > 0:
             problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
-        if widest_mm / 2 * bend_per_mm > WIDEST_BEND:
+        if not isinstance(damage, _DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
             wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
             problems.append(f"damage.diameter_mm: {wide}")
         rim_mm, shrinkage, margin_mm = self._room_mm()
         needed_mm = 2 * rim_mm * shrinkage + LEAST_WEB_MM
         if self.apart_mm < needed_mm:
-            meet = f"{self.apart_mm:g} mm lets holes of {widest_mm:g} mm meet"
+            what = "damage" if isinstance(damage, _DrawnFlaws) else "holes"
+            meet = f"{self.apart_mm:g} mm lets {what} of {damage.widest_mm:g} mm meet"
             problems.append(f"apart_mm: {meet}; it must be {needed_mm:.4g} mm or more")
         if min(board.width_mm, board.height_mm) / 2 < margin_mm:
             off = f"no place for a centre that is {margin_mm:.4g} mm off every edge"
@@ -184,8 +297,8 @@ class DrawnTargetConfig(Config):
         independent. A dent's rim on a face that bends away is up to sqrt 2 larger than on a flat one; allowed for with
         holes too, so that the kind of damage does not change its places."""
         bend_per_mm = _tightest_per_mm(self.board)
-        mouth_mm = self.damage.diameter_mm[1] / 2 + self.damage.chamfer_mm
-        rim_mm = mouth_mm * (math.sqrt(2) if bend_per_mm > 0 else 1.0)
+        round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, _DrawnFlaws)
+        rim_mm = self.damage.widest_mm / 2 * (math.sqrt(2) if round_on_bent else 1.0)
         shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
         return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
 
@@ -206,29 +319,34 @@ class DrawnTargetConfig(Config):
             return drawn
 
         damage, count, depths = self.damage, self.damage.per_board, stream("depths")
-        made: list[custom.HoleConfig | custom.DentConfig] = []
-        (low, high), parts = damage.diameter_mm, (np.arange(count) + stream("diameters").random(count)) / count
+        made: list[custom.AnyDamage] = []
+        (low, high), parts = damage.size_mm, (np.arange(count) + stream("diameters").random(count)) / count
         sizes = low * (high / low) ** parts if damage.sizes == "log" else low + (high - low) * parts
         quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
         # What is placed first has the freest choice: which size that is, is drawn too.
-        places_mm = stream("order of places").permutation(self._places_mm(stream("places"))).tolist()
-        for size, quantile, (x, y) in zip(np.clip(sizes, low, high).tolist(), quantiles, places_mm, strict=True):
-            facts: dict[str, Any] = {"id": len(made) + 1, "diameter_mm": size, "centre_mm": (x, y)}
-            if isinstance(damage, DrawnBlind | DrawnDents):
-                least, most = damage.depth_mm
+        places = self._edge_places_mm if isinstance(damage, DrawnChips) else self._places_mm
+        places_mm = stream("order of places").permutation(places(stream("places"))).tolist()
+        for size, quantile, (x, y, *edge) in zip(np.clip(sizes, low, high).tolist(), quantiles, places_mm, strict=True):
+            facts: dict[str, Any] = {"id": len(made) + 1, f"{damage.size_of}_mm": size, "centre_mm": (x, y)}
+            if damage.depths_mm is not None:
+                least, most = damage.depths_mm
                 if isinstance(damage, DrawnDents):
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
                     least, most = max(least, legal[0]), min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
-            if damage.kind == "dent":
+            if isinstance(damage, _DrawnFlaws):
+                facts |= {"angle_deg": round(edge[0])} if edge else {}
+                made.append(TypeAdapter(flaws.AnyFlawConfig).validate_python(damage.declare(facts, stream)))
+            elif damage.kind == "dent":
                 made.append(custom.DentConfig(**facts))
             else:
                 made.append(custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm))
         common: dict[str, Any] = {key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")}
-        common["dents" if damage.kind == "dent" else "holes"] = tuple(made)
+        kinds = "dents" if damage.kind == "dent" else "holes"
+        common["flaws" if isinstance(damage, _DrawnFlaws) else kinds] = tuple(made)
         pose = within("offset", self.offset_mm, 2) + within("tilt", self.tilt_deg, 2) + within("roll", self.roll_deg, 1)
         config = custom.TargetConfig(
-            board=self.board,
+            board=self._board(stream),
             **common,
             material=custom.MaterialConfig(
                 **self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))
@@ -240,6 +358,14 @@ class DrawnTargetConfig(Config):
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses
         size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
         return config.model_copy(update={"backing": self.backing.model_copy(update={"size_mm": size_mm})})
+
+    def _board(self, stream: Callable[[str], np.random.Generator]) -> custom.BoardConfig:
+        """Return the board; one with a rough face has a face of its own."""
+        shape = self.board.shape
+        if not isinstance(shape, custom.RoughConfig):
+            return self.board
+        own = shape.model_copy(update={"seed": int(stream("roughness").integers(2**32))})
+        return self.board.model_copy(update={"shape": own})
 
     def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
         """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways
@@ -262,6 +388,10 @@ class DrawnTargetConfig(Config):
             while len(places) < count:
                 tried = half * rng.uniform(-1.0, 1.0, (TRIES, 2))
                 free = np.all([off_tape_mm(tape, tried) > rim_mm for tape in self.tapes], axis=0)
+                if isinstance(board.shape, custom.MeshConfig):  # what is not in front has no place
+                    ring = np.exp(2j * np.pi * np.arange(16) / 16) * rim_mm
+                    x, y = (tried[:, :1] + ring.real, tried[:, 1:] + ring.imag)
+                    free = free & np.isfinite(face_of(board).height_m(x * MM, y * MM)).all(axis=1)
                 free = free & (np.linalg.norm(tried[:, None] - places, axis=-1) >= self.apart_mm).all(axis=1)
                 if not free.any():
                     break
@@ -276,6 +406,23 @@ class DrawnTargetConfig(Config):
             legal=f"fewer than {best} damages on this board" if best > 1 else None,
             fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board",
         )
+
+    def _edge_places_mm(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw (per_board, 3): points on the board's edges in plan, apart from one another and off the corners, each
+        with the edge's angle as a chip has it."""
+        half = np.array([self.board.width_mm, self.board.height_mm]) / 2
+        corner_mm, places = self.damage.widest_mm / 2 + LEAST_WEB_MM, np.empty((0, 3))
+        for _ in range(ATTEMPTS * TRIES):
+            if len(places) == self.damage.per_board:
+                return places
+            turn = int(rng.choice([0, 90, 180, -90], p=np.tile(half / half.sum() / 2, 2)))
+            outward = np.round([-math.sin(math.radians(turn)), math.cos(math.radians(turn))])
+            along = rng.uniform(-1, 1) * (half[0 if turn in (0, 180) else 1] - corner_mm)
+            place = np.array([*(outward * half + along * np.abs(outward[::-1])), turn])
+            if not len(places) or np.linalg.norm(places[:, :2] - place[:2], axis=1).min() >= self.apart_mm:
+                places = np.vstack([places, place])
+        fix = "lower damage.per_board, damage.length_mm or apart_mm, or declare a larger board"
+        raise UserError(f"the board's edges are too short for {self.damage.per_board} chips", fix=fix)
 
     def _posed(self, jitter_mm: float, *others: float) -> custom.PoseConfig:
         """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a roll."""
@@ -293,7 +440,10 @@ def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, floa
 
 @lru_cache(maxsize=256)
 def _tightest_per_mm(board: custom.BoardConfig) -> float:
-    """Return a face's largest curvature; 0 where its shape does not reach, which `check_target` tells."""
+    """Return a face's largest curvature; 0 where its shape does not reach, which `check_target` tells, and of a rough
+    face, whose back is flat."""
+    if face_of(board).rough or isinstance(board.shape, custom.MeshConfig):
+        return 0.0
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T
     tightest = float(np.abs(face_of(board).curvatures(x_m, y_m)).max()) * MM
     return tightest if math.isfinite(tightest) else 0.0

@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
@@ -23,7 +23,9 @@ from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
-from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, TargetConfig
+from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshConfig, TargetConfig
+from scenes.target.flaws import FlawConfig, PressedConfig, closed_grid
+from scenes.target.part import part_of
 from scenes.target.truth import (
     Damage,
     Face,
@@ -31,6 +33,7 @@ from scenes.target.truth import (
     face_of,
     floor_corners_camera_m,
     outline_board_m,
+    relief_points,
     truth_of,
     wall_corners_camera_m,
 )
@@ -94,6 +97,8 @@ def _normalised(values: np.ndarray) -> np.ndarray:
 
 COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 """Largest distance of facets from a bent face: well under a camera's noise, finer below shallow dents (depth / 400)."""
+ROUGH_SAGITTA_M = 8e-5
+"""The same of a rough face, at its sharpest crest; elsewhere a tenth of it, far below the roughness itself."""
 TAPE_SINK_M = 0.1e-3
 """Depth of a strip's underside in the board, so that no two surfaces coincide."""
 SEGMENTS = 128
@@ -103,6 +108,8 @@ RINGS = 48
 LARGE_M, LONGEST_M = 0.65, 0.1
 """Side of a board from which on its triangles are cut to edges of ``LONGEST_M``: a renderer in float32 misses the plane
 of a triangle from a facet of a hole to a far corner by its length squared over its width times 1e-7, 0.1 mm at 1 m."""
+SPARE_M = 0.2 * MM
+"""Least distance by which a cutter reaches beyond the face."""
 MAX_CELLS = 1_000_000
 """Most cells of a bent sheet: some 300 MB."""
 
@@ -133,7 +140,7 @@ class TargetPart:
 @dataclass(frozen=True)
 class Target:
     """A built target. ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as declared. ``truth``:
-    holes, then dents. ``outline_board_m`` (n, 3): the rim of the face, counter-clockwise seen from the camera.
+    all damage in its order. ``outline_board_m`` (n, 3): the rim of the face, counter-clockwise seen from the camera.
     ``T_camera_board`` (4, 4)."""
 
     config: TargetConfig
@@ -175,7 +182,7 @@ def build_target(config: TargetConfig) -> Target:
 
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y), angle = tape.size_mm, tape.centre_mm, float(np.deg2rad(tape.angle_deg))
-        offsets = {"top_m": tape.thickness_mm * MM, "bottom_m": -TAPE_SINK_M, "sagitta_m": sagitta_m}
+        offsets: dict[str, Any] = {"top_m": tape.thickness_mm * MM, "bottom_m": -TAPE_SINK_M, "sagitta_m": sagitta_m}
         size_m, centre_m = (width * MM, height * MM), (x * MM, y * MM)
         strip = sheet(face_of(board), size_m, **offsets, centre_m=centre_m, angle_rad=angle)
         add(f"tape_{number}", strip.apply_transform(T_camera_board), tape.albedo_850, tape.rgb)
@@ -194,9 +201,24 @@ def build_target(config: TargetConfig) -> Target:
 
 def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
     """Return the board less its damage, watertight, board frame."""
+    import trimesh
+
     size_m, thickness_m = (config.board.width_mm * MM, config.board.height_mm * MM), config.board.thickness_mm * MM
-    body = sheet(face_of(config.board), size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=_sagitta_m(config))
-    return subtract(body, [cutter(damage, item) for damage, item in zip(truth, config.damages, strict=True)])
+    face = face_of(config.board)
+    added: list[trimesh.Trimesh] = []
+    cutters: list[trimesh.Trimesh] = []
+    if isinstance(config.board.shape, MeshConfig):
+        body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
+    else:
+        sagitta_m = _sagitta_m(config)
+        body = sheet(face, size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=sagitta_m, flat_back=face.rough)
+    for damage, item in zip(truth, config.damages, strict=True):
+        if isinstance(item, FlawConfig):
+            more, less = solids_of(item, face, thickness_m)
+            added, cutters = added + more, cutters + less
+        else:
+            cutters.append(cutter(damage, item))
+    return subtract(body, cutters, added)
 
 
 def _rectangle(corners: np.ndarray) -> trimesh.Trimesh:
@@ -206,7 +228,10 @@ def _rectangle(corners: np.ndarray) -> trimesh.Trimesh:
 
 
 def _sagitta_m(config: TargetConfig) -> float:
-    depths_m = [dent.depth_mm * MM for dent in config.dents]
+    if face_of(config.board).rough:
+        return ROUGH_SAGITTA_M
+    bowls = (*config.dents, *(flaw for flaw in config.flaws if flaw.depth_mm is not None))
+    depths_m = [bowl.depth_mm * MM for bowl in bowls if bowl.depth_mm is not None]
     return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
 
 
@@ -219,9 +244,11 @@ def sheet(
     sagitta_m: float,
     centre_m: tuple[float, float] = (0.0, 0.0),
     angle_rad: float = 0.0,
+    flat_back: bool = False,
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
-    Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. Board frame. Raises UserError where
+    Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
+    plane. Board frame. Raises UserError where
     the face needs more than MAX_CELLS."""
     import trimesh
 
@@ -246,19 +273,42 @@ def sheet(
         raise UserError(f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix)
     places = plan(columns, rows)
     points, normals = face.point(places[..., 0], places[..., 1]), face.normal(places[..., 0], places[..., 1])
-    vertices = np.concatenate([(points + offset * normals).reshape(-1, 3) for offset in (top_m, bottom_m)])
-    # triangles of the two grids of vertices, upper one first, and the walls between
-    grid = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
-    a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    upper = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    rim = np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
-    following, below = np.roll(rim, -1), grid.size
-    walls = [
-        np.column_stack([rim + below, following + below, following]),
-        np.column_stack([rim + below, following, rim]),
-    ]
-    faces = np.concatenate([upper, upper[:, ::-1] + below, *walls])
+    lower = np.dstack([places, np.full(places.shape[:2], bottom_m)]) if flat_back else points + bottom_m * normals
+    vertices, faces = closed_grid(points + top_m * normals, lower)
     return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+
+
+def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
+    """Return the solids that a flaw adds to the board and those that it takes away, in this order, board frame. A
+    pressed sheet moves its back too: what one side takes, the other side adds."""
+    import trimesh
+
+    points, depth_m, axis, across = relief_points(item, face, thickness_m)
+    relief, spare_m = item.relief(), SPARE_M + float(np.ptp(points @ axis))
+    if relief.open_row:  # beyond the board's edge
+        points = np.concatenate([points, points[-1:] + spare_m * across])
+        depth_m = np.concatenate([depth_m, depth_m[-1:]])
+
+    def between(upper_m: np.ndarray | float, lower_m: np.ndarray | float) -> trimesh.Trimesh:
+        """The solid between two heights over the face, along the axis."""
+        heights = (np.broadcast_to(height, depth_m.shape)[..., None] for height in (upper_m, lower_m))
+        return trimesh.Trimesh(*closed_grid(*(points + height * axis for height in heights)), process=False)
+
+    through = np.isnan(relief.depth_m).any()
+    inside_m, out = -thickness_m / 2, bool(depth_m.min() < 0)
+    if not isinstance(item, PressedConfig):
+        if out:
+            return [between(-depth_m, -min(spare_m, thickness_m / 2))], []
+        return [], [between(spare_m, -depth_m - (spare_m if through else 0.0))]
+    # the back is the face moved by the thickness along its own normals
+    normals = face.normal(points[..., 0], points[..., 1])
+    back = points - thickness_m * normals
+    moved = back - depth_m[..., None] * axis
+    middle = points + inside_m * normals
+    beyond = back - spare_m * axis
+    front = between(-depth_m, -thickness_m / 2) if out else between(spare_m, -depth_m)
+    rear = trimesh.Trimesh(*(closed_grid(moved, beyond) if out else closed_grid(middle, moved)), process=False)
+    return ([front], [rear]) if out else ([rear], [front])
 
 
 def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh:
@@ -300,20 +350,24 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
     return solid.apply_transform(pose)
 
 
-def subtract(body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Return body minus cutters by Manifold, watertight. Called directly, because trimesh's own wrapper rounds to
-    float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
+def subtract(
+    body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh], added: Sequence[trimesh.Trimesh] = ()
+) -> trimesh.Trimesh:
+    """Return body and what is added, minus cutters, by Manifold, watertight. Called directly, because trimesh's own
+    wrapper rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
     import manifold3d  # type: ignore[import-not-found]
     import trimesh
 
     solids = []
-    for mesh in (body, *cutters):
+    for mesh in (body, *added, *cutters):
         vertices, faces = np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.uint64)
         solids.append(manifold3d.Manifold(manifold3d.Mesh64(vert_properties=vertices, tri_verts=faces)))
     broken = [solid.status() for solid in solids if solid.status() != manifold3d.Error.NoError]
     if broken:
         raise RuntimeError(f"a solid is not closed: {broken}")
-    result = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract).to_mesh64()
+    whole = manifold3d.Manifold.batch_boolean(solids[: 1 + len(added)], manifold3d.OpType.Add)
+    left = [whole, *solids[1 + len(added) :]]
+    result = manifold3d.Manifold.batch_boolean(left, manifold3d.OpType.Subtract).to_mesh64()
     faces = result.tri_verts.astype(np.int64)
     return trimesh.Trimesh(vertices=result.vert_properties[:, :3], faces=faces, process=False)
 

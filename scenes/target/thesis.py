@@ -15,6 +15,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import INCH, MM
 from scenes.target import custom
 from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.part import MeshTargetConfig
 
 THICKNESS_MM = 12.7
 """Half an inch (stated)."""
@@ -148,9 +149,14 @@ class ThesisTargetConfig(Config):
         )
 
 
-AnyTargetConfig = Annotated[ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig, Field(discriminator="name")]
-TARGETS: dict[str, type[ThesisTargetConfig] | type[custom.TargetConfig] | type[DrawnTargetConfig]] = {
+AnyTargetConfig = Annotated[
+    ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig | MeshTargetConfig, Field(discriminator="name")
+]
+TARGETS: dict[
+    str, type[ThesisTargetConfig] | type[custom.TargetConfig] | type[DrawnTargetConfig] | type[MeshTargetConfig]
+] = {
     "thesis": ThesisTargetConfig,
     "custom": custom.TargetConfig,
     "drawn": DrawnTargetConfig,
+    "mesh": MeshTargetConfig,
 }

@@ -5,16 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull
 
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
+from harness.vocabulary.seeds import random_stream
 from scenes.target import custom
+from scenes.target.flaws import FlawConfig, border, closed_grid, outside_m, volume_m3
+from scenes.target.part import front_derivatives, part_of
 
 OUTLINE_STEPS = 64
 """Points along each side of the outline."""
+LINE_STEP = 8
+"""Columns of a flaw's grid between two points of its centre line."""
 OPEN_FLOOR_M = 3.0
 """Reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m."""
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -28,12 +35,18 @@ class Face:
     of x and y, NaN beyond its reach. Arguments of the methods broadcast; every answer is vectorised."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+    rough: bool = False
+    """Slope and curvature at one place say nothing of the face around it."""
+    height: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """Function for z alone, where that is much quicker."""
 
     def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
         return self.derivatives(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return z of the face; NaN where the shape does not reach."""
+        if self.height is not None:
+            return self.height(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
         return self._derived(x_m, y_m)[0]
 
     def slope(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
@@ -55,6 +68,11 @@ class Face:
         upward = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
         return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
 
+    def axis(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return (..., 3): the direction from which a damage's depth counts: the normal, of a rough face z."""
+        normal = self.normal(x_m, y_m)
+        return np.broadcast_to([0.0, 0.0, 1.0], normal.shape).copy() if self.rough else normal
+
     def curvatures(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 2): principal curvatures in 1/m, positive where the face bulges to the camera, larger first.
         From mean and Gaussian curvature of a Monge patch (do Carmo, Differential Geometry, section 3-3, example 5)."""
@@ -66,9 +84,37 @@ class Face:
         return np.stack([spread - mean, -spread - mean], axis=-1)
 
 
+@lru_cache(maxsize=64)
 def face_of(board: custom.BoardConfig) -> Face:
     """Return the face that a board's declaration describes."""
     shape = board.shape
+    if isinstance(shape, custom.RoughConfig):
+        return _rough_face(shape, (board.width_mm * MM, board.height_mm * MM))
+    if isinstance(shape, custom.MeshConfig):
+        return Face(partial(front_derivatives, shape))
+    if isinstance(shape, custom.CorrugatedConfig):
+        bent_along, wave, high_m = shape.straight_along, 2 * np.pi / (shape.period_mm * MM), shape.depth_mm * MM / 2
+
+        def corrugated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+            across, none = (x if bent_along == "y" else y) * wave, np.zeros(x.shape)
+            slope, bend = -high_m * wave * np.sin(across), -high_m * wave**2 * np.cos(across)
+            height = high_m * (np.cos(across) - 1)
+            along_x = (height, slope, none, bend, none, none)
+            return along_x if bent_along == "y" else (height, none, slope, none, none, bend)
+
+        return Face(corrugated)
+    if isinstance(shape, custom.PanelConfig):
+        bends = -1 / (shape.radius_x_mm * MM), -1 / (shape.radius_y_mm * MM)
+        high_m, y0, wide_m = shape.swage_mm * MM / 2, shape.swage_y_mm * MM, shape.swage_width_mm * MM
+
+        def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+            step = np.tanh((y - y0) / wide_m)
+            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (step + np.tanh(y0 / wide_m))
+            slope_y = bends[1] * y + high_m / wide_m * (1 - step**2)
+            bend_y = bends[1] - 2 * high_m / wide_m**2 * step * (1 - step**2)
+            return height, bends[0] * x, slope_y, np.full(x.shape, bends[0]), np.zeros(x.shape), bend_y
+
+        return Face(panel)
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         straight = shape.straight_along if isinstance(shape, custom.CylinderConfig) else ""
         radius_m, sign = shape.radius_mm * MM, 1.0 if shape.bulge == "towards" else -1.0
@@ -106,8 +152,38 @@ def face_of(board: custom.BoardConfig) -> Face:
     return Face(polynomial)
 
 
+ROUGH_MARGIN_M, ROUGH_STEPS = 0.02, 4
+"""Margin of a rough face beyond the board, and knots of its spline to its shortest wavelength."""
+
+
+def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
+    """Return a bicubic spline through heights drawn from the declared spectrum on a grid."""
+    from scipy.interpolate import RectBivariateSpline
+
+    step_m = shape.inner_mm * MM / ROUGH_STEPS
+    counts = [2 * math.ceil((side / 2 + ROUGH_MARGIN_M) / step_m) + 1 for side in size_m]
+    k = np.hypot(*np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij"))
+    outer, inner = 2 * np.pi / (shape.outer_mm * MM), 2 * np.pi / (shape.inner_mm * MM)
+    amplitude = np.where((k > 0) & (k <= inner), (k**2 + outer**2) ** (-(1 + shape.hurst) / 2), 0.0)
+    noise = random_stream(shape.seed, "rough face").standard_normal(counts)
+    heights = np.fft.ifft2(np.fft.fft2(noise) * amplitude).real
+    heights *= shape.deviation_mm * MM / heights.std()
+    places = [step_m * (np.arange(n) - n // 2) for n in counts]
+    spline = RectBivariateSpline(*places, heights - heights[counts[0] // 2, counts[1] // 2])
+
+    def rough(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        return tuple(spline.ev(x, y, dx=dx, dy=dy) for dx, dy in ORDERS)
+
+    return Face(rough, rough=True, height=spline.ev)
+
+
 def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
-    """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame."""
+    """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame; of a part from
+    a mesh the convex hull of its plan, in the plane of its foremost point."""
+    if isinstance(board.shape, custom.MeshConfig):
+        plan = part_of(board.shape)[0][:, :2]
+        rim = plan[ConvexHull(plan).vertices]
+        return np.column_stack([rim, np.zeros(len(rim))])
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
     side, end = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False), np.ones(OUTLINE_STEPS)
     x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
@@ -118,7 +194,10 @@ def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32
     """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the board; board frame."""
     face, places = face_of(board), np.linspace(-0.5, 0.5, steps + 1)
     x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
-    return face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
+    points = face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
+    if isinstance(board.shape, custom.MeshConfig):  # where its front is not, its bounds count
+        points = np.where(np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points)
+    return points
 
 
 def backing_corners_board_m(config: custom.TargetConfig, backing: custom.BackingConfig) -> np.ndarray:
@@ -147,13 +226,18 @@ def wall_corners_camera_m(room: custom.RoomConfig, back_wall_distance_m: float) 
 
 @dataclass(frozen=True)
 class Damage:
-    """A hole or dent. ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's unit normal there,
-    out of the board. ``depth_m``: of the material removed, along the axis; for a through-hole the board's thickness, so
-    the gap to a backing comes on top. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area).
-    ``volume_m3``: exact on a flat face, to second order in diameter over radius of curvature on a curved one."""
+    """A hole, a dent or another damage. ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's
+    unit normal there, out of the board. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area);
+    of other kinds the size in plan that ``size_of`` names. ``depth_m``: of the material removed, along the axis (of
+    corrosion the mean, of what stands out its height); through the board its thickness, so the gap to a backing comes
+    on top. ``volume_m3`` of holes and dents: exact on a flat face, to second order in diameter over radius of curvature
+    on a curved one; of other kinds as `scenes.target.flaws` meshes them, of a pressed sheet on its front. ``raised``:
+    stands out of the face. Kinds with an outline of their own have it and their centre line in plan, metres
+    (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2); None of round ones), with length, width and ``angle_rad`` from
+    board +x."""
 
     id: int
-    kind: Literal["through", "blind", "dent"]
+    kind: str
     diameter_m: float
     depth_m: float
     volume_m3: float
@@ -161,11 +245,51 @@ class Damage:
     axis_board: np.ndarray
     centre_camera_m: np.ndarray
     axis_camera: np.ndarray
+    size_of: str = "diameter"
+    raised: bool = False
+    outline_board_m: np.ndarray | None = None
+    line_board_m: np.ndarray | None = None
+    sides_m: tuple[float, float] | None = None
+    angle_rad: float = 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Length, of round damage the diameter."""
+        return self.diameter_m if self.sides_m is None else self.sides_m[0]
+
+    @property
+    def width_m(self) -> float:
+        """Width, of round damage the diameter."""
+        return self.diameter_m if self.sides_m is None else self.sides_m[1]
+
+    @property
+    def reach_m(self) -> float:
+        """Radius in plan of a circle about the centre that holds the outline."""
+        if self.outline_board_m is None:
+            return self.diameter_m / 2
+        return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
+
+    def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
+        """Tell which places in plan lie inside the outline, or not so far outside; the shape is that of ``x_m``."""
+        apart = np.sqrt((x_m - self.centre_board_m[0]) ** 2 + (y_m - self.centre_board_m[1]) ** 2)
+        with np.errstate(invalid="ignore"):
+            near = np.asarray(apart < self.reach_m + margin_m)
+        if self.outline_board_m is not None:
+            places = np.column_stack([x_m[near], y_m[near]])
+            near[near] = outside_m(self.outline_board_m, places) <= margin_m
+        return near
+
+    @property
+    def line_m(self) -> np.ndarray:
+        """Centre line (k, 2) in plan; of round damage the centre (1, 2)."""
+        return self.centre_board_m[None, :2] if self.line_board_m is None else self.line_board_m
 
     def to_row(self) -> dict[str, Any]:
         """Return plain data in millimetres, one flat row for JSON or a table."""
         row: dict[str, Any] = {"id": self.id, "kind": self.kind, "diameter_mm": self.diameter_m / MM}
         row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
+        row |= {"length_mm": self.length_m / MM, "width_mm": self.width_m / MM}
+        row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of, "raised": self.raised}
         places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
         for frame, (centre_m, axis) in places.items():
             row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
@@ -174,10 +298,14 @@ class Damage:
 
 
 def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
-    """Return the truth of a declaration: holes, then dents, in the order of their declaration."""
+    """Return the truth of a declaration: holes, dents, then other kinds, in the order of their declaration."""
     face, truth = face_of(config.board), []
     for item in config.damages:
-        centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.normal, face.curvatures))
+        centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.axis, face.curvatures))
+        in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
+        if isinstance(item, FlawConfig):
+            truth.append(_flaw_truth(item, face, config.board.thickness_mm * MM, (centre, axis, *in_camera)))
+            continue
         radius_m = item.radius_m
         depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
         if isinstance(item, custom.DentConfig):
@@ -192,9 +320,47 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
             leg_m = item.mouth_m - radius_m
             volume_m3 = math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
             volume_m3 += math.pi * leg_m**2 * (radius_m + leg_m / 3)
-        in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         truth.append(Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera))
     return tuple(truth)
+
+
+def relief_points(
+    item: FlawConfig, face: Face, thickness_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns) along the axis, that
+    axis (3,) out of the board, and the direction (3,) of t; board frame, metres."""
+    relief, (x, y), angle = item.relief(), item.centre_m, item.turn_rad
+    axis = face.axis(x, y)
+    along = np.array([math.cos(angle), math.sin(angle), 0.0])
+    along[2] = -(axis[:2] @ along[:2]) / axis[2]
+    along /= np.linalg.norm(along)
+    across = np.cross(axis, along)
+    plan = relief.s_m[..., None] * along[:2] + relief.t_m[..., None] * across[:2] + (x, y)
+    depth_m = np.where(np.isnan(relief.depth_m), thickness_m, relief.depth_m)
+    return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
+
+
+def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float, places: tuple[np.ndarray, ...]) -> Damage:
+    points, depth_m, axis, _ = relief_points(item, face, thickness_m)
+    plan, moved, raised = points[..., :2], points - depth_m[..., None] * axis, bool(depth_m.min() < 0)
+    length_mm, width_mm = item.sides_mm
+    return Damage(
+        item.id,
+        item.kind,
+        item.size_mm * MM,
+        thickness_m if item.depth_mm is None else item.depth_mm * MM,
+        volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved))),
+        places[0],
+        places[1],
+        places[2],
+        places[3],
+        size_of=item.size_of,
+        raised=raised,
+        outline_board_m=border(plan),
+        line_board_m=plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None,
+        sides_m=(length_mm * MM, width_mm * MM),
+        angle_rad=item.turn_rad,
+    )
 
 
 def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
@@ -207,8 +373,8 @@ def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
     return math.sqrt(rim_square), sum(caps)
 
 
-def widest_rim_m(item: custom.HoleConfig | custom.DentConfig, face: Face) -> float:
+def widest_rim_m(item: custom.AnyDamage, face: Face) -> float:
     """Return the largest radius of a rim: a chamfer counts, and the direction in which a face bends to a dent most."""
-    if isinstance(item, custom.HoleConfig):
-        return item.mouth_m
+    if not isinstance(item, custom.DentConfig):
+        return item.reach_mm * MM
     return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]

@@ -218,11 +218,11 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     if depths[0] <= 0 or not depth_varies(seen.depth_mm):
         return None, "depth does not vary: {:g} to {:g} mm".format(*depths)
     if diameters[0] == diameters[1]:
-        return None, f"diameter does not vary: {diameters[0]:g} mm"
+        return None, f"{seen.size_of} does not vary: {diameters[0]:g} mm"
     a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
     crossed = np.stack([np.ones_like(a), a, d, a * d], axis=1)
     if _separated(crossed[:, :3], hit):
-        return None, "hits and misses do not overlap over diameter and depth (separation): no maximum likelihood"
+        return None, f"hits and misses do not overlap over {seen.size_of} and depth (separation): no maximum likelihood"
     repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
 
     def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
@@ -233,7 +233,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
 
     deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
     if b[1] <= 0:
-        return None, "the chance of detection does not grow with diameter"
+        return None, f"the chance of detection does not grow with {seen.size_of}"
     p, terms, note = np.nan, 3, "POD falls with depth" if b[2] < 0 else ""
     if not _separated(crossed, hit):
         least, bent, _ = fit(link, crossed)
@@ -242,7 +242,9 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
         if p < 0.05 and rises:
             deviance, b, terms = least, bent, 4
         elif p < 0.05:
-            note += f"{'; ' if note else ''}diameter and depth interact (p = {p:.2g}), which the surface leaves out"
+            note += (
+                f"{'; ' if note else ''}{seen.size_of} and depth interact (p = {p:.2g}), which the surface leaves out"
+            )
     level, columns = float(link_ppf(link, np.array(POD))), crossed[:, :terms]
     blocks = weights_in_blocks(draws, (seen.board, "damaged"))
     again = np.concatenate([_coefficients(columns, w * hit, w * ~hit, link, b[:terms]) for (w,) in blocks])
@@ -376,7 +378,7 @@ def limit_of(
         except UserError as error:
             why = error.message
     if statement is not None:
-        if seen.limit_of == "diameter" and depth_varies(seen.depth_mm):
+        if seen.limit_of != "depth" and depth_varies(seen.depth_mm):
             low, high = seen.depth_mm.min(), seen.depth_mm.max()
             note = f"depths from {low:.3g} to {high:.3g} mm: one curve over all depths"
             statement = replace(statement, notes=(*statement.notes, note))

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import (
@@ -59,7 +59,7 @@ class StoredColumn:
 
 def _one_table(table: Any) -> Any:
     """Refuse columns of different lengths and rows that stand there twice."""
-    columns = {name: column for name, column in vars(table).items() if column is not None}
+    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
     lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
         raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
@@ -97,10 +97,11 @@ FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one a row: each damage of each board once for every repeat of the noise. ``diameter_mm``,
-    ``depth_mm`` (removed material), ``x_mm``, ``y_mm`` (on the board) are true. ``signal`` (n,): the highest score
-    within the hit radius of the damage's centre, NaN where no pixel there was judged. ``by_depth``, ``by_no_return``
-    (n,) bool: hits by each kind of finding; None where hits were counted by depth alone."""
+    """Inspections of damage, one a row: each damage of each board once for every repeat of the noise. ``diameter_mm``
+    (of long damage the width or length that ``size_of`` names), ``depth_mm`` (removed material), ``x_mm``, ``y_mm`` (on
+    the board) are true. ``signal`` (n,): the highest score within the hit radius of the damage's centre, NaN where no
+    pixel there was judged. ``by_depth``, ``by_no_return`` (n,) bool: hits by each kind of finding; None where hits were
+    counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -114,12 +115,14 @@ class Inspected:
     signal: NumbersOrNull
     by_depth: Truths | None = None
     by_no_return: Truths | None = None
+    size_of: Name = "diameter"
 
     @property
-    def limit_of(self) -> Literal["diameter", "depth"]:
-        """Name the size that limits are of: the depth where damage of one diameter differs in it, else the diameter."""
+    def limit_of(self) -> str:
+        """Name the size that limits are of: the depth where damage of one diameter (width, length) differs in it, else
+        the diameter (width, length)."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
-        return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else "diameter"
+        return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else self.size_of
 
     @property
     def size_mm(self) -> np.ndarray:
@@ -194,8 +197,9 @@ class SetUpRecord:
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """A whole study. ``hit_radius_mm``: what counts as a hit, fixed beforehand. ``false_calls_per_m2``: the rate that
-    thresholds were calibrated to, None where they were given. ``provenance``: commit, dirty, versions, seed."""
+    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not asked): what counts as a hit, fixed beforehand.
+    ``false_calls_per_m2``: the rate that thresholds were calibrated to, None where they were given. ``provenance``:
+    commit, dirty, versions, seed."""
 
     __pydantic_config__ = FORM
     name: Name
@@ -204,6 +208,19 @@ class StudyRecord:
     false_calls_per_m2: Size | None
     provenance: Mapping[str, Any]
     set_ups: Annotated[tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)]
+    hit_overlap: Size | None = None
+
+    @property
+    def hit_rule(self) -> str:
+        """Rule for a hit, as the end of a sentence that begins with a damage."""
+        long = any(one.inspected.size_of != "diameter" for one in self.set_ups)
+        of = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {of}"
+        if self.hit_overlap is None:
+            return rule
+        return (
+            f"{rule}, or at least {100 * self.hit_overlap:.3g} % of a finding's pixels lie on it or 2 pixels beside it"
+        )
 
     def to_data(self) -> dict[str, Any]:
         """Return JSON's types; NaN becomes None, and a column or table that is None is left out."""

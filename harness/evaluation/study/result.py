@@ -114,7 +114,11 @@ def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
 
 
 Section = tuple[str, tuple[str, ...]]
-KINDS = {"through": "holes drilled through", "blind": "holes with a flat bottom", "dent": "spherical dents"}
+KINDS = {
+    "through": "holes drilled through",
+    "blind": "holes with a flat bottom",
+    "dent": "spherical dents",
+}
 TESTS_THE_HARNESS = ("oracle", "blind")
 """Detectors whose limits say something of the harness only."""
 NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
@@ -128,7 +132,10 @@ def validity_of(
     """State headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
     radius, largest = record.hit_radius_mm, max((one.largest_mm for one in limits), default=np.nan)
     counted = "closest pairs first, each finding for one damage at most; fixed beforehand, the same for all sizes"
-    hits = [f"A damage is hit where the centre of a finding lies within {radius:.3g} mm of its own ({counted})."]
+    hits = [f"A damage is hit {record.hit_rule} ({counted})."]
+    if record.hit_overlap is not None:
+        hits += ["Further findings that lie on a damage are its parts and no false calls."]
+        hits += ["Chance hits are counted by centres alone, so those of long damage come out too low."]
     hits += [f"The largest damages, up to {largest:.3g} mm, reach beyond that radius."] if largest / 2 > radius else []
     sections = (
         ("What was inspected", _inspected(limits, facts.get("sweep") or {})),
@@ -156,7 +163,7 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
         if len(seen.hit):
             times = limit.inspections / limit.targets
             wide, deep = (_span(sizes.min(), sizes.max()) for sizes in (seen.diameter_mm, seen.depth_mm))
-            text = f"{limit.targets} damages on {limit.boards} boards, {wide} in diameter and {deep} deep"
+            text = f"{limit.targets} damages on {limit.boards} boards, {wide} in {seen.size_of} and {deep} deep"
             text += "" if times == 1 else f", each inspected {times:.3g} times with new noise"
             said.setdefault(text, []).append(limit.record.label)
     whose = {text: "" if len(said) == 1 else f"{', '.join(labels)}: " for text, labels in said.items()}
@@ -169,8 +176,9 @@ def _departures(
 ) -> tuple[str, ...]:
     a_board = max((one.targets / one.boards for one in limits if one.boards), default=1.0)
     inspected = [one.record.inspected for one in limits if one.statement]
-    depths = [seen.depth_mm for seen in inspected if seen.limit_of == "diameter"]
+    depths = [seen.depth_mm for seen in inspected if seen.limit_of != "depth"]
     depths = [one for one in depths if depth_varies(one)]
+    sizes = " or ".join(dict.fromkeys(seen.size_of for seen in inspected)) or "diameter"
     of_depths = np.concatenate(depths) if depths else np.zeros(1)
     few = [one for one in limits if one.targets < LEAST_TARGETS]
     # Unflawed places are where damage could have been drawn, on hole-free boards.
@@ -197,12 +205,12 @@ def _departures(
         ),
         (calibrated, "Other calibration boards would give another threshold, which is in no interval here."),
         # the handbook's curve has one size; depth is a second one
-        (depths, f"Depths of {span} share one curve over diameter: the limits are not those of any one depth."),
+        (depths, f"Depths of {span} share one curve over {sizes}: the limits are not those of any one depth."),
         (few, f"{few_text} ({fewest})."),
         (
             fewest_places < SITES_PER_TARGET,
             f"Unflawed places for each damage: {fewest_places:.3g}; the handbook asks for {SITES_PER_TARGET}. "
-            "Besides, false calls are counted on the whole face of hole-free boards.",
+            "Besides, false calls are counted on the whole face of undamaged boards.",
         ),
         *(rule for limit in limits if limit.statement for rule in _sizes_miss_the_rise(limit)),
         (chosen, f"The same data chose the model: a90/95 is the largest over models whose {NEARLY}."),
@@ -243,7 +251,7 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     rules = (
         (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
         (True, "An inspector, who can miss findings and doubt others: the POD is that of the program alone."),
-        (drawn, f"Damage that is not round, that stands in rows or clusters, or several kinds on one board{only}."),
+        (drawn, f"Damage of another kind, that stands in rows or clusters, or several kinds on one board{only}."),
         (simulated, "Gloss, translucency, undeclared light, motion, dirt and wear: all surfaces are Lambertian."),
         (
             one_unit,
@@ -347,8 +355,9 @@ def _set_up(
     floor = float(np.quantile(signal, NOISE_SHARE)) if len(signal) else np.nan
     limit = limit_of(record, draws=draws, noise_floor=floor, tested=True)
     if not holes.empty and not runs.empty:
-        sized = holes[holes["detected"].astype(bool) & holes["model_diameter_mm"].notna()]
-        error_mm = (sized["model_diameter_mm"] - sized["true_diameter_mm"]).abs().to_numpy()
+        of = "model_diameter_mm" if record.inspected.size_of == "diameter" else f"{record.inspected.size_of}_mm"
+        sized = holes[holes["detected"].astype(bool) & holes[of].notna()]
+        error_mm = (sized[of] - sized["true_diameter_mm"]).abs().to_numpy()
         typical_mm, ends_mm = median_over_boards(sized["board"].to_numpy(), error_mm, draws)
         seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
         limit = replace(
@@ -358,7 +367,15 @@ def _set_up(
     chance = None
     if not holes.empty and not runs.empty:
         chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls, draws)
-    roc = roc_curves(holes, sites, record.threshold, a50, a90, draws, by=record.inspected.limit_of)
+    roc = roc_curves(
+        holes,
+        sites,
+        record.threshold,
+        a50,
+        a90,
+        draws,
+        by="depth" if record.inspected.limit_of == "depth" else "diameter",
+    )
     response = free_response(own(tables.operating), runs, holes, draws)
     pixels, sizes = pixel_curves(own(tables.pixels), draws), pod_at(limit, diameters_mm)
     return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws), sizes, floor)

@@ -186,6 +186,8 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
     if first.hit_radius_mm != second.hit_radius_mm:
         return f"hits within {first.hit_radius_mm:g} mm there, within {second.hit_radius_mm:g} mm here"
+    if first.hit_overlap != second.hit_overlap:
+        return f"hits {first.hit_rule} there, {second.hit_rule} here"
     if first.false_calls_per_m2 != second.false_calls_per_m2:
         rates = (first.false_calls_per_m2, second.false_calls_per_m2)
         there, here = ("no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates)

@@ -1,0 +1,296 @@
+"""Damage beside drilled holes and ball dents: a slot, a gouge, a pressed dent or bump, corrosion, a chip, a protrusion.
+
+All are one thing: a depth over a frame of the damage's own. The frame touches the face at the damage's centre; s runs
+along the damage, t across it, and depth counts along the face's normal there, into the board. A kind gives its depth on
+a grid of (s, t) whose border is the damage's outline; `mesh.solids_of` cuts or adds the solid between that grid and
+the face, and `truth.truth_of` measures outline, centre line and volume on the same grid.
+
+``angle_deg`` turns s from board +x towards board +y. A size is the one in the plane that touches the face at the
+centre: good to second order in size over radius of curvature.
+
+Not modelled: burrs, spring-back, rust that stands on the face, another albedo of what is laid bare."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.ndimage import gaussian_filter
+
+from harness.vocabulary.config import Config
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.seeds import random_stream
+
+Coordinate = Annotated[float, Field(ge=-5e3, le=5e3)]
+PlaceMm = tuple[Coordinate, Coordinate]
+DamageId = Annotated[int, Field(ge=1, le=9999)]
+Extent = Annotated[float, Field(ge=0.05, le=2e3)]
+Depth = Annotated[float, Field(gt=0.0, le=500.0)]
+Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
+ALONG, ACROSS = 96, 24
+"""Cells of an elongated damage's grid; profiles are piecewise linear between them, to 0.1 % of the volume."""
+ROUND = 64
+"""Cells along each side of a round damage's grid: volume within 0.1 %."""
+CHIP_ARC = 0.998
+"""Part of a chip's half-length that its grid spans: at the very tips it would have no width."""
+
+
+@dataclass(frozen=True)
+class Relief:
+    """The depth of a damage over its own frame, metres. ``s_m``, ``t_m``, ``depth_m`` (rows, columns): a grid whose
+    border is the outline; ``depth_m`` is negative where the damage stands out of the face, and NaN where it goes
+    through the board. ``open_row``: whether the last row lies
+    on the board's edge, beyond which a cutter goes on."""
+
+    s_m: np.ndarray
+    t_m: np.ndarray
+    depth_m: np.ndarray
+    open_row: bool = False
+
+
+class _FlawConfig(Config):
+    """Declaration that these kinds have in common."""
+
+    id: DamageId
+    centre_mm: PlaceMm
+    size_of: ClassVar[str] = "diameter"
+    """The size in plan that a limit is of where it varies; where it does not, the limit is of the depth."""
+
+    @property
+    def centre_m(self) -> tuple[float, float]:
+        """Place in plan, metres."""
+        return self.centre_mm[0] * MM, self.centre_mm[1] * MM
+
+    @property
+    def size_mm(self) -> float:
+        """The size that ``size_of`` names."""
+        return float(getattr(self, f"{self.size_of}_mm"))
+
+    @property
+    def sides_mm(self) -> tuple[float, float]:
+        """Length and width."""
+        length_mm = getattr(self, "length_mm", self.size_mm)
+        return float(length_mm), float(getattr(self, "width_mm", length_mm))
+
+    @property
+    def turn_rad(self) -> float:
+        """Angle of the length from board +x."""
+        return float(np.deg2rad(getattr(self, "angle_deg", 0.0)))
+
+    @property
+    def reach_mm(self) -> float:
+        """Radius of a circle about the centre that holds the outline."""
+        relief = self.relief()
+        return float(np.hypot(relief.s_m, relief.t_m).max()) / MM
+
+    def relief(self) -> Relief:
+        """Return the depth over the damage's frame."""
+        raise NotImplementedError
+
+
+class _LongConfig(_FlawConfig):
+    """A damage along a centre line: ``wander_mm`` is the line's standard deviation from a straight one, in waves of a
+    third of its length and longer that ``seed`` draws."""
+
+    length_mm: Extent
+    width_mm: Extent
+    angle_deg: Angle = 0.0
+    wander_mm: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
+    seed: Seed = 1
+
+    def _grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return s and t (rows, columns) in metres, and the part of the half-width at which each row lies."""
+        part, s = np.linspace(-1.0, 1.0, ACROSS + 1), np.linspace(-0.5, 0.5, ALONG + 1)
+        turns, weights = random_stream(self.seed, "centre line").uniform(size=(2, 3))
+        waves = [w * np.sin(2 * np.pi * (k * s + turn)) for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)]
+        line = np.sum(waves, axis=0)
+        line = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
+        across, along = np.broadcast_arrays(part[:, None], s * self.length_mm * MM)
+        return along, line + across * self.width_mm * MM / 2, across
+
+
+class SlotConfig(_LongConfig):
+    """A slot or open crack with upright walls and blunt ends, as deep everywhere; the limit is of its width."""
+
+    kind: Literal["slot"]
+    size_of: ClassVar[str] = "width"
+    depth_mm: Depth | None = Field(None, description="none: through the board")
+
+    def relief(self) -> Relief:
+        """Return the depth over the slot's frame."""
+        s, t, _ = self._grid()
+        return Relief(s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM))
+
+
+class GougeConfig(_LongConfig):
+    """A scratch or gouge: its section a V or a parabola, its floor rising to the face over ``run_out_mm`` at each end.
+    Assessments of pipes (ASME B31G, API 579) go by its depth and its length."""
+
+    kind: Literal["gouge"]
+    size_of: ClassVar[str] = "length"
+    depth_mm: Depth
+    section: Literal["v", "round"] = "v"
+    run_out_mm: Annotated[float, Field(ge=0.1, le=1e3)] = 5.0
+
+    def relief(self) -> Relief:
+        """Return the depth over the gouge's frame."""
+        s, t, across = self._grid()
+        section = 1 - np.abs(across) if self.section == "v" else 1 - across**2
+        run_out = min(self.run_out_mm, self.length_mm / 2) * MM
+        ramp = np.clip((self.length_mm * MM / 2 - np.abs(s)) / run_out, 0.0, 1.0)
+        return Relief(s, t, self.depth_mm * MM * section * ramp)
+
+
+class PressedConfig(_FlawConfig):
+    """A sheet pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised cosine of
+    the distance from the centre, so that rim and pole are soft. It may be deeper than the sheet is thick."""
+
+    kind: Literal["pressed_dent", "pressed_bump"]
+    diameter_mm: Extent
+    depth_mm: Depth
+
+    def relief(self) -> Relief:
+        """Return the depth over the dent's frame."""
+        s, t, ring = _disc(self.diameter_mm * MM / 2)
+        sign = 1.0 if self.kind == "pressed_dent" else -1.0
+        return Relief(s, t, sign * self.depth_mm * MM * (1 + np.cos(np.pi * ring)) / 2)
+
+
+class CorrosionConfig(_FlawConfig):
+    """A corroded patch: an uneven outline of a circle's area, whose radius varies by ``uneven`` (standard deviation
+    over mean), and a rough floor of a stated mean depth, standard deviation and correlation length (Gaussian, cut at
+    the face), rising to the face over the outer tenth of the radius."""
+
+    kind: Literal["corrosion"]
+    diameter_mm: Annotated[Extent, Field(description="of the circle with the patch's area")]
+    depth_mm: Annotated[Depth, Field(description="mean")]
+    rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
+    grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
+    uneven: Annotated[float, Field(ge=0.0, le=0.3)] = 0.12
+    seed: Seed = 1
+
+    def relief(self) -> Relief:
+        """Return the depth over the patch's frame."""
+        rng, radius_m = random_stream(self.seed, "corrosion"), self.diameter_mm * MM / 2
+        s, t, ring = _disc(1.0)
+        angle, turn = np.arctan2(t, s), np.linspace(0, 2 * np.pi, 721)
+        turns, weights = rng.uniform(0, 2 * np.pi, 4), rng.uniform(0.3, 1.0, 4)
+        spread = self.uneven / np.sqrt((weights**2).sum() / 2)
+
+        def outline(at: np.ndarray) -> np.ndarray:
+            return 1 + spread * sum(
+                w * np.cos(k * at + p) for k, w, p in zip((2, 3, 4, 5), weights, turns, strict=True)
+            )
+
+        stretch = radius_m * outline(angle) / np.sqrt(np.mean(outline(turn[:-1]) ** 2))
+        noise = gaussian_filter(rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2))
+        noise *= self.rough_mm * MM / max(float(noise.std()), 1e-12)
+        ramp = np.clip((1 - ring) / 0.1, 0.0, 1.0)
+        depth = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp
+        s, t = s * stretch, t * stretch
+        return Relief(s, t, depth * self.depth_mm * MM / _mean(s, t, depth))
+
+
+class ChipConfig(_FlawConfig):
+    """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a point of the edge,
+    which is its centre. ``angle_deg`` is the edge's: 0 top, 90 left, 180 bottom, -90 right. The limit is of its
+    length."""
+
+    kind: Literal["chip"]
+    size_of: ClassVar[str] = "length"
+    length_mm: Annotated[Extent, Field(description="along the edge")]
+    width_mm: Annotated[Extent, Field(description="from the edge inwards")]
+    depth_mm: Depth
+    angle_deg: Literal[0, 90, 180, -90]
+
+    def relief(self) -> Relief:
+        """Return the depth over the chip's frame; its last row lies on the board's edge."""
+        u, v = np.meshgrid(CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2), np.linspace(1, 0, ACROSS + 1))
+        v = np.sin(v * np.pi / 2)
+        s, t = u * self.length_mm * MM / 2, -v * np.sqrt(1 - u**2) * self.width_mm * MM
+        return Relief(s, t, self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)), open_row=True)
+
+
+class ProtrusionConfig(_FlawConfig):
+    """Something that stands on the face (weld spatter, a rivet's head): a paraboloid."""
+
+    kind: Literal["protrusion"]
+    diameter_mm: Extent
+    depth_mm: Annotated[Depth, Field(description="height over the face")]
+
+    def relief(self) -> Relief:
+        """Return the depth over the protrusion's frame: negative, as it stands out."""
+        s, t, ring = _disc(self.diameter_mm * MM / 2)
+        return Relief(s, t, -self.depth_mm * MM * (1 - ring**2))
+
+
+FlawConfig = SlotConfig | GougeConfig | PressedConfig | CorrosionConfig | ChipConfig | ProtrusionConfig
+AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
+
+
+def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a square grid mapped onto a disc, s and t, and each point's part of the radius; the border is the rim."""
+    u, v = np.meshgrid(np.linspace(-1, 1, ROUND + 1), np.linspace(-1, 1, ROUND + 1))
+    s, t = u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
+    return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)
+
+
+def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
+    """Return the mean of a grid's values over its area."""
+    across, down = (np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t))
+    areas = np.abs(across[0] * down[1] - across[1] * down[0])
+    middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
+    return float((areas * middles).sum() / areas.sum())
+
+
+def border(grid: np.ndarray) -> np.ndarray:
+    """Return the border (n, ...) of a grid (rows, columns, ...), once round, from its first corner along the row."""
+    return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
+
+
+def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (n, 3) and outward triangles (m, 3) of the solid between two grids (rows, columns, 3) of points,
+    columns running with x and rows with y as seen from above, closed by walls between their borders."""
+    rows, columns = upper.shape[:2]
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    rim = border(grid)
+    following, below = np.roll(rim, -1), grid.size
+    walls = [
+        np.column_stack([rim + below, following + below, following]),
+        np.column_stack([rim + below, following, rim]),
+    ]
+    vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)])
+    return vertices, np.concatenate([top, top[:, ::-1] + below, *walls])
+
+
+def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return the volume that closed, outward triangles enclose."""
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def outside_m(outline_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of places (n, 2) from a closed polygon (k, 2), 0 inside it (even-odd rule)."""
+    following = np.roll(outline_m, -1, axis=0)
+    x, y = places_m.T[:, :, None]
+    (ax, ay), (bx, by) = outline_m.T, following.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossed = ((ay > y) != (by > y)) & (x < (bx - ax) * (y - ay) / (by - ay) + ax)
+    inside = crossed.sum(axis=1) % 2 == 1
+    return np.where(inside, 0.0, from_line_m(np.vstack([outline_m, outline_m[:1]]), places_m))
+
+
+def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of places (n, 2) from a line of straight pieces (k, 2), or from one point (1, 2)."""
+    if len(line_m) == 1:
+        return np.asarray(np.linalg.norm(places_m - line_m[0], axis=-1))
+    start, way = line_m[:-1], np.diff(line_m, axis=0)
+    square = np.maximum((way**2).sum(axis=1), 1e-30)
+    to = places_m[:, None] - start
+    part = np.clip((to * way).sum(axis=-1) / square, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(to - part[..., None] * way, axis=-1).min(axis=1))
