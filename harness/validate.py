@@ -41,6 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     put("--intrinsics", metavar="FILE|CAMERA", help="the lens of the depth pixels: a file, or a camera's nominal lens")
     put("--frames", type=_positive, metavar="N", help="use the first N frames only")
     put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
+    put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
     put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default 0.8, a light wall)")
     return parser
 
@@ -52,13 +53,20 @@ def _positive(text: str) -> int:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
-    if options.capture:
+    if options.capture or options.board:
         for name in ("quick", "update_baseline", "figures", "baseline"):
             if getattr(options, name):
                 raise UserError(f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture")
         from harness.scorecard.capture import run_capture
 
-        return run_capture(options, command)
+        if options.board is None:
+            return run_capture(options, command)
+        from harness.scorecard.board import run_board
+        from harness.scorecard.capture import opened_capture
+
+        if options.camera or options.mask:
+            raise UserError("--camera and --mask do not go with --board: the experiment names the camera")
+        return run_board(options, opened_capture(options) if options.capture else None, command)
     for name in ("unit", "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -298,7 +298,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
-    recording = _opened(options)
+    recording = opened_capture(options)
     captured = captured_of(recording, None if options.mask is None else read_mask(options.mask))
     name = options.camera[0] if options.camera else camera_of_size(captured.lens)
     twin = twin_of(name, captured.lens, options.albedo)
@@ -306,36 +306,36 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     print(f"{captured.name}: {len(captured.z_m)} frames beside {twin.camera.title}, albedo {options.albedo:g}")
     for remark in recording.notes:
         print(f"note: {remark}")
-    show([BESIDE.grid(rows)])
-    provenance = {
-        "results_version": RESULTS_VERSION,
-        **record(command),
-        "camera": name,
-        "files": [str(path) for path in recording.files],
-    }
     ratios = ", ".join(
         f"{row.ratio:.2f} ({row.where})" for row in rows if (row.quantity, row.at) == ("temporal deviation", "all")
     )
     answer = f"Temporal deviation, simulated by measured: {ratios}."
-    page = template("capture.html", Path(__file__).parent).render(
-        name=captured.name,
-        camera=twin.camera.title,
-        answer=answer if ratios else "The simulation sees none of the planes of this capture.",
-        frames=len(captured.z_m),
-        albedo=f"{twin.albedo:g}",
-        figure=svg("capture", (6.0, 4.2), "Planes found", lambda figure: _draw(figure, captured)),
-        numbers=BESIDE.grid(rows).html() if rows else "",
-        edges=any("edge" in row.where for row in rows),
-        provenance=[(key, plain(value)) for key, value in provenance.items()],
-    )
-    write_table(options.out, BESIDE, BESIDE.frame(rows))
-    write_text(options.out / "capture.html", page)
-    write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
-    print(f"wrote {options.out / 'capture.html'}")
+    answer = answer if ratios else "The simulation sees none of the planes of this capture."
+    facts = {"camera": name, "files": [str(path) for path in recording.files]}
+    words = {"name": captured.name, "camera": twin.camera.title, "answer": answer, "albedo": f"{twin.albedo:g}"}
+    figure = svg("capture", (6.0, 4.2), "Planes found", lambda figure: _draw(figure, captured))
+    edges, frames = any("edge" in row.where for row in rows), len(captured.z_m)
+    write_comparison(options, rows, facts, command, **words, frames=frames, figure=figure, edges=edges)
     return 0
 
 
-def _opened(options: argparse.Namespace) -> Recording:
+def write_comparison(
+    options: argparse.Namespace, rows: list[Beside], facts: dict[str, Any], command: str, **page: Any
+) -> None:
+    """Print the rows, and write capture.csv, capture.html (``page``: the words of its template) and provenance.json."""
+    show([BESIDE.grid(rows)])
+    provenance = {"results_version": RESULTS_VERSION, **record(command), **facts}
+    described = [(key, plain(value)) for key, value in provenance.items()]
+    numbers = BESIDE.grid(rows).html() if rows else ""
+    page = {"board": False, "remarks": (), "numbers": numbers, "provenance": described, **page}
+    text = template("capture.html", Path(__file__).parent).render(page)
+    write_table(options.out, BESIDE, BESIDE.frame(rows))
+    write_text(options.out / "capture.html", text)
+    write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
+    print(f"wrote {options.out / 'capture.html'}")
+
+
+def opened_capture(options: argparse.Namespace) -> Recording:
     """The capture. Without a lens anywhere, the nominal one of the camera that the user names counts."""
     first = slice(options.frames) if options.frames else None
     try:

@@ -219,6 +219,15 @@ class HoleConfig(DamageConfig):
         return self
 
 
+class DrillConfig(Config):
+    """The drill of all holes of a board, in place of what each hole says."""
+
+    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
+    kind: Literal["through", "blind"] = "through"
+    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
+    chamfer_mm: Chamfer = 0.0
+
+
 class DentConfig(DamageConfig):
     """A spherical cap: rim diameter and depth as a ball would leave them on a flat face."""
 
@@ -336,6 +345,7 @@ class TargetConfig(Config):
 
     name: Literal["custom"] = "custom"
     board: BoardConfig
+    drill: DrillConfig | None = Field(None, description="one drill for all holes: a single key to vary")
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
     flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
@@ -347,6 +357,15 @@ class TargetConfig(Config):
     other_wavelengths: tuple[WavelengthConfig, ...] = Field(
         (), max_length=20, description="for cameras that do not work near 850 nm"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_drill(cls, data: Any) -> Any:
+        drill, holes = (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
+        if not isinstance(drill, dict) or not isinstance(holes, list | tuple):
+            return data
+        whole = {"kind": "through", "depth_mm": None, "chamfer_mm": 0.0, **drill}
+        return {**data, "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes]}
 
     @model_validator(mode="after")
     def _ids_once(self) -> Self:

@@ -154,6 +154,26 @@ class ScatterFacts(Config):
     stray_px: Positive
 
 
+class ColourFacts(Config):
+    """The colour camera beside, onto whose pixels depth images may be aligned: ``turn_deg`` (a rotation vector) and
+    ``shift_mm`` take points of the depth camera's frame to its frame. ``distortion`` as of every lens (k1 k2 p1 p2 k3
+    k4 k5 k6)."""
+
+    turn_deg: Fact[tuple[float, float, float]]
+    shift_mm: Fact[tuple[float, float, float]]
+    distortion: Fact[tuple[float, ...]]
+
+    @property
+    def T_colour_depth(self) -> np.ndarray:
+        """(4, 4): the depth camera's frame to the colour camera's."""
+        from scipy.spatial.transform import Rotation
+
+        T_colour_depth = np.eye(4)
+        T_colour_depth[:3, :3] = Rotation.from_rotvec(self.turn_deg.value, degrees=True).as_matrix()
+        T_colour_depth[:3, 3] = np.array(self.shift_mm.value) * MM
+        return T_colour_depth
+
+
 class ModulationFacts(Config):
     """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: amplitude of the
     fundamental by the light's mean. ``wiggling_residual``: what factory calibration and bandwidth leave of square
@@ -275,6 +295,7 @@ class AmcwCamera(CameraFacts):
     kind: Literal["amcw_imager"]
     emitter: EmitterFacts
     scatter: ScatterFacts | None = None
+    colour: ColourFacts | None = None
     modulation: ModulationFacts
     photons: PhotonFacts
     converter: ConverterFacts
