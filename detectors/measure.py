@@ -41,6 +41,9 @@ MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
 """Errors that light between wall and floor leaves, as simulated clouds show beyond their noise: a pixel's share of its
 depth, by which the likelihood trusts it less, and parts of the fitted radius and depth, which their standard errors
 include."""
+MOST_MISFIT = 1.5
+"""Deviation of what the fit leaves from which on the model does not hold: 0.3 to 1.05 on simulated boards of its own
+optics, 1.1 to 3 before lenses that blur otherwise."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
 
@@ -166,7 +169,8 @@ def derivatives(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @dataclass(frozen=True)
 class HoleFit:
-    """``u_px``, ``v_px`` in the patch; ``covariance`` (6, 6) of (u, v, radius, depth, offset, wall), px and metres."""
+    """``u_px``, ``v_px`` in the patch; ``covariance`` (6, 6) of (u, v, radius, depth, offset, wall), px and metres.
+    ``misfit``: deviation of what is left in units of the noise and the model's own error; 0 where neither is known."""
 
     u_px: float
     v_px: float
@@ -176,6 +180,7 @@ class HoleFit:
     wall: float
     covariance: np.ndarray
     converged: bool
+    misfit: float
 
 
 def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
@@ -222,20 +227,21 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     hole, offset = hole_of(q), float(q[4])
     u, v, radius, depth, wall = hole.tolist()
     if whitened is None:
-        covariance = sandwich_covariance(patch, hole, offset)
+        covariance, left = sandwich_covariance(patch, hole, offset), 0.0
     else:
         by = derivatives(patch, hole)[1][:, used]
         rows = whitened(np.stack([*by[:4], np.ones(len(data)), by[4]]).T).T
-        covariance = _likelihood_covariance(patch, hole, rows, misfit(q)[:-1])
-    return HoleFit(u, v, radius, depth, offset, wall, covariance, outcome in (1, 2, 3, 4))
+        left = float((misfit(q)[:-1] ** 2).sum()) / max(len(data) - 6, 1)
+        covariance = _likelihood_covariance(patch, hole, rows, left)
+    return HoleFit(u, v, radius, depth, offset, wall, covariance, outcome in (1, 2, 3, 4), math.sqrt(left))
 
 
-def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray, variance: float) -> np.ndarray:
     """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from whitened derivatives (6, n) by them and
-    misfits (n,): the information's inverse times the misfit's variance, and the model's own errors."""
+    the variance of what is left: the information's inverse times that variance, and the model's own errors."""
     information = rows @ rows.T
     information[5, 5] += WALL_PRIOR[1] ** -2
-    found = np.linalg.pinv(information, hermitian=True) * float(misfit @ misfit) / max(len(misfit) - 6, 1)
+    found = np.linalg.pinv(information, hermitian=True) * variance
     found[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
     found[3, 3] += (DEPTH_ERROR * hole[3]) ** 2
     return np.asarray(found)
@@ -510,7 +516,7 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     h, w = own.shape
     reach = np.pad(grown(own, around.reach_px + 1), 1)
     at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
-    if not (fit.converged and reach[at[0], at[1]]):
+    if not (fit.converged and reach[at[0], at[1]] and fit.misfit < MOST_MISFIT):
         return None, "the model of a blurred hole does not fit"
     if abs(fit.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep

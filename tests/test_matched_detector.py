@@ -155,6 +155,18 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
         assert np.hypot(*(np.array(np.unravel_index(places_found[0].pixels[0], SHAPE)) - (45.2, 60.4))) < 8.0
 
 
+def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None:
+    """A mouth as sharp as no camera with the assumed window shows it, beside the same through that window."""
+    rows, columns = np.indices(SHAPE)
+    sharp = 0.01 * (np.hypot(columns - 60, rows - 45) < 4.0)
+    notes = []
+    for image in (sharp, hole(60, 45, 4.0, 0.01)):
+        cloud = cloud_of(image + 1e-4 * blurred(17))
+        evidence = DETECTOR.analyse(cloud)
+        notes.append(DETECTOR.measure(cloud, evidence, DETECTOR.find(cloud, evidence, 6.0)[0]).model_note)
+    assert "does not fit" in notes[0] and not notes[1]
+
+
 def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
     """Six pixels without a return in a hole whose depth alone is not enough; scattered ones change the noise's highest
     score by less than 0.3, and six that stand alone stay below a threshold."""
