@@ -6,7 +6,6 @@ axis leaves every other point, its seeds and its finished trials as they were.""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -22,7 +21,7 @@ from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
-from harness.vocabulary.files import inside
+from harness.vocabulary.files import file_digest, inside
 from harness.vocabulary.seeds import digest
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
@@ -277,11 +276,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
     """Return a point from its resolved declaration."""
     source = config.source
     if isinstance(source, CaptureSource):
-        files = [
-            [file.name, _file_digest(file, stat.st_size, stat.st_mtime_ns)]
-            for file in recording_of(source).files
-            for stat in [file.stat()]
-        ]
+        files = [[file.name, file_digest(file)] for file in recording_of(source).files]
         camera_name = lens_names().get(source.intrinsics or "")
         named = load_camera(camera_name).lens.to_data() if camera_name else None
         render = frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
@@ -318,10 +313,3 @@ def recording_of(source: CaptureSource) -> Recording:
     lens = lens_named(name) if name and name in lens_names() else None
     file = Path(name) if name and lens is None else None
     return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)
-
-
-@lru_cache(maxsize=100_000)
-def _file_digest(path: Path, size: int, changed_ns: int) -> str:
-    """Return the digest of a file; size and time of change are arguments so that a changed file is read again."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -50,8 +50,8 @@ TRUTH = _columns(
 )
 SHAPE = _columns(
     size_of="what true_diameter_mm is: the diameter, or of long damage its width or length",
-    true_length_mm="length, of round damage the diameter",
-    true_width_mm="width, of round damage the diameter",
+    true_length_mm="length; empty for holes and ball dents",
+    true_width_mm="width, likewise",
     true_angle_deg="angle of the length from the board's x",
 )
 SIZES = _columns(

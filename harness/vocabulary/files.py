@@ -7,6 +7,7 @@ back, and no clock is asked."""
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -16,6 +17,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -293,3 +295,15 @@ def one_at_a_time(path: Path, number: int) -> Iterator[None]:
         with suppress(OSError):  # a file system without locks
             fcntl.lockf(file, fcntl.LOCK_EX, 1, number)
         yield
+
+
+def file_digest(path: Path) -> str:
+    """Return the digest of a file's content; it is read again where its size or its time of change is another."""
+    found = path.stat()
+    return _digest_of(path, found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=100_000)
+def _digest_of(path: Path, size: int, changed_ns: int) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

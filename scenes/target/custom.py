@@ -7,8 +7,6 @@ fields are checked here; what concerns several together (a hole that leaves the 
 
 from __future__ import annotations
 
-import hashlib
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -17,6 +15,7 @@ from pydantic import Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import file_digest
 from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from scenes.target.flaws import AnyFlawConfig, Coordinate, DamageId, FlawConfig, PlaceMm
 
@@ -125,7 +124,7 @@ class MeshConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
     unit: Literal["mm", "cm", "m", "in"] = "mm"
     front: FrontAxis = "+z"
-    content: str = Field("", max_length=16, description="the file's digest; filled in, so that results know the file")
+    content: str = Field("", max_length=32, description="the file's digest; filled in, so that results know the file")
 
     @model_validator(mode="before")
     @classmethod
@@ -133,14 +132,7 @@ class MeshConfig(Config):
         path = Path(str(data.get("file", ""))) if isinstance(data, dict) else Path()
         if not path.is_file() or data.get("content"):
             return data
-        return {**data, "content": _file_digest(path, path.stat().st_size, path.stat().st_mtime_ns)}
-
-
-@lru_cache(maxsize=64)
-def _file_digest(path: Path, size: int, changed_ns: int) -> str:
-    """Return the digest of a file; size and time of change are arguments so that a changed file is read again."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
+        return {**data, "content": file_digest(path)}
 
 
 ShapeConfig = Annotated[

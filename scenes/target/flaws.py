@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
+import cv2
 import numpy as np
 from pydantic import Field
 from scipy.ndimage import gaussian_filter
@@ -275,14 +276,9 @@ def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def outside_m(outline_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of places (n, 2) from a closed polygon (k, 2), 0 inside it (even-odd rule)."""
-    following = np.roll(outline_m, -1, axis=0)
-    x, y = places_m.T[:, :, None]
-    (ax, ay), (bx, by) = outline_m.T, following.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossed = ((ay > y) != (by > y)) & (x < (bx - ax) * (y - ay) / (by - ay) + ax)
-    inside = crossed.sum(axis=1) % 2 == 1
-    return np.where(inside, 0.0, from_line_m(np.vstack([outline_m, outline_m[:1]]), places_m))
+    """Return the distance (n,) of places (n, 2) from a closed polygon (k, 2), negative inside it."""
+    outline = outline_m.astype(np.float32)
+    return np.array([-cv2.pointPolygonTest(outline, (x, y), True) for x, y in places_m.tolist()])
 
 
 def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:

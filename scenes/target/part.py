@@ -9,7 +9,6 @@ and chips, which need a sheet's back or a declared edge."""
 
 from __future__ import annotations
 
-import hashlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,7 +20,7 @@ from scipy.ndimage import map_coordinates
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import bounded_bytes, limited_memory
+from harness.vocabulary.files import bounded_bytes, file_digest, limited_memory
 from harness.vocabulary.geometry import MM
 from scenes.target import custom
 
@@ -86,7 +85,7 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     content = _content(shape.file)
-    if shape.content and hashlib.blake2b(content, digest_size=8).hexdigest() != shape.content:
+    if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
     try:
         with limited_memory():

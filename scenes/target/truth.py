@@ -249,18 +249,9 @@ class Damage:
     raised: bool = False
     outline_board_m: np.ndarray | None = None
     line_board_m: np.ndarray | None = None
-    sides_m: tuple[float, float] | None = None
+    length_m: float = float("nan")
+    width_m: float = float("nan")
     angle_rad: float = 0.0
-
-    @property
-    def length_m(self) -> float:
-        """Length, of round damage the diameter."""
-        return self.diameter_m if self.sides_m is None else self.sides_m[0]
-
-    @property
-    def width_m(self) -> float:
-        """Width, of round damage the diameter."""
-        return self.diameter_m if self.sides_m is None else self.sides_m[1]
 
     @property
     def reach_m(self) -> float:
@@ -288,8 +279,9 @@ class Damage:
         """Return plain data in millimetres, one flat row for JSON or a table."""
         row: dict[str, Any] = {"id": self.id, "kind": self.kind, "diameter_mm": self.diameter_m / MM}
         row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
-        row |= {"length_mm": self.length_m / MM, "width_mm": self.width_m / MM}
-        row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of, "raised": self.raised}
+        if self.outline_board_m is not None:
+            row |= {"length_mm": self.length_m / MM, "width_mm": self.width_m / MM, "raised": self.raised}
+            row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of}
         places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
         for frame, (centre_m, axis) in places.items():
             row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
@@ -358,7 +350,8 @@ def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float, places: tuple[
         raised=raised,
         outline_board_m=border(plan),
         line_board_m=plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None,
-        sides_m=(length_mm * MM, width_mm * MM),
+        length_m=length_mm * MM,
+        width_m=width_mm * MM,
         angle_rad=item.turn_rad,
     )
 
