@@ -68,6 +68,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
     flat = "take this unit's fixed pattern, as harness.flatfield measured it, off each capture"
     add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
+    gauge = "find the boards of this gauge.json (harness.gauge) by their marks, and tell hits and misses: gauge.csv"
+    add("--gauge", type=Path, metavar="FILE.json", help=gauge)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")

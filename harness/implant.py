@@ -40,9 +40,9 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
-    add("--damage", required=True, metavar="KIND", help="through, blind or dent, as an experiment's drawn boards have")
-    add("--diameters", required=True, type=_span, metavar="FROM:TO", help="of the damage, mm")
-    add("--depths", type=_span, metavar="FROM:TO", help="of blind holes and dents, mm")
+    add("--damage", required=True, choices=("through", "blind", "dent"), help="as on the drawn boards of an experiment")
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="of the damage, mm")
+    add("--depths", type=span, metavar="FROM:TO", help="of blind holes and dents, mm")
     add("--thickness", type=float, default=12.7, metavar="MM", help="of the part (default: 12.7)")
     behind = "distance of what stands behind a through-hole, mm, or none (default: 20)"
     add("--backing", default="20", metavar="MM|none", help=behind)
@@ -57,18 +57,17 @@ def _parser() -> argparse.ArgumentParser:
     calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    add("--detector", default="local", help="detector's name (default: local)")
+    add("--detector", default="matched", help="detector's name (default: matched)")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
     add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}")
-    add("--target", type=int, metavar="N", help="with --crop auto: take surface N")
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
-    add("--max-frames", type=int, metavar="N", help="use the first N frames only")
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
     return parser
 
 
-def _span(text: str) -> tuple[float, float]:
+def span(text: str) -> tuple[float, float]:
+    """Return the ends of FROM:TO, for argparse."""
     try:
         low, high = map(float, text.split(":"))
     except ValueError as error:
@@ -95,7 +94,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from scenes.render.scene import load_mitsuba
 
     load_mitsuba()  # before anything loads Open3D, with which LLVM cannot be
-    options.quiet_capture = None  # the recording itself is undamaged
+    options.quiet_capture = options.target = None  # what harness.detect has, and this program has not
     refuse_thresholds(options)
     detector, settings = detector_of(options, options.crop, options.set)
 
@@ -105,10 +104,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
-    some = slice(options.max_frames) if options.max_frames else None
-    scans = [
-        Scan(opened([path], options.intrinsics, unit=options.unit, frames=some), judging) for path in options.paths
-    ]
+    scans = [Scan(opened([path], options.intrinsics, unit=options.unit), judging) for path in options.paths]
     family = _family(options, scans)
     cache = options.out / ".cache" / "renders"
     made = []
@@ -123,7 +119,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     area_m2 = sum(scan.area_m2 for scan in scans)
     said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
     facts = {
-        "implanted": _shares(options, said, found.calmer),
+        "implanted": _shares(options, said),
         "recordings": [str(path) for path in options.paths],
         "camera": options.camera,
         "targets": options.targets,
@@ -194,17 +190,19 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     return settings_of(DrawnTargetConfig, data, "the virtual damage")
 
 
-def _shares(options: argparse.Namespace, said: str, calmer: float) -> list[str]:
+def _shares(options: argparse.Namespace, said: str) -> list[str]:
     """Return sentences on what is measured, what is simulated, and what the limit holds for."""
     return [
         f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
         f"of {options.albedo:g}; noise is added where the damage weakens the light.",
-        f"{100 * calmer:.0f} % of the pixels that damage changes should be quieter than the recording, and are not: "
-        "damage there is a little harder to find than it would be.",
+        "Where damage should make pixels quieter than the recording they keep its noise: it is then a little harder to "
+        "find than it would be.",
         "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "
         "surface and fixed pattern, and its noise where it has few frames: intervals are over places and sizes in this "
         "recording, not over other parts, units or days.",
+        "No damage was placed within the hit radius of a finding in the average of all undamaged frames, so that "
+        "nothing else passes for it.",
         "The undamaged recording is the hole-free board. Where false calls are counted on the frames that set the "
         "threshold, a warning says so.",
     ]

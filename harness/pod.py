@@ -69,9 +69,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
     put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
-    scale = "factor by which the simulation may well be wrong"
-    put("--prior-size", type=float, metavar="FACTOR", help=f"{scale} in size (default: 1.5)")
-    put("--prior-width", type=float, metavar="FACTOR", help=f"{scale} in the width of the rise (default: 2)")
     return parser
 
 
@@ -101,7 +98,7 @@ def _corrected(options: argparse.Namespace, command: str) -> int:
     import json
 
     from harness.evaluation.pod import inspections as table
-    from harness.evaluation.pod.transfer import PRIOR_SIZE, PRIOR_WIDTH, Mapod
+    from harness.evaluation.pod.transfer import Mapod
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
     from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
@@ -116,16 +113,13 @@ def _corrected(options: argparse.Namespace, command: str) -> int:
     if not options.hit or len(options.hit) != 1 or options.unit not in ("", "mm"):
         legal = "--hit COL once, with sizes in mm, as a study's are"
         raise UserError("--prior corrects a curve by hits and misses", legal=legal)
-    factors = (options.prior_size or PRIOR_SIZE, options.prior_width or PRIOR_WIDTH)
-    if not 1.01 <= min(factors) <= max(factors) <= 100:
-        raise UserError(f"--prior-size {factors[0]:g}, --prior-width {factors[1]:g}", legal="factors from 1.01 to 100")
     limit = limit_of(set_up_named(read_record(options.prior), options.set_up))
     read = table.read_inspections(options.file, options.size, options.hit, options.target)
     table.require_positive(read, response=False, why="--prior")
     if read.targets < len(read.size):
         raise UserError(f"{options.file}: targets stand in it more than once", fix="keep one inspection of each target")
     boards = table.texts_of(read, options.board) if options.board else None
-    found = Mapod.of(limit.record.label, limit.statement, limit.why, read, boards, *factors)
+    found = Mapod.of(limit.record.label, limit.statement, limit.why, read, boards)
     show(mapod_parts(found))
     data, picture, page = (options.out / name for name in MAPOD_FILES)
     told = {"results_version": RESULTS_VERSION, "prior": str(options.prior), **found.to_data(), "command": command}
@@ -140,7 +134,7 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     from harness.evaluation.pod import inspections as table
     from harness.evaluation.pod import statement as pod
 
-    for name in ("set_up", "board", "prior_size", "prior_width"):
+    for name in ("set_up", "board"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out")
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"

@@ -33,22 +33,18 @@ BEYOND_PX = 2
 """Pixels beyond the reach of the camera's filter about the damage's rim that may change."""
 AROUND_PX = 8
 """Pixels of the small board beyond those: its rim disturbs both renders alike."""
-CALMER = 0.9
-"""Share of the noise without the damage below which less noise is wanted than the recording has."""
 
 
 @dataclass(frozen=True)
 class Implant:
     """A damage's difference on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change of z, 0 beyond
     the damage's reach. ``noise_m`` (t, h, w): noise to add to frame t, 0 where the light does not grow weaker.
-    ``lost`` (t, h, w) bool: pixels that the damage makes invalid in frame t. ``calmer``: share of the changed pixels
-    whose noise should be less than the recording's, which they keep."""
+    ``lost`` (t, h, w) bool: pixels that the damage makes invalid in frame t."""
 
     region: Region
     shift_m: np.ndarray
     noise_m: np.ndarray
     lost: np.ndarray
-    calmer: float
 
     def put_into(self, frame: Frame, number: int, z_m: np.ndarray, reason: np.ndarray) -> None:
         """Change ``z_m`` and ``reason`` (H, W), copies of those of the recording's frame, in place. Of its pixels those
@@ -125,15 +121,13 @@ def implant_of(
         middle = [np.where(np.isfinite(z), z, mean) for z, mean in zip(smooth, means, strict=True)]
         more = np.sqrt(np.clip(1.0 - spreads[1] / spreads[0], 0.0, 1.0))
         noise_m = more * (drawn[0] - means[0])
-        calm = spreads[0] < CALMER**2 * spreads[1]
     near = _near(units[0], board)
     shift_m = np.where(near, np.nan_to_num(middle[0] - middle[1]), 0.0)
     noise_m = np.where(near, np.nan_to_num(noise_m), 0.0)
     lost = near & np.isnan(drawn[0]) & np.isfinite(drawn[1])
-    calmer = float((calm & near).sum() / max(near.sum(), 1))
     region = units[0].region
     if same:
-        return Implant(region, shift_m, noise_m, lost, calmer)
+        return Implant(region, shift_m, noise_m, lost)
     # the recording was aligned to other pixels: each takes its value between those of the camera that it lies among
     rays = _corners_m(board)
     ends = lens.project(rays)
@@ -146,7 +140,7 @@ def implant_of(
     def moved(image: np.ndarray) -> np.ndarray:
         return np.asarray(ndimage.map_coordinates(image.astype(float), rows_columns, order=1))
 
-    return Implant(onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5, calmer)
+    return Implant(onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5)
 
 
 def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:

@@ -43,6 +43,7 @@ PROGRAMS = [
     "score",
     "export",
     "flatfield",
+    "gauge",
     "implant",
     "target",
     "validate",

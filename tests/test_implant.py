@@ -63,7 +63,7 @@ def test_an_implanted_hole_is_the_hole_that_the_camera_would_have_seen(tmp_path:
     for number, plain in enumerate(bare):
         frame, whole = Frame("", plain[cut], np.zeros(found.shift_m.shape, np.uint8)), plain[cut].copy()
         reason = frame.reason.copy()
-        part = Implant(Region(0, whole.shape[0], 0, whole.shape[1]), found.shift_m, found.noise_m, found.lost, 0.0)
+        part = Implant(Region(0, whole.shape[0], 0, whole.shape[1]), found.shift_m, found.noise_m, found.lost)
         part.put_into(frame, number, whole, reason)
         assert np.array_equal(np.isnan(whole), (reason != Reason.VALID) | np.isnan(frame.z_m))
         z_m, valid = z_m + np.nan_to_num(whole), valid + np.isfinite(whole)

@@ -15,7 +15,7 @@ from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.design import curve_through, place_sizes
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import state_hits
-from harness.evaluation.pod.transfer import PRIOR_SIZE, PRIOR_WIDTH, Mapod, Transfer
+from harness.evaluation.pod.transfer import Mapod, Transfer
 from harness.evaluation.study.record import record_text
 
 
@@ -46,7 +46,7 @@ def test_many_real_targets_overrule_the_simulation(log_size: bool):
     last = found.steps()[-1]
     assert last.a50 == pytest.approx(truth.size_at(0.5), rel=0.1)
     assert last.a90 == pytest.approx(truth.size_at(0.9), rel=0.1)
-    assert found.agreement(with_prior=False) < 0.01 < found.agreement(with_prior=True)
+    assert found.agreement() < 0.01
 
 
 def test_without_real_targets_the_prior_remains():
@@ -60,10 +60,7 @@ def test_agreement_is_as_rare_as_it_says():
     """P-values of campaigns whose truth is the simulated curve: 5 % and fewer lie below 0.05 (binomial, 3 sigma)."""
     curve, size = simulated(), np.linspace(2.0, 12.0, 20)
     random = np.random.default_rng(3)
-    below = sum(
-        campaign(size, random.random(20) < curve.pod(size), curve).agreement(with_prior=False, seed=seed) < 0.05
-        for seed in range(10)
-    )
+    below = sum(campaign(size, random.random(20) < curve.pod(size), curve).agreement(seed) < 0.05 for seed in range(10))
     assert below <= 4
 
 
@@ -78,7 +75,7 @@ def test_the_limit_covers_the_truth_whatever_the_camera(k: float, w: float, leas
     for _ in range(120):
         hit = (random.random(30) < truth.pod(size)).astype(float)
         read = Inspections(Path("campaign"), "size", "hit", size, hit, None, np.arange(30))
-        found = Mapod.of("one", replace(statement_of(curve), curve=curve), "", read, None, PRIOR_SIZE, PRIOR_WIDTH)
+        found = Mapod.of("one", replace(statement_of(curve), curve=curve), "", read)
         covered.append(found.a90_95 >= truth.size_at(0.9))
         if found.measured is not None:
             shorter.append(found.steps[-1].a90_95 / found.measured.bound.value)

@@ -84,6 +84,13 @@ class Scan:
         middle = places.min(axis=0) / 2 + places.max(axis=0) / 2
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
         self.size_m: np.ndarray = np.ptp(places, axis=0)
+        # what is found in the undamaged recording is no place for damage, which it would pass for
+        detector, threshold = detector_of(judging.detector, judging.settings_json), judging.threshold
+        found = detector.find(self.whole, evidence, threshold or judging.threshold_of(self.whole)[0])
+        rays = np.array([each.centre_m for each in found]).reshape(-1, 3)
+        met = rays * ((self.T_camera_board[:3, 3] @ normal) / (rays @ normal))[:, None]
+        self.taken_m = transform_points(invert(self.T_camera_board), met)[:, :2]
+        self.free_m = judging.radius_m
 
     @cached_property
     def rays(self) -> np.ndarray:
@@ -116,7 +123,10 @@ class Scan:
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the point (3,) of the surface in the camera's frame above a place of the plane, and the unit normal
-        (3,) to the camera there; None where less than ``rim_px`` of judged surface lie around it."""
+        (3,) to the camera there; None where less than ``rim_px`` of judged surface lie around it, or where the
+        undamaged recording has a finding within the hit radius."""
+        if (np.linalg.norm(self.taken_m - [x_m, y_m], axis=1) < self.free_m).any():
+            return None
         point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
         u, v = self.lens.project(point)
         row, column = round(float(v)), round(float(u))
@@ -209,13 +219,11 @@ def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: 
 
 @dataclass(frozen=True, eq=False)
 class JudgedScans:
-    """The study's tables and records, one set-up for each number of frames; ``warnings``: full sentences;
-    ``calmer``: share of the changed pixels that keep more noise than the damage would leave."""
+    """The study's tables and records, one set-up for each number of frames; ``warnings``: full sentences."""
 
     tables: ResultTables
     set_ups: tuple[SetUpRecord, ...]
     warnings: tuple[str, ...]
-    calmer: float
 
 
 def judge_scans(
@@ -279,8 +287,7 @@ def judge_scans(
                 **judged_facts(holes, runs),
             )
         )
-    calmer = [implant.calmer for placement in made for implant in placement.implants]
-    return JudgedScans(tables, tuple(set_ups), tuple(warnings), float(np.mean(calmer)))
+    return JudgedScans(tables, tuple(set_ups), tuple(warnings))
 
 
 def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]) -> None:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
     from detectors.views import PreparedView, View
+    from harness.inspection.gauge import GaugeSeen
     from harness.report.findings import Judged
     from harness.vocabulary.geometry import Cloud
 
@@ -182,6 +183,7 @@ class Inspection:
     result: Judged
     threshold: float
     origin: str
+    seen: GaugeSeen | None
 
     @property
     def cell_m(self) -> float | None:
@@ -197,6 +199,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     """
     from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
+    from harness.inspection.gauge import read_gauge, seen_on
 
     config = mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
@@ -204,6 +207,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     refuse_thresholds(arguments)
     own_settings = [each for each in arguments.set if config is None or not each.startswith(PREFIX)]
     detector, settings = detector_of(arguments, "none" if config else arguments.crop, own_settings)
+    gauge = read_gauge(arguments.gauge) if arguments.gauge else None
     field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
     guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
@@ -241,9 +245,11 @@ def inspect(arguments: argparse.Namespace) -> int:
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = result if mapped else with_faint_told(result, threshold)
+    seen = seen_on(gauge, result) if gauge else None
     run = Inspection(
-        arguments, recordings, choices, config, mapped, registrations, detector, settings, result, threshold, origin
-    )
+        arguments, recordings, choices, config, mapped, registrations, detector, settings, result, threshold, origin,
+        seen,
+    )  # fmt: skip
     _print(run)
     if arguments.out is not None:
         _write(run, _facts(run, [*recordings, *quiet]))
@@ -399,7 +405,8 @@ def _print(run: Inspection) -> None:
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
     # of several views the doubts about their targets were told before they were registered
     doubts = choice.warnings if run.mapped is None and choice else ()
-    told.print_warnings((*recorded, *doubts, *evidence.warnings))
+    of_gauge = run.seen.warnings if run.seen else ()
+    told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
     kept = np.isfinite(evidence.residual_m)
     if run.mapped is None:
         told.print_choice(choice)
@@ -419,6 +426,13 @@ def _print(run: Inspection) -> None:
         print(run.result.missing.blind_text)
     print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
     told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
+    if run.seen is not None:
+        from harness.inspection.gauge import HITS_AND_MISSES
+        from harness.tables.text import show
+
+        told.print_notes(run.seen.notes)
+        show([HITS_AND_MISSES.grid(run.seen.rows, terminal=True)])
+        print(run.seen.answer)
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -444,7 +458,7 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     settings["detector"] = {"name": run.detector.name, "version": run.detector.version, "settings": run.settings}
     paths = [path for recording in recordings for path in recording.files]
     files = []
-    for path in (*paths, *filter(None, [arguments.poses, arguments.flat_field])):
+    for path in (*paths, *filter(None, [arguments.poses, arguments.flat_field, arguments.gauge])):
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
     scale_mm = evidence.scale_m / MM
@@ -470,6 +484,12 @@ def _write(run: Inspection, facts: dict[str, Any]) -> None:
     count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
+    if run.seen is not None:
+        from harness.inspection.gauge import csv_text
+        from harness.tables.outputs import GAUGE_ROWS
+
+        rows = run.seen.rows
+        beside[GAUGE_ROWS.name] = lambda path: path.write_text(csv_text(rows), encoding="utf-8")
     if mapped is None:
         beside |= told.pictures(run.choices[0])
     else:

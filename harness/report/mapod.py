@@ -8,21 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.evaluation.pod.statement import POD
-from harness.evaluation.pod.transfer import ENOUGH, FREEDOM, BoardStep, Mapod
-from harness.report.blocks import (
-    BLUE,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
-    bullets,
-    command_of,
-    figure,
-    heading,
-    page,
-    save_png,
-    svg,
-)
+from harness.evaluation.pod.transfer import ENOUGH, FREEDOM, PRIOR_SIZE, PRIOR_WIDTH, Mapod
+from harness.report import blocks
+from harness.report.blocks import BLUE, GREY, ORANGE, PURPLE, RED
 from harness.report.pod import VALIDITY, draw_hits, hits_in_view, sized
 from harness.tables.schema import Column, Table
 from harness.tables.text import Grid
@@ -75,25 +63,18 @@ def sizes_grid(found: Mapod) -> Grid:
     return Grid.of(("", "a50 (mm)", "a90 (mm)", "a90/95 (mm)", "from"), rows, left=1)
 
 
-def boards_grid(found: Mapod) -> Grid:
-    """One row for each board, with what the stop rule says."""
-    return BOARDS.grid(found.steps)
-
-
 def notes(found: Mapod) -> list[str]:
     """Sentences on prior, tests and stop rule."""
-    prior = found.transfer
     said = [
         "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
         f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
-        f"degrees of freedom, with scales of a factor {prior.prior_size:g} in k and {prior.prior_width:g} in w, and "
+        f"degrees of freedom, with scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, and "
         "the simulated curve's own uncertainty.",
         "Combined: medians of the posterior, and for a90/95 its 95 % quantile, a credible limit. Over simulations that "
         "are wrong as the prior says it covers the truth in 95 % of campaigns, with one that is far too optimistic in "
         "fewer: where the simulation is contradicted, the larger of the combined and the measured limit counts.",
         "Were the simulated curve right, hits and misses as far from it as these would come with probability "
-        f"{found.agrees:.2g}; with a transfer function of the prior's kind {found.covered:.2g}. Below 0.05 the first "
-        "is a contradiction, and the second says that the prior is too narrow: widen it (--prior-size, --prior-width).",
+        f"{found.agrees:.2g}; below 0.05 that is a contradiction.",
         f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
     ]
     return [*said, *found.read.notes, VALIDITY]
@@ -102,8 +83,8 @@ def notes(found: Mapod) -> list[str]:
 def mapod_parts(found: Mapod) -> list[str | Grid]:
     """Return what a terminal shows; what makes the limit doubtful comes first."""
     warning = ["warning: the real hits and misses contradict the simulation"] if found.contradicted else []
-    return [*warning, sizes_grid(found), "", boards_grid(found), "", *(f"note: {one}" for one in notes(found)), "",
-            answer(found)]  # fmt: skip
+    told = [f"note: {one}" for one in notes(found)]
+    return [*warning, sizes_grid(found), "", BOARDS.grid(found.steps), "", *told, "", answer(found)]
 
 
 def mapod_html(found: Mapod, command: str) -> str:
@@ -112,16 +93,20 @@ def mapod_html(found: Mapod, command: str) -> str:
         "Left: the simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one "
         "with its 90 % credible band. Right: what is known after each board."
     )
-    drawn = svg("mapod", SIZE_IN, answer(found), _drawing(found))
-    body = [heading("Simulated, measured, combined"), sizes_grid(found).html()]
-    body += [figure({"mapod": drawn}, "mapod", caption), heading("After each board"), boards_grid(found).html()]
-    body += [heading("Notes"), bullets(notes(found)), *command_of(command)]
-    return page(f"Model-assisted probability of detection: {found.read.path.name}", answer(found), body)
+    drawn = blocks.svg("mapod", SIZE_IN, answer(found), _drawing(found))
+    body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
+    body += [
+        blocks.figure({"mapod": drawn}, "mapod", caption),
+        blocks.heading("After each board"),
+        BOARDS.grid(found.steps).html(),
+    ]
+    body += [blocks.heading("Notes"), blocks.bullets(notes(found)), *blocks.command_of(command)]
+    return blocks.page(f"Model-assisted probability of detection: {found.read.path.name}", answer(found), body)
 
 
 def save_mapod_png(path: Path, found: Mapod) -> None:
     """The figure as a PNG at ``path``."""
-    save_png(path, SIZE_IN, _drawing(found))
+    blocks.save_png(path, SIZE_IN, _drawing(found))
 
 
 def _drawing(found: Mapod) -> Callable[[Figure], None]:
@@ -144,13 +129,9 @@ def _drawing(found: Mapod) -> Callable[[Figure], None]:
         at = np.arange(len(found.steps))
         boards.plot(at, [step.a90 for step in found.steps], "o-", color=BLUE, label="a90")
         boards.plot(at, [step.a90_95 for step in found.steps], "v-", color=RED, label="a90/95")
-        boards.set_xticks(at, [_named(step) for step in found.steps])
+        boards.set_xticks(at, [f"{step.board}\n{step.hits}/{step.targets}" for step in found.steps])
         boards.set(xlabel="after board", ylabel="size (mm)", ylim=(0, None))
         for axes in (curves, boards):
             axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=3, borderaxespad=0)
 
     return draw
-
-
-def _named(step: BoardStep) -> str:
-    return f"{step.board}\n{step.hits}/{step.targets}"

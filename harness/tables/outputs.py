@@ -42,10 +42,11 @@ FINDINGS_DATA = Output(
 ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
 TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture", "capture")
 BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
+GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
 CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
 FILES = (
     REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
-    ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, CLOUD,
+    ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"
 LATEST = "latest"

@@ -29,7 +29,7 @@ from harness.vocabulary.seeds import random_stream
 
 FREEDOM = 3.0
 PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
-"""Default scales: factors by which a simulation may well be wrong in size and in the width of the rise."""
+"""Scales of the prior: factors by which a simulation may well be wrong in size and in the width of the rise."""
 REACH, NODES = 8.0, (241, 61)
 """Half the grid's side in scales, and its nodes along ln k and ln w."""
 DRAWS = 999
@@ -58,15 +58,13 @@ class BoardStep:
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """A simulated ``curve``, the real inspections' ``size`` (n,), ``hit`` (n,) bool and ``board`` (n,) names, and the
-    prior's scales of k and w, both above 1. Sizes are in the simulation's unit."""
+    """A simulated ``curve``, and the real inspections' ``size`` (n,), ``hit`` (n,) bool and ``board`` (n,) names. Sizes
+    are in the simulation's unit."""
 
     curve: PodCurve
     size: np.ndarray
     hit: np.ndarray
     board: np.ndarray
-    prior_size: float = PRIOR_SIZE
-    prior_width: float = PRIOR_WIDTH
 
     def __post_init__(self) -> None:
         if not self.curve.size_at(0.5) > 0:
@@ -86,7 +84,7 @@ class Transfer:
     @cached_property
     def scale(self) -> np.ndarray:
         """(2, 2) scale matrix of the prior of ln k, ln w."""
-        return np.diag([np.log(self.prior_size) ** 2, np.log(self.prior_width) ** 2]) + self.own_covariance
+        return np.diag([np.log(PRIOR_SIZE) ** 2, np.log(PRIOR_WIDTH) ** 2]) + self.own_covariance
 
     @cached_property
     def grid(self) -> np.ndarray:
@@ -152,22 +150,17 @@ class Transfer:
         )
         return middle, low, high
 
-    def agreement(self, *, with_prior: bool, seed: int = 1) -> float:
-        """Return the probability, were the simulated curve right (``with_prior``: but for a transfer function drawn
-        from the prior), of real hits and misses as far from it as these or farther. The statistic is the ratio of the
-        largest likelihood over the grid to the mean one over the curves that the hypothesis allows; its distribution
-        is simulated at the same sizes."""
+    def agreement(self, seed: int = 1) -> float:
+        """Return the probability, were the simulated curve right, of real hits and misses as far from it as these or
+        farther. The statistic is the ratio of the largest likelihood over the grid to the mean one over the curves that
+        the study's own uncertainty allows; its distribution is simulated at the same sizes."""
         found, missed = self.logs
-        if with_prior:
-            weight = self.prior
-        else:
-            spread = self.own_covariance + np.diag(np.diff(self.grid, axis=0).max(axis=0) ** 2 / 12)
-            density = stats.multivariate_normal(np.zeros(2), spread).pdf(self.grid)
-            weight = density / density.sum()
-        stream = random_stream(seed, "agreement", int(with_prior), len(self.size))
+        spread = self.own_covariance + np.diag(np.diff(self.grid, axis=0).max(axis=0) ** 2 / 12)
+        weight = stats.multivariate_normal(np.zeros(2), spread).pdf(self.grid)
+        weight /= weight.sum()
+        stream = random_stream(seed, "agreement", len(self.size))
         nodes = stream.choice(len(weight), DRAWS, p=weight)
-        drawn = stream.random((DRAWS, len(self.size))) < np.exp(found[nodes])
-        campaigns = np.vstack([self.hit, drawn])
+        campaigns = np.vstack([self.hit, stream.random((DRAWS, len(self.size))) < np.exp(found[nodes])])
         statistic = []
         for some in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
             value = some @ found.T + ~some @ missed.T
@@ -192,8 +185,7 @@ DISAGREES = 0.05
 class Mapod:
     """A study's curve beside real hits and misses and the combination of both. ``set_up``: the study's, by name;
     ``measured``: the real ones alone, None where no curve fits them, ``why``. ``steps``: what is known after each
-    board, before any first. ``agrees``: probability of data as far from the simulated curve as these, were it right;
-    ``covered``: the same, were it right but for a transfer function of the prior's kind."""
+    board, before any first. ``agrees``: probability of data as far from the simulated curve as these, were it right."""
 
     set_up: str
     simulated: PodStatement
@@ -203,20 +195,12 @@ class Mapod:
     transfer: Transfer
     steps: tuple[BoardStep, ...]
     agrees: float
-    covered: float
 
     @classmethod
     def of(
-        cls,
-        set_up: str,
-        simulated: PodStatement | None,
-        why: str,
-        read: Inspections,
-        boards: np.ndarray | None,
-        prior_size: float,
-        prior_width: float,
+        cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None
     ) -> Mapod:
-        """Correct a study's curve. Raises UserError where the study has no curve."""
+        """Correct a study's curve. Raises UserError where the study has no curve, and says ``why``."""
         if simulated is None:
             raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another one with --set-up")
         measured, none = None, ""
@@ -225,9 +209,8 @@ class Mapod:
         except UserError as error:
             none = error.message
         names = np.full(len(read.size), "all") if boards is None else boards
-        transfer = Transfer(simulated.curve, read.size, read.response == 1, names, prior_size, prior_width)
-        p_values = transfer.agreement(with_prior=False), transfer.agreement(with_prior=True)
-        return cls(set_up, simulated, read, measured, none, transfer, transfer.steps(), *p_values)
+        transfer = Transfer(simulated.curve, read.size, read.response == 1, names)
+        return cls(set_up, simulated, read, measured, none, transfer, transfer.steps(), transfer.agreement())
 
     @property
     def contradicted(self) -> bool:
@@ -255,13 +238,12 @@ class Mapod:
         return {
             "set_up": self.set_up,
             "file": str(self.read.path),
-            "prior": {"size": self.transfer.prior_size, "width": self.transfer.prior_width, "freedom": FREEDOM},
+            "prior": {"size": PRIOR_SIZE, "width": PRIOR_WIDTH, "freedom": FREEDOM},
             "simulated": self.simulated.to_data(),
             "measured": None if self.measured is None else self.measured.to_data(),
             "no_measured_curve": self.why,
             "after_each_board": [{**asdict(step), "enough": step.enough} for step in self.steps],
             "p_simulation_right": self.agrees,
-            "p_prior_covers": self.covered,
             "a90_95": finite(self.a90_95),
             "combined": {"size": self.sizes.tolist(), "pod": middle.tolist(), "p5": low.tolist(), "p95": high.tolist()},
         }

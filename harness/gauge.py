@@ -1,0 +1,161 @@
+"""``python -m harness.gauge``: a board with holes to check a detection limit with, as a drilling template and truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from harness.evaluation.pod.curve import PodCurve
+    from harness.inspection.gauge import Gauge
+
+DICTIONARY, CODES = "DICT_6X6_50", 50
+MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
+"""Side of a mark, step of the drills that there are, and the seed of which size goes where."""
+CLEAR_MM = 6.0
+"""White around a mark, without which a code cannot be read, and between marks and holes."""
+HIT_SHARE = 0.4
+"""Hit radius as a share of the distance between holes, so that no finding can count for two."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.gauge " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.gauge",
+        description="Design gauge boards: how many holes of which sizes, as harness.design plans them, on boards with "
+        "coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each board, and gauge.json, "
+        "the truth that harness.detect --gauge reads.",
+        epilog="example: python -m harness.gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
+        "gauge, then drill, record, and python -m harness.detect captures/gauge --gauge gauge/gauge.json --out found",
+    )
+    from harness.implant import span
+
+    add = parser.add_argument
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of the drills, mm")
+    add("--depths", type=span, metavar="FROM:TO", help="of blind holes, mm (default: all go through)")
+    add("--study", type=Path, metavar="DIR", help="plan by the curve of this study, simulated or implanted")
+    add("--set-up", metavar="NAME", help='which of its set-ups: "50 frames"')
+    add("--a50", type=float, metavar="MM", help="plan by this guess: found half the time")
+    add("--a90", type=float, metavar="MM", help="and found nine times of ten")
+    add("--targets", type=int, default=36, metavar="N", help="holes in all (default: 36)")
+    add("--board", default="270x175", metavar="WxH", help="size of a board, mm (default: 270x175, one sheet of A4)")
+    add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")
+    add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
+    add("--out", type=Path, required=True, metavar="DIR", help="template.pdf, board-N.svg and gauge.json")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.evaluation.pod import design as plan
+    from harness.inspection.gauge import GAUGE_VERSION
+    from harness.report.gauge import template_pdf, template_svg, tiles_of
+    from harness.vocabulary.files import write_bytes, write_text
+
+    low, high = options.diameters
+    if not DRILLS_MM <= low < high:
+        raise UserError(f"--diameters {low:g}:{high:g}", legal=f"FROM < TO, and FROM at least {DRILLS_MM:g}")
+    if not 10 <= options.targets <= 600:
+        raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
+    plans = plan.design(_curve(options), [options.targets], (low, high), studies=100, seed=SEED)
+    chosen = plan.recommend(plans).plan
+    gauge = _laid_out(options, chosen.sizes)
+    text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
+    write_text(options.out / "gauge.json", text + "\n")
+    write_bytes(options.out / "template.pdf", template_pdf(gauge.boards, DICTIONARY, options.paper))
+    for board in gauge.boards:
+        write_bytes(options.out / f"{board.name}.svg", template_svg(board, DICTIONARY))
+    first = gauge.boards[0]
+    sheets = len(tiles_of(first.width_mm, first.height_mm, options.paper)[1])
+    expected = "no a90/95" if chosen.bound == float("inf") else f"a90/95 of about {chosen.bound:.3g} mm"
+    print(f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for each: {sheets}")
+    print(f"real hits and misses alone would show {expected}; harness.pod --prior says what they add to a study")
+    print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
+    print(f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json: print at 100 %, check the bar")
+    return 0
+
+
+def _curve(options: argparse.Namespace) -> PodCurve:
+    """Return the curve to plan by. Raises UserError where it is told twice or not at all."""
+    from harness.evaluation.pod.design import curve_through
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record, set_up_named
+
+    guessed = options.a50 is not None and options.a90 is not None
+    if guessed == (options.study is not None):
+        raise UserError("which holes? the curve to plan by is told once", legal="--study DIR, or --a50 MM --a90 MM")
+    if guessed:
+        return curve_through(options.a50, options.a90)
+    limit = limit_of(set_up_named(read_record(options.study), options.set_up))
+    if limit.statement is None:
+        raise UserError(f"{options.study}: has no curve: {limit.why}", fix="guess one with --a50 and --a90")
+    return limit.statement.curve
+
+
+def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
+    """Return boards with these holes: as many boards as hold them, sizes spread over all boards, in random order."""
+    import numpy as np
+
+    from harness.inspection.gauge import Gauge, GaugeBoard, GaugeHole, GaugeMark
+    from harness.vocabulary.seeds import random_stream
+
+    try:
+        width, height = map(float, options.board.lower().split("x"))
+    except ValueError as error:
+        raise UserError(f"--board {options.board}: is no size", legal="WIDTHxHEIGHT in mm: 270x175") from error
+    side, apart = MARK_MM, options.apart
+    if not 0 < options.diameters[1] < apart - 4:
+        raise UserError(
+            f"--apart {apart:g}: holes of {options.diameters[1]:g} mm meet", legal="their diameter and 5 more"
+        )
+    inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
+    corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
+    rim = options.diameters[1] / 2 + CLEAR_MM + 4
+    room = [size - 2 * rim for size in (width, height)]
+    xs, ys = (np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist() for size in room)
+    clear = side / 2 + rim - 4
+    places = [
+        (x, y) for y in ys for x in xs if all(max(abs(x - cx), abs(y - cy)) >= clear for cx, cy in corners.tolist())
+    ]
+    count = -(-len(sizes) // max(len(places), 1))
+    if not places or min(*inset, *room) <= side or 4 * count > CODES:
+        fix = "a larger --board, a smaller --apart, or fewer --targets"
+        raise UserError(f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix)
+    drilled = np.round(sizes / DRILLS_MM) * DRILLS_MM
+    boards = []
+    for number in range(count):
+        stream = random_stream(SEED, "gauge board", number)
+        own = drilled[number::count]
+        chosen = stream.permutation(len(places))[: len(own)]
+        deep: list[float | None] = [None] * len(own)
+        if options.depths:
+            parts = (stream.permutation(len(own)) + 0.5) / len(own)
+            deep = np.round(options.depths[0] + parts * (options.depths[1] - options.depths[0]), 1).tolist()
+        holes = tuple(
+            GaugeHole(id=k + 1, diameter_mm=float(own[k]), depth_mm=deep[k], x_mm=places[at][0], y_mm=places[at][1])
+            for k, at in enumerate(chosen.tolist())
+        )
+        marks = tuple(
+            GaugeMark(code=4 * number + k, x_mm=x, y_mm=y, side_mm=side) for k, (x, y) in enumerate(corners.tolist())
+        )
+        boards.append(
+            GaugeBoard(name=f"board-{number + 1}", width_mm=width, height_mm=height, marks=marks, holes=holes)
+        )
+    return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * apart, boards=tuple(boards))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

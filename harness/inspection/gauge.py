@@ -1,0 +1,209 @@
+"""A gauge board: its declaration, where a capture shows it by its coded marks, and which of its holes were found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from harness.evaluation.match import match
+from harness.tables.outputs import GAUGE_ROWS
+from harness.tables.schema import Column, Table
+from harness.vocabulary.config import Config
+from harness.vocabulary.declaration.diagnose import settings_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.geometry import MM, invert, transform_points
+from harness.vocabulary.provenance import check_version
+
+if TYPE_CHECKING:
+    from harness.report.findings import Judged
+
+GAUGE_VERSION = 1
+FEWEST_MARKS = 3
+WORST_FIT_MM = 2.0
+"""Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
+Length = Annotated[float, Field(gt=0, le=5e3)]
+Place = Annotated[float, Field(ge=-5e3, le=5e3)]
+
+
+class GaugeMark(Config):
+    """A printed code: its number, its centre on the board, and the side of its black square."""
+
+    code: Annotated[int, Field(ge=0, le=999)]
+    x_mm: Place
+    y_mm: Place
+    side_mm: Length
+
+
+class GaugeHole(Config):
+    """A hole to drill: its centre on the board, and its depth, None where it goes through."""
+
+    id: Annotated[int, Field(ge=1)]
+    diameter_mm: Length
+    depth_mm: Length | None = None
+    x_mm: Place
+    y_mm: Place
+
+
+class GaugeBoard(Config):
+    """One board: x to the right and y up from its centre, seen from the printed side."""
+
+    name: Annotated[str, Field(min_length=1)]
+    width_mm: Length
+    height_mm: Length
+    marks: tuple[GaugeMark, ...]
+    holes: Annotated[tuple[GaugeHole, ...], Field(min_length=1)]
+
+
+class Gauge(Config):
+    """All boards, the dictionary of their codes (OpenCV's name), and how near a finding is a hit."""
+
+    dictionary: str
+    hit_radius_mm: Length
+    boards: Annotated[tuple[GaugeBoard, ...], Field(min_length=1)]
+
+
+def read_gauge(path: Path) -> Gauge:
+    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is none."""
+    legal = "the gauge.json that python -m harness.gauge wrote"
+    try:
+        data = strict_json(bounded_bytes(path, RECORD_BYTES))
+    except (OSError, ValueError) as error:
+        raise UserError(f"--gauge {path}: cannot be read ({error})", legal=legal) from error
+    if not isinstance(data, dict) or "gauge_version" not in data:
+        raise UserError(f"--gauge {path}: is no truth file of a gauge", legal=legal)
+    check_version(data.pop("gauge_version"), GAUGE_VERSION, path, "a gauge")
+    return settings_of(Gauge, data, f"--gauge {path}")
+
+
+@dataclass(frozen=True)
+class GaugeRow:
+    """One hole of a board in a capture. ``found``: "hit", "miss", or "NA" where the detector judged nothing within the
+    hit radius; ``offset_mm`` and ``score`` of the finding that hit it, None of others."""
+
+    board: str
+    hole: GaugeHole
+    found: Literal["hit", "miss", "NA"]
+    offset_mm: float | None
+    score: float | None
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+HITS_AND_MISSES = Table(
+    GAUGE_ROWS.name.removesuffix(".csv"),
+    "one row per hole of a gauge board: what harness.pod reads",
+    (
+        Column("board", "board", "board", "name of the board"),
+        Column("target", "hole", lambda row: f"{row.board}:{row.hole.id}", "board and number of the hole"),
+        Column("diameter_mm", "diameter (mm)", "hole.diameter_mm", "of the drill"),
+        Column("depth_mm", "depth (mm)", "hole.depth_mm", "none where it goes through", text=_number),
+        Column("found", "found", "found", "hit, miss, or NA where nothing was judged", text=str),
+        Column("offset_mm", "offset (mm)", "offset_mm", "of the finding's centre from the hole's", text=_number),
+        Column("score", "score", "score", "of that finding", text=_number),
+    ),
+    formats=("csv",),
+)
+
+
+@dataclass(frozen=True)
+class GaugeSeen:
+    """The boards that a capture shows. ``false_calls``: findings on them that hit no hole and lie on no mark."""
+
+    rows: tuple[GaugeRow, ...]
+    false_calls: int
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def answer(self) -> str:
+        """The counts in a sentence."""
+        count = {state: sum(row.found == state for row in self.rows) for state in ("hit", "miss", "NA")}
+        return (
+            f"gauge: {count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged, "
+            f"{self.false_calls} false calls"
+        )
+
+
+def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
+    """Find the boards in a judged capture by their marks, and match findings to their holes. Raises UserError where no
+    board shows three marks."""
+    from dataclasses import replace
+
+    from detectors.marks.find import find_marks
+    from detectors.marks.mark import CodedMarks
+    from detectors.marks.pairing import kabsch
+
+    cloud = judged.cloud
+    if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
+        known = cloud.amplitude[np.isfinite(cloud.amplitude)]
+        scaled = 255 * np.nan_to_num(cloud.amplitude) / max(float(np.quantile(known, 0.99)) if known.size else 0, 1e-9)
+        cloud = replace(cloud, rgb=np.repeat(np.clip(scaled, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
+    found = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
+    by_code = {mark.code: mark for mark in found.trusted}
+    rows: list[GaugeRow] = []
+    warnings, notes, calls = [], [], 0
+    for board in gauge.boards:
+        marks = [mark for mark in board.marks if mark.code in by_code]
+        if len(marks) < FEWEST_MARKS:
+            continue
+        on_board = np.array([(mark.x_mm, mark.y_mm, 0.0) for mark in marks]) * MM
+        in_camera = np.array([by_code[mark.code].centre_m for mark in marks])
+        T_camera_board = kabsch(on_board, in_camera, np.ones(len(marks)))
+        apart_m = np.linalg.norm(transform_points(T_camera_board, on_board) - in_camera, axis=-1)
+        fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
+        notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm from where the board has them")
+        if fit_mm > WORST_FIT_MM:
+            warnings.append(
+                f"{board.name}: its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
+            )
+        own, beside = _matched(board, gauge.hit_radius_mm * MM, judged, invert(T_camera_board))
+        rows += own
+        calls += beside
+    if not rows:
+        why = found.problem or f"{len(by_code)} codes are read, and no board has three of them"
+        fix = "show the whole board, nearer to the camera, in the picture that is recorded beside the depth"
+        raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
+    return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))
+
+
+def _matched(
+    board: GaugeBoard, radius_m: float, judged: Judged, T_board_camera: np.ndarray
+) -> tuple[list[GaugeRow], int]:
+    """Return the rows of a board's holes, and how many findings on the board are false calls."""
+
+    def on_face(points_m: np.ndarray) -> np.ndarray:
+        """Return (n, 2): the board's face where lines of sight through points (n, 3) in the camera's frame meet it."""
+        points, lens = transform_points(T_board_camera, points_m.reshape(-1, 3)), T_board_camera[:3, 3]
+        return np.asarray((lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2])
+
+    places = on_face(np.array([each.centre_m for each in judged.detections]))
+    centres = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes]) * MM
+    pairs = match(centres, places, radius_m)
+    score, points = judged.evidence.score, judged.cloud.points_m
+    seen = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
+    rows = []
+    for number, (hole, centre) in enumerate(zip(board.holes, centres, strict=True)):
+        if number in pairs:
+            finding = judged.detections[pairs[number]]
+            offset_mm = float(np.linalg.norm(places[pairs[number]] - centre)) / MM
+            rows.append(GaugeRow(board.name, hole, "hit", offset_mm, finding.score))
+        else:
+            was_judged = (np.linalg.norm(seen - centre, axis=-1) < radius_m).any()
+            rows.append(GaugeRow(board.name, hole, "miss" if was_judged else "NA", None, None))
+    inside = (np.abs(places) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(axis=-1)
+    for mark in board.marks:
+        inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)
+    return rows, int(inside.sum()) - sum(bool(inside[finding]) for finding in pairs.values())
+
+
+def csv_text(rows: Sequence[GaugeRow]) -> str:
+    """Return the table as harness.pod reads it."""
+    return str(HITS_AND_MISSES.frame(rows).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
