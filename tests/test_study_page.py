@@ -34,7 +34,7 @@ SECTIONS = [
     "Detection limits",
     "Probability of detection",
     "Limits against what was varied",
-    "Diameter and depth",
+    "Size and depth",
     "False calls and chance hits",
     "Signal against size",
     "Operating curves",
@@ -248,7 +248,7 @@ def test_validity_is_the_results_own(whole: StudyResult, page: str) -> None:
 
 def test_where_nothing_is_found_the_page_says_so() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0))))
-    left_out = ("Limits against what was varied", "Diameter and depth")
+    left_out = ("Limits against what was varied", "Size and depth")
     assert headings(page) == [name for name in SECTIONS if name not in left_out]
     assert "a90/95 is not demonstrated: every target was missed" in words(page)
     assert "–" in section(page, "The thesis' holes")
@@ -275,7 +275,7 @@ def test_the_depths_that_are_drawn_stand_in_their_file(whole: StudyResult) -> No
 
 def test_depths_without_a_surface_say_why() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0), depths_mm=(2.0, 10.0))))
-    assert "No surface: every damage fared alike" in section(page, "Diameter and depth")
+    assert "No surface: every damage fared alike" in section(page, "Size and depth")
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +296,7 @@ def test_no_number_on_the_page_lies_beyond_the_sizes_inspected(beyond: StudyResu
     )
     rows = section(page, "Detection limits")
     assert rows.replace("&gt;", ">").count(f"> {largest:.3g}") >= 9
-    for part in ("Detection limits", "Limits against what was varied", "Diameter and depth", "Signal against size"):
+    for part in ("Detection limits", "Limits against what was varied", "Size and depth", "Signal against size"):
         sizes = [float(one) for one in re.findall(r"\d+\.\d\d\b", section(page, part).partition("no regression")[0])]
         assert max(sizes) <= largest, part
         assert "e+" not in section(page, part)
@@ -319,7 +319,7 @@ def test_one_set_up_has_no_axis_and_one_depth_no_surface(single_page: str) -> No
     page = single_page
     assert 'id="axis-1"' not in page
     assert 'id="surface"' not in page
-    assert "Diameter and depth" not in headings(page)
+    assert "Size and depth" not in headings(page)
     # Of a single set-up the ROC is drawn by classes of size.
     assert "a90 and above" in section(page, "Operating curves")
 
