@@ -230,24 +230,37 @@ def test_ambient_adds_its_shot_noise():
 
 
 def test_sunlight_fills_the_wells():
-    """80 uW/cm2/nm are four times the emitter's light at 1 m: 57,000 electrons on a surface of 0.9, beside the 47,000
-    of its own light at 0.55 m, leave 8,000 of the wells' 112,000 for samples of up to 0.77 x 47,000."""
-    sun = {"ambient_uw_cm2_nm": 80.0}
+    """150 uW/cm2/nm are 7.5 times the emitter's light at 1 m: 7,900 electrons on a surface of 0.9, beside the 6,000 of
+    its own light at 0.42 m, leave 2,100 of the wells' 16,000 for samples of up to 0.87 x 6,000."""
+    sun = {"ambient_uw_cm2_nm": 150.0}
     for saturation, expected in ((True, Reason.SATURATED), (False, Reason.VALID)):
-        settings = config(V2, ambient=True, saturation=saturation).model_copy(update=sun)
-        frame = next(iter(unit_of(settings, 0.55, albedo=0.9).capture(1, 1).frames()))
+        settings = config(AZURE, ambient=True, saturation=saturation).model_copy(update=sun)
+        frame = next(iter(unit_of(settings, 0.42, albedo=0.9).capture(1, 1).frames()))
         assert (frame.reason == expected).all()
-    assert np.isfinite(frames(unit_of(config(V2, ambient=True, saturation=True), 0.55, albedo=0.9))).all()
+    assert np.isfinite(frames(unit_of(config(AZURE, ambient=True, saturation=True), 0.42, albedo=0.9))).all()
 
 
-@pytest.mark.parametrize(("camera", "near_m"), [(AZURE, 0.14), (V2, 0.42)])
-def test_near_bright_surfaces_saturate(camera, near_m):
+def test_near_bright_surfaces_saturate():
     """White ones do below the least distance of use (0.5 m) and not from it on; with the effect off none does."""
     numbers = {"engine.min_range_mm": 50.0}
-    near = unit_of(config(camera, numbers, fine=False, saturation=True), near_m, albedo=1.0)
+    near = unit_of(config(AZURE, numbers, fine=False, saturation=True), 0.14, albedo=1.0)
     assert (next(iter(near.capture(1, 1).frames())).reason == Reason.SATURATED).all()
-    assert np.isfinite(frames(unit_of(config(camera, numbers, fine=False), near_m, albedo=1.0))).all()
-    assert np.isfinite(frames(unit_of(config(camera, fine=False, saturation=True), 0.53, albedo=0.95))).all()
+    assert np.isfinite(frames(unit_of(config(AZURE, numbers, fine=False), 0.14, albedo=1.0))).all()
+    assert np.isfinite(frames(unit_of(config(AZURE, fine=False, saturation=True), 0.53, albedo=0.95))).all()
+
+
+def test_an_exposure_that_ends_early_has_the_noise_of_what_it_holds():
+    """A white surface at 1 m would give a Kinect v2 14,000 electrons; the exposure ends at 5,700 of them, so samples
+    keep their size and scatter as if there were so many, and both wells' read noise grows as the scale does."""
+    photons = load_camera(V2).photons
+    for distance_m in (1.0, 2.5):
+        unit = unit_of(config(V2, noise=True), distance_m, albedo=1.0)
+        electrons = photons.signal_electrons.value * unit.view.intensity[unit.view.intensity.shape[0] // 2].mean()
+        share = min(1.0, photons.exposure_ends_electrons.value / electrons)
+        expected = np.sqrt(electrons / share + 2 * (photons.read_noise_electrons.value / share) ** 2)
+        middle = unit.exposure.sigma.reshape(unit.exposure.shape)[unit.exposure.shape[0] // 2]
+        assert (share < 1) == (distance_m == 1.0)
+        assert middle.mean() * unit.camera.photons.electrons_per_unit.value == pytest.approx(expected, rel=0.01)
 
 
 def test_multipath_off_sees_the_direct_light_only():

@@ -18,9 +18,9 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camer
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32
-V2 = load_camera("kinect_v2")
+V2 = load_camera("kinect_v2_libfreenect2")
 NEAR_AXIS = Region(170, 240, 210, 300)
-QUIET = CameraConfig(name="kinect_v2", effects=NO_EFFECTS.model_copy(update={"multipath": True}))
+QUIET = CameraConfig(name="kinect_v2_libfreenect2", effects=NO_EFFECTS.model_copy(update={"multipath": True}))
 NOISY = QUIET.model_copy(update={"effects": NO_EFFECTS.model_copy(update={"noise": True, "multipath": True})})
 FINE = {"converter.knee_units": 10**6, "photons.electrons_per_unit": 0.1}
 """A converter whose rounding hides nothing."""
@@ -83,7 +83,7 @@ def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, fl
     strength[:, 0] = amplitude
     unit = np.stack([np.cos(phases), np.sin(phases)]).astype(f4)
     filtered, edge = np.empty((3, 3, 3), f4), np.empty((3, 3), f4)
-    settings = kernels.FilterSettings(WINDOW.astype(f4), f4(3.6067), f4(3), True, True)
+    settings = kernels.FilterSettings(WINDOW.astype(f4), f4(3.6067), f4(3), True, True, True)
     kernels.filter_image(unit, strength, settings, filtered, edge)
     return complex(filtered[0, 1, 1], filtered[1, 1, 1]), float(edge[1, 1])
 
@@ -237,7 +237,7 @@ def test_the_residual_that_is_allowed_falls_with_amplitude():
 
 
 def test_noise_free_range_is_exact_from_half_a_metre_on():
-    settings = CameraConfig(name="kinect_v2", effects=NO_EFFECTS, numbers=FINE)
+    settings = CameraConfig(name="kinect_v2_libfreenect2", effects=NO_EFFECTS, numbers=FINE)
     camera = camera_of(settings)
     for distance_m, valid in ((0.49, False), (0.52, True), (2.0, True), (4.4, True), (4.6, False)):
         unit = SimulatedUnit(camera, settings, plane_view(camera, NEAR_AXIS, distance_m, 0.6, 0.01, 0.02))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,10 +68,11 @@ class Bench:
         return tight.grown(self.camera.optics.margin_px, lens.height, lens.width)
 
     def taken(
-        self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, unit_seed: int = 1
+        self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, **settings: Any
     ) -> FrameStack:
-        """Frames of a unit of the camera before a view; the noise is the stream of the labels."""
-        config = CameraConfig(name=self.camera_name, unit_seed=unit_seed, effects=effects)
+        """Frames of a unit of the camera, with further ``settings`` of `CameraConfig`, before a view; the noise is the
+        stream of the labels."""
+        config = CameraConfig(name=self.camera_name, effects=effects, **settings)
         unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
         taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
@@ -341,18 +343,22 @@ def edge_widths(
     from_edge_px: np.ndarray,
     tolerance_m: float,
     reach_px: float,
-    lines: int,
+    across: int,
 ) -> dict[str, np.ndarray]:
-    """The `WIDTHS` (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that ``lines`` lines of
-    pixels cross: pixels without a range; with a range off both surfaces; whose central ray meets the front (the back)
-    and that do not show it, shadow included. All but the gap are NaN where noise hides the step. ``front_z_m``,
-    ``back_z_m`` (h, w): z along each pixel's ray. ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do
-    not count."""
+    """The `WIDTHS` (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that lines of pixels
+    along the axis ``across`` cross: pixels without a range; with a range off both surfaces; whose central ray meets the
+    front (the back) and that do not show it, shadow included; and the share of lines ``with_flying`` pixels. All but
+    the gap are NaN where noise hides the step. ``front_z_m``, ``back_z_m`` (h, w): z along each pixel's ray.
+    ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do not count."""
     near = np.abs(from_edge_px) <= reach_px
     z, side = z_m[:, near], from_edge_px[near]
     shows_front, shows_back = (np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m))
     valid = np.isfinite(z)
     missing = (~valid, valid & ~shows_front & ~shows_back, ~shows_front[:, side < 0], ~shows_back[:, side >= 0])
-    widths = {name: pixels.sum(axis=1) / lines for name, pixels in zip(WIDTHS, missing, strict=True)}
+    lines = np.asarray(near.any(axis=across - 1))
+    found = {name: pixels.sum(axis=1) / lines.sum() for name, pixels in zip(WIDTHS, missing, strict=True)}
+    flying = np.zeros(z_m.shape, bool)
+    flying[:, near] = missing[1]
+    found["with_flying"] = np.asarray(flying.any(axis=across))[:, lines].mean(axis=1)
     unknown = np.full(len(z_m), np.nan)
-    return {name: unknown if np.isnan(tolerance_m) and name != "gap" else each for name, each in widths.items()}
+    return {name: unknown if np.isnan(tolerance_m) and name != "gap" else each for name, each in found.items()}

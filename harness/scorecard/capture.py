@@ -282,7 +282,7 @@ def _edge_rows(captured: Captured, crossings: np.ndarray, axis: int, pair: tuple
         off = (z - np.where(from_edge < 0, front_z, back_z))[:, flat]
         uneven = float(np.nanmedian(np.abs(off))) * 1.4826 if np.isfinite(off).any() else 0.0
         tolerance_m = bench.on_surface_tolerance_m(max(bench.temporal_sigma_m(z, flat), uneven), abs(step_m))
-        return bench.edge_widths(z, front_z, back_z, from_edge, tolerance_m, REACH_PX, count)
+        return bench.edge_widths(z, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)
 
     both, step = (widths(z_m), widths(simulated)), f"step {abs(step_m) / MM:.0f} mm"
     return [

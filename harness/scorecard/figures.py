@@ -49,6 +49,10 @@ from scenes.sensor.camera import camera_names
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 BASELINE_FILE = Path(__file__).with_name("baseline.json")
 SCORECARD_VERSION = 1
+NEAR = 0.25
+"""A figure of reality passes within this share of a published value; a bound must hold."""
+DRAWN = ("azure_kinect_nfov", "kinect_v2", "realsense_l515")
+"""Cameras whose curves the page draws unless others are asked for: those of the thesis."""
 
 
 class Published(Config):
@@ -76,11 +80,21 @@ class Published(Config):
         return self
 
     @property
-    def limits(self) -> tuple[float, float]:
-        """The lowest and highest simulated value that passes, tolerance included."""
+    def ends(self) -> tuple[float, float]:
+        """The lowest and the highest value that agree with what was published; infinite where there is no bound."""
         low, high = self.between or ((self.above, self.below) if self.value is None else (self.value, self.value))
-        slack = self.tolerance or 0.0
-        return (-float("inf") if low is None else low - slack), (float("inf") if high is None else high + slack)
+        return (-float("inf") if low is None else low), (float("inf") if high is None else high)
+
+    def limits(self, near: float = 0.0) -> tuple[float, float]:
+        """The lowest and highest simulated value that passes: beyond the ends by the tolerance, or by the share
+        ``near`` of a published value where that is more."""
+        slack = max(self.tolerance or 0.0, near * abs(self.value or 0.0))
+        return self.ends[0] - slack, self.ends[1] + slack
+
+    def ratio(self, simulated: float) -> float:
+        """Simulated by published, or by the nearer bound; NaN where that is 0."""
+        nearest = min(self.ends, key=lambda end: abs(end - simulated))
+        return simulated / nearest if nearest else float("nan")
 
     def in_words(self) -> str:
         """``1.42``, ``below 17``, ``0.15 to 0.35``."""
@@ -91,7 +105,8 @@ class Published(Config):
 
 
 class FigureEntry(Config):
-    """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it."""
+    """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it.
+    ``kind``: a figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", description="small letters, digits and _; once in the file")]
     camera: str
@@ -101,7 +116,18 @@ class FigureEntry(Config):
     source: Annotated[str, Field(min_length=3)]
     tag: Literal["R", "D", "S", "W", "M"]
     calibration: bool
+    kind: Literal["reality", "code"] = "reality"
     note: str = ""
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The lowest and highest simulated value that passes."""
+        return self.published.limits(NEAR if self.kind == "reality" else 0.0)
+
+    @property
+    def blind(self) -> bool:
+        """True where the figure tests the model against real cameras and was not used for it."""
+        return self.kind == "reality" and not self.calibration
 
 
 class FiguresFile(Config):
@@ -165,8 +191,8 @@ class Score:
 
     @property
     def passes(self) -> bool:
-        """True where the simulated value lies within what was published, tolerance included; False without a value."""
-        low, high = self.figure.entry.published.limits
+        """True where the simulated value lies within the entry's limits; False without a value."""
+        low, high = self.figure.entry.limits
         return bool(np.isfinite(self.simulated.value) and low <= self.simulated.value <= high)
 
     @property
@@ -367,6 +393,19 @@ def _tone(score: Score) -> Tone:
     return "good" if score.passes else "bad"
 
 
+def _ratio(score: Score) -> float:
+    return score.figure.entry.published.ratio(score.simulated.value)
+
+
+def _use(score: Score) -> str:
+    entry = score.figure.entry
+    return "code" if entry.kind == "code" else "calibration" if entry.calibration else "blind"
+
+
+def _first_hand(score: Score) -> str:
+    return "yes" if score.figure.entry.tag in "RW" else "no"
+
+
 SIMULATED = _reading("simulated", "low", "high", "simulated value", "simulated")
 VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
 ENTRY, PUBLISHED = "figure.entry", "figure.entry.published"
@@ -376,7 +415,7 @@ SCORES = Table(
     (
         Column("name", "", "figure.name", "name in the file of figures"),
         Column("camera", "camera", f"{ENTRY}.camera", "simulated camera"),
-        Column("", "figure", lambda score: score.figure.what()),
+        Column("figure", "figure", lambda score: score.figure.what(), "quantity and conditions in words"),
         Column("quantity", "", f"{ENTRY}.quantity", "quantity that is measured"),
         Column("unit", "", "figure.quantity.unit", "unit of all values"),
         Column("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
@@ -390,13 +429,14 @@ SCORES = Table(
             lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
         ),
         Column("", "unit", lambda score: score.figure.quantity.unit or "–"),
-        Column("passes_from", "", lambda score: score.figure.entry.published.limits[0], "lowest value that passes"),
-        Column("passes_to", "", lambda score: score.figure.entry.published.limits[1], "highest value that passes"),
+        Column("ratio", "ratio", _ratio, "simulated by published, or by the nearer bound", number),
+        Column("passes_from", "", lambda score: score.figure.entry.limits[0], "lowest value that passes"),
+        Column("passes_to", "", lambda score: score.figure.entry.limits[1], "highest value that passes"),
         Column("verdict", "verdict", "verdict", "whether the simulated value passes", tone=_tone),
         Column("passed_before", "", "passed_before", "whether it passed in the baseline; empty where that lacks it"),
-        Column("calibration", "", f"{ENTRY}.calibration", "whether the camera's file was, or may be, fitted to it"),
-        Column("", "use", lambda score: "calibration" if score.figure.entry.calibration else "test"),
+        Column("use", "use", _use, "blind, calibration (the camera's file was, or may be, fitted to it) or code"),
         Column("tag", "", f"{ENTRY}.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
+        Column("first_hand", "first hand", _first_hand, "whether the source itself was read, or the capture measured"),
         Column("source", "", f"{ENTRY}.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
         Column("note", "note", f"{ENTRY}.note", "what was assumed", brief=False),

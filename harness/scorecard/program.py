@@ -139,15 +139,16 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     published = dict.fromkeys(figure.entry.camera for figure in every)
     titles = {name: load_camera(name).title for name in (dict.fromkeys(options.camera) or published)}
     figures = tuple(figure for figure in every if figure.entry.camera in titles)
+    drawn = {name: title for name, title in titles.items() if options.camera or name in scoring.DRAWN}
     baseline = scoring.read_baseline(baseline_file) if baseline_file else {}
     points = tuple(scoring.curve_points(scoring.QUICK_GRIDS if options.quick else scoring.FULL_GRIDS))
-    wanted = scoring.requests_of(tuple(titles), figures, points)
+    wanted = scoring.requests_of(tuple(drawn), figures, points)
     found = scoring.measured(wanted, QUICK if options.quick else FULL, options.out / ".cache" / "renders", options.jobs)
     simulated = {each.name: found[each.entry.camera, each.quantity.name, each.conditions] for each in figures}
     scores = scoring.judged(figures, simulated, baseline)
     curves = [
         scoring.MeasuredPoint(camera, point, found[camera, point.quantity, point.conditions])
-        for camera in titles
+        for camera in drawn
         for point in points
     ]
     provenance = {
@@ -160,16 +161,19 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         "seconds": round(time.perf_counter() - began, 1),
     }
     answer = _answer(scores, options.quick)
+    real = [score for score in scores if score.figure.entry.kind == "reality"]
+    code = [score for score in scores if score.figure.entry.kind == "code"]
     groups = [
         (title, scoring.SCORES.grid(own, heads={"camera": ""}).html() if own else "")
         for camera, title in titles.items()
-        for own in [[score for score in scores if score.figure.entry.camera == camera]]
+        for own in [[score for score in real if score.figure.entry.camera == camera]]
     ]
-    drawn = all_figures(titles, curves, scores)
+    images = all_figures(drawn, curves, scores)
     page = template("scorecard.html", Path(__file__).parent).render(
         answer=answer,
         groups=groups,
-        figures=[(each.title, name, drawn[name], each.caption) for name, each in pictures().items()],
+        checks=scoring.SCORES.grid(code).html() if code else "",
+        figures=[(each.title, name, images[name], each.caption) for name, each in pictures().items()],
         quantities=QUANTITIES.values(),
         provenance=[(key, plain(value)) for key, value in provenance.items()],
     )
@@ -200,17 +204,32 @@ def _said_what_fell_behind(scores: Sequence[scoring.Score], baseline: Mapping[st
         print(f"passed in the baseline and is no longer among the figures: {name}", file=sys.stderr)
     fallen = [score for score in scores if score.regressed]
     for score in fallen:
-        low, high = score.figure.entry.published.limits
+        low, high = score.figure.entry.limits
         told = f"{score.figure.what()}): simulated {score.simulated.value:.4g}, passes from {low:g} to {high:g}"
         print(f"passed in the baseline and fails now: {score.figure.name} ({told}", file=sys.stderr)
     return 1 if fallen or gone else 0
 
 
+FAMILIES = {"azure": "Azure Kinect", "femto": "Femto", "kinect": "Kinect v2", "realsense": "RealSense L515"}
+"""Families of cameras by the first word of their names; all others are counted together."""
+
+
 def _answer(scores: Sequence[scoring.Score], quick: bool) -> str:
-    """One sentence: how many figures pass, apart for those that test and those that calibrate."""
-    test, fitted = ([one.passes for one in scores if one.figure.entry.calibration == of] for of in (False, True))
+    """Tell how many blind figures hold, in all and by family, and how many of the others."""
+
+    def share(chosen: Sequence[scoring.Score]) -> str:
+        return f"{sum(score.passes for score in chosen)} of {len(chosen)}"
+
+    blind = [score for score in scores if score.figure.entry.blind]
+    fitted = [score for score in scores if score.figure.entry.kind == "reality" and not score.figure.entry.blind]
+    families: dict[str, list[scoring.Score]] = {}
+    for score in blind:
+        first = score.figure.entry.camera.partition("_")[0]
+        families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
+    each = ", ".join(f"{name} {share(own)}" for name, own in families.items())
     text = "A quick look, with too few frames for a judgement: " if quick else ""
-    text += f"{sum(test)} of {len(test)} published figures that the models were not fitted to hold"
-    text += f", and {sum(fitted)} of {len(fitted)} that they were or may be fitted to."
+    text += f"{share(blind)} blind figures are within 25 %{f' ({each})' if len(families) > 1 else ''}; "
+    text += f"of figures that calibrated a camera {share(fitted)}; "
+    text += f"of checks of the code {share([score for score in scores if score.figure.entry.kind == 'code'])}."
     regressed = [score.figure.name for score in scores if score.regressed]
     return text + (f" Passed before and fail now: {', '.join(regressed)}." if regressed else "")

@@ -36,10 +36,12 @@ from harness.scorecard.bench import (
     temporal_sigma_m,
 )
 from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import digest
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import NO_EFFECTS, EffectsConfig
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
 
 PATCH = (40, 24)
 """Height and width in pixels. Narrow: at 70 degrees of incidence z then varies by 6 % to either side on the coarsest
@@ -62,6 +64,7 @@ SURVIVES = 0.5
 """A step survives where at least this share of its height is seen, in most plateaus."""
 LADDER_MM = (2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 MONTE_CARLO_SIGMAS = 2.0
+ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 # ---- conditions ------------------------------------------------------------------------------------------------------
 
@@ -73,11 +76,14 @@ StepMm = Annotated[float, Field(ge=0.5, le=5e3, description="from front to back,
 
 
 class PlaneConditions(Config):
-    """An endless matte plane that fills the field of view."""
+    """An endless matte plane that fills the field of view; ambient light as in `CameraConfig`. A continuous-wave
+    camera's plane may be given by the sum of its amplitudes in place of its albedo."""
 
     distance_m: Distance = 1.5
     albedo: Albedo = 0.8
     angle_deg: Annotated[float, Field(ge=0.0, le=80.0, description="of incidence, 0 to 80 degrees")] = 0.0
+    ambient_uw_cm2_nm: Annotated[float, Field(ge=0.0, le=200.0, description="0 to 200 uW/(cm2 nm)")] = ROOM_LIGHT
+    amplitude_units: Annotated[float, Field(gt=0.0, description="of all frequencies, in converter units")] | None = None
 
 
 class LagConditions(PlaneConditions):
@@ -130,6 +136,8 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "distance_m": "{:g} m".format,
     "albedo": "albedo {:g}".format,
     "angle_deg": lambda v: f"{v:g}°" if v else "",
+    "ambient_uw_cm2_nm": lambda v: "" if v == ROOM_LIGHT else f"ambient {v:g} µW/(cm² nm)",
+    "amplitude_units": lambda v: "" if v is None else f"amplitudes {v:g}",
     "step_mm": "step {:g} mm".format,
     "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
@@ -144,6 +152,8 @@ _WORDS: dict[str, Callable[[Any], str]] = {
 def in_words(conditions: Config) -> str:
     """Conditions as a short text with units: ``1.5 m, albedo 0.8``."""
     data = conditions.to_data()
+    if data.get("amplitude_units") is not None:
+        del data["albedo"]
     if "lag_x_px" in data:
         data["lag_px"] = (data.pop("lag_x_px"), data.pop("lag_y_px"))
     return ", ".join(filter(None, (_WORDS[key](value) for key, value in data.items())))
@@ -156,7 +166,7 @@ def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
 
 
 def _plane(c: PlaneConditions) -> PlaneConditions:
-    return PlaneConditions(distance_m=c.distance_m, albedo=c.albedo, angle_deg=c.angle_deg)
+    return PlaneConditions(**{key: getattr(c, key) for key in PlaneConditions.model_fields})
 
 
 # ---- the list --------------------------------------------------------------------------------------------------------
@@ -204,9 +214,17 @@ def plane_stack(
 ) -> FrameStack:
     """Frames of a plane about the axis; all that is measured on one plane with the same effects shares them."""
     slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
-    view = plane_view(bench.camera, bench.patch(*patch), c.distance_m, c.albedo, slope_x, LEAST_TILT[1])
+    albedo = c.albedo
+    if c.amplitude_units is not None:
+        camera = bench.camera
+        if not isinstance(camera, AmcwCamera):
+            raise UserError(f"{camera.name} has no amplitude_units", fix="give the plane's albedo")
+        electrons = c.amplitude_units * camera.photons.electrons_per_unit.value * c.distance_m**2
+        albedo = electrons / (camera.photons.signal_electrons.value * sum(camera.modulation.contrast.value))
+    view = plane_view(bench.camera, bench.patch(*patch), c.distance_m, albedo, slope_x, LEAST_TILT[1])
     labels = ("plane", digest([c.to_data(), effects.to_data()]), unit)
-    return bench.taken(view, effects, frames or bench.effort.noise_frames, *labels, unit_seed=unit)
+    count = frames or bench.effort.noise_frames
+    return bench.taken(view, effects, count, *labels, unit_seed=unit, ambient_uw_cm2_nm=c.ambient_uw_cm2_nm)
 
 
 def _deviation(stack: FrameStack) -> Reading:
@@ -239,17 +257,21 @@ def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
     return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
 
 
+def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
+    """(patches, n, n): z (h, w) of square patches less each patch's own plane, mm."""
+    v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
+    plane = np.column_stack([np.ones(n * n), u, v])
+    corners = [(i, j) for i in range(0, len(z_m) - n + 1, n) for j in range(0, z_m.shape[1] - n + 1, n)]
+    patches = np.stack([z_m[i : i + n, j : j + n].ravel() for i, j in corners], axis=1) / MM
+    return np.asarray((patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n))
+
+
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
     """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product of pixels so far
     apart, of both directions."""
     n, k, found = c.patch_px, c.apart_px, []
-    v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
-    plane = np.column_stack([np.ones(n * n), u, v])
     for unit in range(1, bench.effort.few_frames + 1):
-        z_mm = plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] / MM
-        corners = [(i, j) for i in range(0, len(z_mm) - n + 1, n) for j in range(0, z_mm.shape[1] - n + 1, n)]
-        patches = np.stack([z_mm[i : i + n, j : j + n].ravel() for i, j in corners], axis=1)
-        left = (patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n)
+        left = _left_of_patches(plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0], n)
         beside, below = left[:, :, k:] * left[:, :, : n - k], left[:, k:] * left[:, : n - k]
         found.append((left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2))
     variance, product = np.transpose(found, (1, 0, 2))
@@ -261,6 +283,18 @@ def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Deviation over a patch of a single frame about the patch's own plane, noise and fixed pattern: median over
     patches, mean over units."""
     return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
+
+
+@_quantity("pattern within patches", PatchConditions)
+def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
+    """Deviation over a patch about the patch's own plane that two averages of different frames have in common, rms over
+    patches, mean of units."""
+    found = []
+    for unit in range(1, min(bench.effort.units, 5) + 1):
+        z_m = plane_stack(bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH).z_m
+        one, other = (_left_of_patches(half.mean(axis=0), c.patch_px) for half in (z_m[::2], z_m[1::2]))
+        found.append(float(np.sqrt(max((one * other).mean(), 0.0))))
+    return mean_of(found)
 
 
 @_quantity("correlation within patches", PatchConditions)
@@ -339,7 +373,10 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
     from_edge = signed_px(lens.region_slopes(stack.region))
     tolerance_m = on_surface_tolerance_m(temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM)
     front_z, back_z = (plane.z_along_m(stack.slopes) for plane in (front, back))
-    return edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, stack.region.shape[axis])
+    widths = edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)
+    # each surface so far from the edge that the camera's filter sees it alone
+    on_front, on_back = from_edge < -FLAT_PX, (from_edge > FLAT_PX) & np.isfinite(stack.z_m).all(axis=0)
+    return widths | {"height": stack.z_m[:, on_back].mean(axis=1) - np.nanmean(stack.z_m[:, on_front], axis=1)}
 
 
 @_quantity("gap at an edge", StepConditions)
@@ -353,6 +390,18 @@ def flying_pixels_px(bench: Bench, c: StepConditions) -> Reading:
     """Width across an edge of pixels whose range is off both surfaces by more than four deviations and a tenth of the
     step."""
     return mean_of(_widths(bench, c)["flying"])
+
+
+@_quantity("edges with flying pixels", StepConditions)
+def flying_share(bench: Bench, c: StepConditions) -> Reading:
+    """Share of the lines of pixels across an edge that hold such a pixel."""
+    return mean_of(_widths(bench, c)["with_flying"])
+
+
+@_quantity("height of a step", StepConditions)
+def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
+    """Mean z of the back less that of the front, more than 8 pixels from the edge, noise alone."""
+    return mean_of(_widths(bench, c)["height"] / MM)
 
 
 @_quantity("erosion of the front", StepConditions)

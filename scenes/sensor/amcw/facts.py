@@ -201,7 +201,9 @@ class ModulationFacts(Config):
 
 class PhotonFacts(Config):
     """The photon budget: one gain, calibrated at one point. ``signal_electrons``: of both wells in one exposure, albedo
-    1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates)."""
+    1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates).
+    ``exposure_ends_electrons``: a pixel's exposure ends where both wells hold so many, and its sample is scaled to the
+    full length (None: all pixels are exposed alike)."""
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive
@@ -210,6 +212,7 @@ class PhotonFacts(Config):
     read_noise_electrons: NonNegative
     electrons_per_unit: Positive
     full_well_electrons: Positive | None = None
+    exposure_ends_electrons: Positive | None = None
     band_nm: Positive
 
 
@@ -255,6 +258,7 @@ class EngineFacts(Config):
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
+    ``edges_to_dim``: whether the sum that ``edge_threshold`` limits counts such dim neighbours.
     ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: of the limits of
     range.
     """
@@ -265,6 +269,7 @@ class EngineFacts(Config):
     concentration: NonNegative
     dim_amplitude_units: NonNegative
     drop_dim_neighbours: Fact[bool]
+    edges_to_dim: Fact[bool]
     fusion: Fact[Literal["least_squares", "mean"]]
     amplitude_gains: PositiveEach
     edge_threshold: Positive | None = None

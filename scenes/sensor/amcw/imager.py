@@ -3,10 +3,11 @@
 Modelled: shot and read noise, the harmonics that the number of phases aliases, ambient light, companding, saturation,
 fixed pattern and drift, the phase-space joint bilateral filter, unwrapping of one to three frequencies, the engine's
 gates, the correction for the emitter beside the lens, rounding, the lens' natural fall-off of light, its blur and stray
-light where the camera's file has them. Not modelled: dark current, motion, light that changes during a frame,
-cross-talk between pixels, in-pixel rejection of ambient light, gain switching and exposures of unequal length, errors
-of phase that differ between frequencies other than harmonics, any post-processing beyond this. Tables of a unit's lens,
-emitter and phase offsets are exact; what real ones leave is the fixed pattern and the unit's offset.
+light and exposures that end early where the camera's file has them. Not modelled: dark current, motion, light that
+changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
+which exposures end, errors of phase that differ between frequencies other than harmonics, any post-processing beyond
+this. Tables of a unit's lens, emitter and phase offsets are exact; what real ones leave is the fixed pattern and the
+unit's offset.
 """
 
 from __future__ import annotations
@@ -59,7 +60,11 @@ def exposure_of(
     if config.effects.wiggling:
         signal = with_harmonics(signal, phases, np.array(modulation.wiggling_residual.value))
     both_wells = electrons * intensity + ambient_electrons(camera, config, view, gathered)
-    variance = both_wells + 2 * photons.read_noise_electrons.value**2
+    # an exposure that ends early is scaled to the full length, and its noise with it
+    share = 1.0
+    if photons.exposure_ends_electrons is not None:
+        share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
+    variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
     sigma = np.sqrt(variance) if config.effects.noise else np.zeros_like(variance)
     # (f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
     steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
@@ -69,7 +74,7 @@ def exposure_of(
     if config.effects.saturation:
         limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
         if photons.full_well_electrons is not None:
-            room = 2 * photons.full_well_electrons.value - both_wells
+            room = 2 * photons.full_well_electrons.value / share - both_wells
             limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
     return AmcwExposure(
         (samples / photons.electrons_per_unit.value).reshape(*samples.shape[:2], -1).astype(f4),
@@ -238,7 +243,8 @@ class AmcwImager:
             space = np.outer(gauss, gauss).astype(f4)
         limits = f4(engine.concentration.value), f4(engine.dim_amplitude_units.value)
         by_amplitude = engine.filter_on.value == "phasors"
-        return kernels.FilterSettings(space, *limits, engine.drop_dim_neighbours.value, by_amplitude)
+        rules = engine.drop_dim_neighbours.value, engine.edges_to_dim.value, by_amplitude
+        return kernels.FilterSettings(space, *limits, *rules)
 
     @cached_property
     def engine(self) -> ranging.DepthEngine:

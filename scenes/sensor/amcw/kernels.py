@@ -104,7 +104,7 @@ def _filter_of(stride: int) -> Any:
         """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart; ``centre`` and
         ``starts`` (k,): where the values and their neighbours begin, -1 for none; ``total``: room for 7 planes. Writes
         ``filtered`` (3, length) and ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
-        weights, concentration, dim, drop_dim, by_amplitude = settings
+        weights, concentration, dim, drop_dim, dim_edges, by_amplitude = settings
         space = weights.ravel()
         p1, p2, p3, p4 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride), np.uint64(4 * stride)
         p5, p6 = np.uint64(5 * stride), np.uint64(6 * stride)
@@ -142,7 +142,7 @@ def _filter_of(stride: int) -> Any:
                 total[p1 + x] += v * i
                 total[p2 + x] += a
                 total[p3 + x] += e
-                total[p4 + x] += gap if kept else ZERO
+                total[p4 + x] += gap if kept and (dim_edges or amplitude >= dim) else ZERO
         for x in range(np.uint64(length)):
             a = total[x]
             b = total[p1 + x]
@@ -162,13 +162,14 @@ _filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
 class FilterSettings(NamedTuple):
     """Settings of the joint bilateral filter, float32 in its kernels: ``space`` (k, k), weights by distance. A centre
     not brighter than ``dim`` takes all by distance alone, before a brighter one neighbours below ``dim`` are dropped
-    where ``drop_dim``. Phasors count by their amplitude as well where ``by_amplitude``; else unit phasors are
-    averaged."""
+    where ``drop_dim``; the edge sum counts such neighbours only where ``dim_edges``. Phasors count by their amplitude
+    as well where ``by_amplitude``; else unit phasors are averaged."""
 
     space: np.ndarray
     concentration: Any
     dim: Any
     drop_dim: bool
+    dim_edges: bool
     by_amplitude: bool
 
 

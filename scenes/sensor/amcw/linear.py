@@ -158,14 +158,14 @@ def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: i
     for row in range(pixels.size):
         i = pixels[row]
         near, sure, rule_known = _look_around(i, light, window, shape, wild, lost, room)
-        noisy = _edge_of(i, light, near, out)
+        noisy, edge_known = _edge_of(i, light, window, near, out)
         _amplitude_of(i, light, window.by_amplitude, near, out)
         out.turned[i] = np.inf
         out.left_out[i] = np.inf
         if sure and rule_known and not (noisy or lost[i]):
             _moves_of(i, light, window.by_amplitude, near, out, moved[row])
             _rest_of(i, light, window.by_amplitude, near, out, moved[row])
-        if lost[i] or noisy or not sure:
+        if lost[i] or not (sure and edge_known):
             out.edge[i] = np.inf
             out.edge_spread[i] = np.inf
         if not sure:
@@ -208,15 +208,26 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
 
 
 @numba.njit(**FAST)
-def _edge_of(i, light, near, out):  # type: ignore[no-untyped-def]
-    """Write the edge sum's mean, deviation and bounds; return whether the window is too noisy for the former."""
+def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
+    """Write the edge sum's mean, deviation and bounds; return whether the window is too noisy for the former, and
+    whether they are right: it is sure which neighbours are counted, and those are not too noisy."""
     own = light.turn[i]
     noisy = own > NOISY
     mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
     longest, loose = 0.0j, 0.0
+    counted, doubtful = 0, False
     for q in near.others:
-        turn, between = light.turn[near.at[q]], near.between[q]
+        j, between = near.at[q], near.between[q]
+        turn = light.turn[j]
         noisy = noisy or turn > NOISY
+        if not window.dim_edges:
+            reach = DEVIATIONS * light.amplitude[j] * light.swell[j]
+            if light.bright[j] + reach < window.dim:
+                continue
+            if light.amplitude[j] - reach <= window.dim:
+                doubtful = True
+                continue
+        counted += 1
         shrunk = 1.0 - 0.5 * (turn * turn + own * own)
         mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
         sines += 0.5 * between.imag
@@ -231,9 +242,9 @@ def _edge_of(i, light, near, out):  # type: ignore[no-untyped-def]
     out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
     # the centre's own noise turns it at most as far as that, and where it is large anywhere
     away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-    out.edge_least[i] = 0.5 * (near.others.size - abs(longest) * np.cos(away))
+    out.edge_least[i] = 0.5 * (counted - abs(longest) * np.cos(away))
     out.edge_loose[i] = np.sqrt(loose)
-    return noisy
+    return noisy, not doubtful and (counted == 0 or not noisy)
 
 
 @numba.njit(**FAST)
