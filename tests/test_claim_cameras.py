@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pandas as pd
 import pytest
 from synthetic_tables import World, cameras, joined, placed, set_up_name, tables
 
@@ -9,12 +10,20 @@ from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.thesis.claims import claim_c11
 
-AXES = ["source.camera.name", "source.target.distance_m"]
+UNIT = "source.camera.unit_seed"
+AXES = ["source.camera.name", "source.target.distance_m", UNIT]
+
+
+def judged(found, units=3, axes=AXES):
+    """C11 on these tables, all units of a camera being alike."""
+    holes = found.holes
+    alike = [holes.assign(**{UNIT: unit, "variant": holes["variant"] + f", unit={unit}"}) for unit in range(units)]
+    return claim_c11(summarise_holes(pd.concat(alike, ignore_index=True), AXES), axes)
 
 
 def verdict(azure, v2, l515, **changes):
     found = cameras({"azure_kinect_nfov": azure, "kinect_v2": v2, "realsense_l515": l515}, **changes)
-    answer = claim_c11(summarise_holes(found.holes, AXES), AXES)
+    answer = judged(found)
     assert answer is not None
     return answer
 
@@ -39,7 +48,7 @@ def unsure(camera: str):
     name = set_up_name(camera, 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 3 else float(hole >= 4))
     rest = joined(*(_without(sure, name), placed(tables(half, (1, 50), name), camera, 1.0)))
-    return claim_c11(summarise_holes(rest.holes, AXES), AXES)
+    return judged(rest)
 
 
 def _without(found, name):
@@ -62,22 +71,32 @@ def test_an_undecided_hole_that_can_change_nothing_does_not_matter():
     name = set_up_name("kinect_v2", 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 4 else float(hole >= 5))
     found = joined(_without(found, name), placed(tables(half, (1, 50), name), "kinect_v2", 1.0))
-    assert claim_c11(summarise_holes(found.holes, AXES), AXES).verdict == "not borne out"
+    assert judged(found).verdict == "not borne out"
+
+
+def test_two_units_or_units_that_differ_leave_the_claim_undecided():
+    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    few = judged(found, units=2)
+    assert few.verdict == "undecided" and few.evidence.startswith("Only 2 of each camera's units")
+    # a variation of the L515 at 0.5 m finds as many holes as the Azure Kinect
+    better = tables(World(repeats=12, rate=lambda hole, frames: float(hole >= 3)), (1, 50), "another beam")
+    varied = joined(found, placed(better, "realsense_l515", 0.5, of=set_up_name("realsense_l515", 0.5)))
+    assert judged(varied).verdict == "undecided"
 
 
 def test_not_judged_without_the_three_cameras_or_without_fifty_frames():
     found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
-    summary = summarise_holes(found.holes, AXES)
-    assert claim_c11(summary[summary["source.camera.name"] != "kinect_v2"], AXES) is None
+    summary = summarise_holes(found.holes, AXES[:2])
+    assert claim_c11(summary[summary["source.camera.name"] != "kinect_v2"], AXES[:2]) is None
     assert claim_c11(summary, ["source.target.distance_m"]) is None
-    answer = claim_c11(summary[summary.frames == 1], AXES)
+    answer = claim_c11(summary[summary.frames == 1], AXES[:2])
     assert answer.verdict == "undecided"
     assert "no trial has 50 frames" in answer.evidence
 
 
 def test_set_ups_side_by_side():
     found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
-    compared = compare_set_ups(found, summarise_holes(found.holes, AXES), set_ups_of(found))
+    compared = compare_set_ups(found, summarise_holes(found.holes, AXES[:2]), set_ups_of(found))
     assert len(compared) == 3 * 2 * 2
     row = compared[(compared["variant"] == set_up_name("kinect_v2", 1.0)) & (compared["frames"] == 50)].iloc[0]
     assert row["found"] == [str(number) for number in range(5, 12)]

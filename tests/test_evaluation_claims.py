@@ -31,9 +31,15 @@ def rate(many: float, few: float, of: int) -> World:
 CASES = {
     "C1": (
         (World(), "borne out"),
-        (rate(1.0, 0.0, of=3), "not borne out"),
+        (rate(1.0, 0.0, of=3), "borne out"),
         (rate(0.0, 0.0, of=4), "not borne out"),
         (rate(0.5, 0.0, of=4), "undecided"),
+    ),
+    "C1b": (
+        (World(), "borne out"),
+        (rate(1.0, 0.0, of=3), "not borne out"),
+        (rate(0.0, 0.0, of=4), "borne out"),
+        (rate(0.5, 0.0, of=3), "undecided"),
     ),
     "C2": (
         (World(), "borne out"),
@@ -101,7 +107,9 @@ def test_missing_counts_are_undecided_and_say_why(claim: str) -> None:
 
 def test_nothing_found_is_no_evidence() -> None:
     scored = score_claims(tables(World(rate=lambda hole, frames: 0.0), frames=(1, 50)))
-    assert [v.verdict for v in scored] == ["not borne out"] * 2 + ["undecided"] * 4 + ["borne out"]
+    assert [v.verdict for v in scored] == ["not borne out", "borne out", "not borne out"] + ["undecided"] * 4 + [
+        "borne out"
+    ]
 
 
 def test_another_target_is_not_the_thesis() -> None:
@@ -113,10 +121,11 @@ def test_another_target_is_not_the_thesis() -> None:
 
 
 def test_evidence_carries_the_numbers() -> None:
-    more = verdict("C1", rate(42 / 50, 0.0, of=3))
+    more = verdict("C1b", rate(42 / 50, 0.0, of=3))
     assert "More than the thesis: 3" in more.evidence
     assert "42 of 50 (3)" in more.evidence
     assert "hole 4 +2.0 (1.5 to 2.5)" in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
+    assert "that it falls with the diameter" in verdict("C4").evidence
     assert "ratio position to size 4.00" in verdict("C5").evidence
 
 

@@ -81,13 +81,14 @@ def test_a_covariance_that_is_honest_has_a_ratio_about_one():
     assert row["in_plane_ratio_low"] < 1 < row["in_plane_ratio_high"]
 
 
-def test_a_ratio_is_paired_by_repeat():
-    first = registrations()
+def test_a_ratio_is_paired_by_view():
+    """Two repeats of each of two pairs of views: the pairs count, not the repeats."""
+    first = pd.concat([registrations(view=view) for view in (1, 2)], ignore_index=True)
     ratio, low, high, n = paired_ratio(
         first, first.assign(tre_in_plane_mm=first["tre_in_plane_mm"] / 2), "tre_in_plane_mm"
     )
     assert (ratio, low, high, n) == (pytest.approx(0.5), pytest.approx(0.5), pytest.approx(0.5), 2)
-    gone = first.assign(failure=["", "x"])
+    gone = first.assign(failure=["", "", "x", "x"])
     assert np.isnan(paired_ratio(first, gone, "tre_in_plane_mm")[0])
 
 

@@ -230,7 +230,7 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict
         found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
         verdicts = score_views(map_cases(tables, summary))
     elif len(variants) > 1:
-        verdict = claim_c11(summary[summary["variant"].isin(variants)], paths)
+        verdict = claim_c11(summary, paths)
         found[trials.SET_UPS] = compare_set_ups(tables, summary, variants)
         verdicts = [verdict] if verdict else []
         if not (effects := effects_table(tables)).empty:

@@ -7,7 +7,7 @@ the board, against the truth and against what the method itself predicts."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
 """The axes that this room knows by name."""
+CAMERA_UNIT = "source.camera.unit_seed"
 MANY = 50
 """Frames a view that maps are compared with, where they have them."""
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
@@ -180,12 +181,13 @@ class Map:
 @dataclass(frozen=True)
 class MapCase:
     """The maps of one place: those of one value of every axis but views, registration and merging. ``summary``: of
-    `harness.evaluation.summary.summarise_holes`."""
+    `harness.evaluation.summary.summarise_holes`; ``without_unit``: the place but for the camera's unit."""
 
     tables: ResultTables
     summary: pd.DataFrame
     maps: Sequence[MapSetUp]
     place: str
+    without_unit: str = ""
 
     @property
     def set_ups(self) -> list[MapSetUp]:
@@ -250,7 +252,10 @@ def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
     """Make one case for each place, in the order of the set-ups."""
     maps = maps_of(tables)
     places = dict.fromkeys(one.place for one in maps if not one.is_variation)
-    return [MapCase(tables, summary, [one for one in maps if one.place == place], place) for place in places]
+    alike = tables.variants.assign(**{CAMERA_UNIT: ""}) if CAMERA_UNIT in tables.variants else tables.variants
+    without = {one.variant: one.place for one in maps_of(replace(tables, variants=alike))}
+    groups = ((place, [one for one in maps if one.place == place]) for place in places)
+    return [MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups]
 
 
 @dataclass(frozen=True)
@@ -369,17 +374,17 @@ def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
     return registrations[registrations["failure"] == ""]
 
 
-def per_unit(registrations: pd.DataFrame, column: str) -> pd.Series:
-    """Root mean square over the views of each repeat and role of one column, of the registrations that did not fail."""
+def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
+    """Root mean square over the repeats of each view, paired with the first one, of the registrations that did not
+    fail. Repeats of a pair share its geometry and the fixed pattern, so that they are no further pairs."""
     rows = trusted(registrations)
-    squares = (rows[column] ** 2).groupby([rows[key] for key in UNIT]).mean()
-    return squares.pow(0.5)
+    return (rows[column] ** 2).groupby(rows["view"]).mean().pow(0.5)
 
 
 def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
-    """Geometric mean over repeats of second / first of one column's `per_unit`, with its Student interval of the
+    """Geometric mean over pairs of views of second / first of one column's `per_pair`, with its Student interval of the
     logarithm, and how many pairs there were; NaN below two."""
-    both = per_unit(first, column).to_frame("first").join(per_unit(second, column).rename("second"), how="inner")
+    both = per_pair(first, column).to_frame("first").join(per_pair(second, column).rename("second"), how="inner")
     both = both[(both > 0).all(axis=1)]
     if len(both) < 2:
         return np.nan, np.nan, np.nan, len(both)

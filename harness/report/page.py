@@ -205,7 +205,7 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     summary, variants = summarise_holes(tables.holes, axes), set_ups_of(tables)
     compared = compare_set_ups(tables, summary, variants)
     layout, costs, frames = Layout.of(tables), effect_costs(tables), sections.shown_frames(compared)
-    verdict = claim_c11(summary[summary["variant"].isin(variants)], axes) if about.with_claims else None
+    verdict = claim_c11(summary, axes) if about.with_claims else None
     middle = max(0, (len(layout.columns) - 1) // 2)
     clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
     sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}

@@ -1,6 +1,7 @@
 """The claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an experiment.
 
-Repeats vary the noise and the error of the nominal poses; the poses, the board and the camera's unit stay the same.
+Repeats vary the noise and the error of the nominal poses; the poses, the board and the camera's unit stay the same. So
+C7 is judged over pairs of views, and C8 and C10, which have one pair, over units of the camera.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from harness.evaluation import intervals, maps
 from harness.evaluation.summary import hole_list
 from harness.tables.text import many
-from harness.thesis.claims import Answer, Rules, Verdict, decide, is_above_zero, rule_of
+from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Rules, Verdict, decide, is_above_zero, rule_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,15 +27,34 @@ SLAM = ("odometry", "volume")
 NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
 RESPECTS = ("holes", "size", "noise")
+OVER_UNITS = ("C8", "C10")
 VIEW_CLAIMS: Rules = {}
 
 
 def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
     """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
-    verdicts = [(case, rule(case)) for rule in VIEW_CLAIMS.values() for case in cases]
-    if len(cases) == 1:
-        return [verdict for _, verdict in verdicts]
-    return [replace(verdict, evidence=f"{case.place}: {verdict.evidence}") for case, verdict in verdicts]
+    verdicts: list[Verdict] = []
+    for claim, rule in VIEW_CLAIMS.items():
+        judged = [(case, rule(case)) for case in cases]
+        if len(cases) > 1:
+            judged = [(case, replace(one, evidence=f"{case.place}: {one.evidence}")) for case, one in judged]
+        if claim in OVER_UNITS:
+            places = dict.fromkeys(case.without_unit for case in cases)
+            verdicts += [_over_units([one for case, one in judged if case.without_unit == at]) for at in places]
+        else:
+            verdicts += [one for _, one in judged]
+    return verdicts
+
+
+def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
+    """One verdict from those on units of the camera: that of all of them where they agree and are enough."""
+    evidence = " ".join(one.evidence for one in verdicts)
+    answers = [one.verdict for one in verdicts]
+    if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
+        on = f"{many(len(verdicts), 'unit')} of the camera"
+        evidence = f"Judged on {on} only, which says nothing of others; there: {', '.join(answers)}. {evidence}"
+    agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
+    return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)
 
 
 @rule_of(VIEW_CLAIMS, "C7")
@@ -43,14 +63,15 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     if alone is None:
         return "undecided", "Not judged: no single view stands beside the registrations."
     rows = case.registrations(alone.frames)
-    pairs = {method: maps.of_map(rows, method, 2) for method in dict.fromkeys(rows["method"])}
+    most = max(one.views for one in case.set_ups)
+    pairs = {method: maps.of_map(rows, method, most) for method in dict.fromkeys(rows["method"])}
     if not {"icp", "cpd"} <= set(pairs):
         return "undecided", "Not judged: ICP and CPD were not both tried."
     runs = case.runs(alone)
     noise_mm = float(runs["surface_noise_mm"][runs["role"] == "damaged"].median())
     planes = [_is_in_one_plane(pairs[method], noise_mm) for method in ("icp", "cpd")]
     ratio, low, high, n = maps.paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
-    better = True if high < 1 else (False if low >= 1 else None)
+    better = None if n < FEWEST_PAIRS else True if high < 1 else (False if low >= 1 else None)
     said = []
     for method, part in pairs.items():
         good = maps.trusted(part)
@@ -59,7 +80,7 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     evidence = (
         f"With {maps.frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
         f"{'; '.join(said)}. A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} "
-        f"times the error of ICP ({maps.span(intervals.Interval(low, high))}, {n} pairs)."
+        f"times the error of ICP ({maps.span(intervals.Interval(low, high))}, {many(n, 'pair')} of views)."
     )
     return decide([*planes, better]), evidence
 
@@ -68,8 +89,8 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     """Return whether a method's error across the board is at most the noise of a surface."""
     if intervals.wilson(len(rows) - len(maps.trusted(rows)), len(rows))[0] > 0.5:
         return False
-    across = maps.per_unit(rows, "tre_across_mm").to_numpy(float)
-    if not len(across):
+    across = maps.per_pair(rows, "tre_across_mm").to_numpy(float)
+    if len(across) < FEWEST_PAIRS:
         return None
     interval = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
     if interval.known and interval.high <= noise_mm:
