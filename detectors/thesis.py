@@ -1,6 +1,7 @@
 """The thesis' detector: points farther from a surface than k deviations, in clusters at 10 mm. The text's variant:
 robust cubic, robust deviations of the residual; the script's: least squares without cross terms, those of the *raw
-z*."""
+z*. The text also says that the threshold excludes all outliers that are no damage: `highest_before` takes it from the
+cloud itself."""
 
 from __future__ import annotations
 
@@ -27,14 +28,15 @@ SCRIPT_THRESHOLD = 1.2  # the script's k, in standard deviations of the raw z
 class ThesisConfig(ScoreMapConfig):
     """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
     With a shape other than ``polynomial`` one unit of score is the local noise. ``scale``: the deviation that one unit
-    of score means: ``mad`` (median |residual| / 0.6745), ``residual_std`` or ``raw_z_std``. ``use_variance``: where a
-    map states each point's variance, one unit of score is a multiple of each point's own deviation (but for
-    ``raw_z_std``)."""
+    of score means: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or ``highest_before``: the
+    largest residual of this cloud towards the camera, where no hole can be; k = 1 then leaves out what is as large
+    behind the surface. Nothing may stand out of the face. ``use_variance``: where a map states each point's variance,
+    one unit of score is a multiple of each point's own deviation (but for ``raw_z_std``)."""
 
     variant: Literal["text", "script"] = "text"
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
-    scale: Literal["mad", "residual_std", "raw_z_std"] = "mad"
+    scale: Literal["mad", "residual_std", "raw_z_std", "highest_before"] = "mad"
     use_variance: bool = True
 
     @model_validator(mode="before")
@@ -57,7 +59,9 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     @property
     def default_threshold(self) -> float | None:
-        """Threshold k that the thesis states: 1.2 for the script; None for the text."""
+        """Threshold k that the thesis states: 1.2 for the script, 1 of the cloud's own; None for the text."""
+        if self.settings.scale == "highest_before":
+            return 1.0
         return SCRIPT_THRESHOLD if self.settings.variant == "script" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
@@ -77,6 +81,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             sigma_of(off) if self.settings.scale == "mad" else float(np.std(z if raw else off, ddof=min(1, len(z) - 1)))
         )
         typical = 1.0 if deviation is None else median_of(deviation)
+        spread = max(0.0, -float(off.min())) if self.settings.scale == "highest_before" else spread
         scale = max(spread, floor) if deviation is None else np.maximum(spread * deviation, floor)
         notes = {"surface": surface.note, "points": len(z), "spread_m": spread * typical, "floor_m": floor}
         notes |= {"surface_iterations": surface.iterations, "surface_converged": surface.converged}

@@ -68,7 +68,7 @@ def test_every_variant_has_the_reason_that_stands_beside_it():
 
 
 def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
-    several = load_experiment(ROOT / "experiments" / "cameras.yaml")
+    several = load_experiment(ROOT / "experiments" / "cameras.yaml", ["sweep.source.camera.unit_seed=[1]"])
     variant = "camera=kinect_v2, distance=0.75 m"
     record = {
         "holes": [hole(0, "1", 2.0) | {"variant": variant}],
@@ -85,7 +85,10 @@ def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
     variants = tables.variants.set_index("variant")
     assert list(variants.reference[variants.is_variation]) == [
         "camera=kinect_v2, distance=0.5 m",
-        *2 * ["camera=realsense_l515, distance=0.75 m"],
+        *3 * ["camera=realsense_l515, distance=0.5 m"],
+        "camera=azure_kinect_nfov, distance=0.5 m",
+        *3 * ["camera=realsense_l515, distance=0.75 m"],
+        "camera=azure_kinect_nfov, distance=0.75 m",
     ]
 
     alone = tables_of([record], load_experiment(ROOT / "experiments" / "averaging.yaml"))

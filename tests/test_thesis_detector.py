@@ -185,3 +185,15 @@ def test_an_unknown_name_and_wrong_settings_are_clear_mistakes() -> None:
         load_detector("thesis", {"surface": {"degree": 99}, "scael": "mad"})
     assert "surface.degree" in str(caught.value) and "scael" in str(caught.value)
     assert "thesis" in detector_names() and detector_type("thesis") is ThesisDetector
+
+
+def test_the_threshold_of_the_cloud_itself_is_its_largest_residual_towards_the_camera() -> None:
+    detector = load_detector("thesis", {"scale": "highest_before"})
+    assert isinstance(detector, ThesisDetector) and detector.default_threshold == 1.0
+    cloud = board(HOLES, seed=3)
+    evidence = detector.analyse(cloud)
+    assert evidence.scale_m == pytest.approx(-np.nanmin(evidence.residual_m))
+    # Gaussian noise: the highest of 19,000 is about four deviations, and holes are 40 deep
+    assert 3.5 * 3e-4 < evidence.scale_m < 5.5 * 3e-4
+    found = detector.find(cloud, evidence, 1.0)
+    assert {len(one.pixels) > 10 for one in found[:3]} == {True} and len(found) < 10

@@ -219,6 +219,7 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict
     """Return the summaries of an experiment that is no study: all that its page shows. ``examples``: pictures that
     claims are scored with."""
     from harness.thesis.claims import claim_c11, score_claims
+    from harness.thesis.inference import posterior_of
     from harness.thesis.views import score_views
 
     paths, variants = list(tables.axes["path"]), set_ups_of(tables)
@@ -233,6 +234,8 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict
         verdict = claim_c11(summary, paths)
         found[trials.SET_UPS] = compare_set_ups(tables, summary, variants)
         verdicts = [verdict] if verdict else []
+        posterior = posterior_of(summary[summary["variant"].isin(variants)], paths)
+        found |= {} if posterior is None else {trials.POSTERIOR: posterior}
         if not (effects := effects_table(tables)).empty:
             found[trials.EFFECTS] = effects
     else:

@@ -202,6 +202,9 @@ class ExperimentConfig(Config):
     study: StudyConfig | None = Field(None, description="needs a family of boards, such as target: {name: drawn}")
     repeats: Repeats = 1
     sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
+    draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
+        None, description="of the sweep's set-ups so many are drawn at random, alike ones taken once; none: all are run"
+    )
     switches: DottedPath | None = Field(
         None, description="a mapping of switches: a set-up with none on, with each alone, with all but each, with all"
     )
@@ -227,7 +230,7 @@ def declared_of(data: Any) -> shape.Declared:
 
 MAIN = "main"
 """The only set-up of an experiment whose only axis, if any, is the number of frames."""
-NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "switches", "sensitivity")
+NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
 """Keys that decide which trials are run, not what a trial gives."""
 
 

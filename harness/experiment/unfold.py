@@ -19,7 +19,7 @@ from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Place, Problem, Source, parse_yaml
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
-from harness.vocabulary.seeds import canonical_json
+from harness.vocabulary.seeds import canonical_json, random_stream
 
 OPTION = "--set"
 NOT_VARIED = ("sweep", "sensitivity")
@@ -135,7 +135,7 @@ MAX_SHOWN = 20
 FRAMES = "capture.frames"
 SWITCHES = "switches"
 """Key of the file that names a mapping of switches."""
-FIXED = ("name", "title", "repeats", "study", "sweep", SWITCHES, "sensitivity")
+FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")
 """Keys that are the same for all points."""
 
 
@@ -320,7 +320,14 @@ def _drafts(
         for one in axis
         if one.path in telling
     }
-    for settings in product(*axes):
+    chosen = list(product(*axes))
+    if config.draws is not None:
+        groups: dict[str, list[tuple[Setting, ...]]] = {}
+        for each in chosen:
+            groups.setdefault(_label(one for one in each if one.path != FRAMES), []).append(each)
+        order = random_stream(config.seed, "draws").permutation(len(groups))[: config.draws]
+        chosen = [each for number in sorted(order) for each in [*groups.values()][number]]
+    for settings in chosen:
         # a set-up is called like ``camera=kinect_v2, distance=0.75 m``
         said = [told[id(one)] for one in settings if one.path in telling]
         yield Draft(_label(settings), ", ".join(said) or MAIN, settings, settings[-1].written_at if settings else ())
@@ -371,6 +378,8 @@ def _points(
         else:
             set_ups.setdefault(_sameness(placed), draft.variant)
         twin = known.setdefault((point.digest, draft.variant if draft.is_variation else ""), draft)
+        if twin is not draft and experiment.draws is not None:
+            continue
         if twin is not draft:
             message = f"the points {draft.label} and {twin.label} are the same experiment"
             problems.append(Problem(message, source.place_of(draft.named_at), fix="keep one"))

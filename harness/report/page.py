@@ -24,11 +24,13 @@ from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure, sights_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
+from harness.report.posterior import posterior_section
 from harness.report.view3d import write_view3d
 from harness.tables.outputs import REPORT
 from harness.tables.text import Grid, inches, many
 from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict, claim_c11, score_claims
+from harness.thesis.inference import borne_out_if, posterior_of
 from harness.vocabulary.files import write_text
 from harness.vocabulary.path_names import value_text
 
@@ -206,6 +208,8 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     compared = compare_set_ups(tables, summary, variants)
     layout, costs, frames = Layout.of(tables), effect_costs(tables), sections.shown_frames(compared)
     verdict = claim_c11(summary, axes) if about.with_claims else None
+    own = summary[summary["variant"].isin(variants)]
+    posterior = posterior_of(own, axes) if about.with_claims else None
     middle = max(0, (len(layout.columns) - 1) // 2)
     clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
     sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}
@@ -215,7 +219,8 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     if not costs and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
         figures["sights"] = sights_figure(sights)
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
-    body = [blocks.heading("Holes found"), sections.set_ups_grid(compared).html()]
+    body = posterior_section(posterior) if posterior is not None else []
+    body += [blocks.heading("Holes found"), sections.set_ups_grid(compared).html()]
     if "limits" in figures:
         body.append(blocks.figure(figures, "limits", "The smallest diameter from which on every hole is found."))
     body += _effects_section(costs)
@@ -251,7 +256,8 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     rule = "Each set-up has hole-free runs and a threshold of its own."
     under = sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule)
     guesses = about.provenance.get("guesses", ())
-    return blocks.page(about.title, set_ups_answer(compared, layout, costs, verdict), body, [under], guesses)
+    answer = set_ups_answer(compared, layout, costs, verdict) if posterior is None else borne_out_if(posterior)
+    return blocks.page(about.title, answer, body, [under], guesses)
 
 
 def set_ups_answer(

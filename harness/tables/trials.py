@@ -466,6 +466,19 @@ CLAIMS = Table(
     left=5,
     kind="claims",
 )
+POSTERIOR = Table(
+    "posterior",
+    "one row per set-up and per value of an axis: how well it agrees with the thesis' outcome (of 20 set-ups and more)",
+    (
+        Column("axis", note="the fact that the thesis does not state; `set-up` for all of them together"),
+        Column("value", "set-up", note="its value; of a set-up its name"),
+        Column("prior_share", note="probability beforehand"),
+        Column("likelihood", "likelihood", note="probability of exactly the thesis' holes with 1 and 50 frames; mean"),
+        Column("posterior_share", "posterior", note="probability afterwards"),
+    ),
+    formats=("csv",),
+    left=2,
+)
 EFFECTS = Table(
     "effects",
     "one row per effect, condition and number of frames, of an experiment with `switches`: what the effect costs",
@@ -481,7 +494,7 @@ EFFECTS = Table(
 )
 STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, WALLS, SITES, FINDINGS, OPERATING, PIXELS)
 STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
-SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS, EFFECTS)
+SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS, POSTERIOR, EFFECTS)
 
 
 def _empty() -> pd.DataFrame:

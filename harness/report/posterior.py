@@ -1,0 +1,43 @@
+"""The part of a page that says which set-ups are compatible with the thesis' outcome."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from markupsafe import Markup
+
+from harness.report import blocks, sections
+from harness.tables.trials import POSTERIOR
+from harness.thesis.inference import SET_UP, borne_out_if
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+SHOWN = 10
+
+
+def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
+    """Heading, sentence, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
+    axes = posterior[posterior["axis"] != SET_UP]
+    names = list(dict.fromkeys(axes["axis"]))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(-(-len(names) // 4), min(4, len(names)), squeeze=False, sharey=True).ravel()
+        for panel, name in zip(panels, names, strict=False):
+            rows = axes[axes["axis"] == name]
+            panel.bar(rows["value"], rows["posterior_share"], color=blocks.BLUE, label="posterior")
+            panel.step(rows["value"], rows["prior_share"], where="mid", color=blocks.GREY, label="prior")
+            panel.set(title=name, ylim=(0, 1))
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
+        panels[0].legend()
+
+    figures = {"posterior": blocks.svg("posterior", (9, 2.4 * -(-len(names) // 4)), "posterior of each fact", draw)}
+    best = posterior[posterior["axis"] == SET_UP].head(SHOWN)
+    return [
+        blocks.heading("What would make the thesis true"),
+        blocks.paragraph(borne_out_if(posterior)),
+        blocks.figure(figures, "posterior", "Share of the posterior (bars) and of the prior (line) of each fact."),
+        POSTERIOR.grid(sections.records(best)).html(),
+    ]

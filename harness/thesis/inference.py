@@ -1,0 +1,70 @@
+"""The set-ups of an experiment that are compatible with what the thesis found: a likelihood and a posterior for each.
+
+The outcome is one cloud of one frame, in which holes 5 to 11 were found, and one of 50, with holes 4 to 11. Each hole's
+chance is (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything; holes count as
+independent given the set-up. All set-ups have the same prior probability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.evaluation.maps import MANY
+from harness.thesis.claims import CAMERA, FEW, FOUND_WITH_FEW, FOUND_WITH_MANY, THESIS_HOLES
+from harness.vocabulary.path_names import names_of, value_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEWEST_SET_UPS = 20
+"""Set-ups from which on a posterior is told."""
+DOUBTED = 0.5
+"""A value is left out where the outcome makes it less probable than this share of what it was beforehand."""
+SET_UP = "set-up"
+
+
+def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
+    """Return rows of `harness.tables.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
+    None where another target, too few set-ups, several cameras, or not both numbers of frames were tried."""
+    import pandas as pd
+
+    rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
+    whole = rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)
+    rows = rows[whole]
+    if CAMERA in axes or rows["variant"].nunique() < FEWEST_SET_UPS:
+        return None
+    chance = (rows["detected"] + 0.5) / (rows["n"] + 1)
+    expected = np.where(rows["frames"] == MANY, rows["hole"].isin(FOUND_WITH_MANY), rows["hole"].isin(FOUND_WITH_FEW))
+    logs = pd.Series(np.log(np.where(expected, chance, 1 - chance)), rows.index).groupby(rows["variant"]).sum()
+    share = np.exp(logs - logs.max())
+    share, prior = share / share.sum(), 1 / len(share)
+    told = [
+        {"axis": SET_UP, "value": name, "prior_share": prior, "likelihood": np.exp(logs[name]), "posterior_share": of}
+        for name, of in share.sort_values(ascending=False, kind="stable").items()
+    ]
+    of_set_up = rows.drop_duplicates("variant").set_index("variant")
+    for path, name in names_of(list(axes)).items():
+        for value, there in of_set_up.groupby(path, dropna=False):
+            own = {"axis": name, "value": value_text(path, value), "prior_share": prior * len(there)}
+            mean = float(np.exp(logs[there.index]).mean())
+            told.append({**own, "likelihood": mean, "posterior_share": float(share[there.index].sum())})
+    return pd.DataFrame(told)
+
+
+def borne_out_if(posterior: pd.DataFrame) -> str:
+    """Say in one sentence what the thesis' outcome asks for: of each axis the values that are not `DOUBTED`, where one
+    is; and how probable the outcome is in the likeliest set-up."""
+    best = posterior.iloc[0]
+    asked = []
+    for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
+        kept = rows[rows["posterior_share"] >= DOUBTED * rows["prior_share"]]
+        asked += [f"{name} is {' or '.join(kept['value'])}"] if len(kept) < len(rows) else []
+    said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
+    return (
+        f"The thesis' outcome is borne out if {said} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
+        f"that the outcome makes less than half as probable are left out). In the likeliest set-up, {best['value']}, "
+        f"the exact outcome has a probability of {best['likelihood']:.2g}."
+    )
