@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--crop", default="auto", metavar="KIND", help=crop)
     target = "with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows"
     add("--target", type=_number, metavar="N", help=target)
-    add("--detector", default="matched", help="detector's name (default: matched)")
+    add("--detector", default="local", help="detector's name (default: local)")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     averages = ("mean", "median", "clipped")
