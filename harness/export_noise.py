@@ -31,9 +31,6 @@ FRAMES, FRAMES_OF_CORRELATION = 40, 100
 """Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
 LONGEST_LAG = 12
 """Pixels to which the correlation of neighbours is followed."""
-SPECTRUM, LEAST_POWER, FAINT = 256, 3e-3, 0.05
-"""Frequencies of a filter's spectrum, the least power there relative to the largest, and the share of the largest tap
-below which further taps are left out: correlations are met to 0.03."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -170,20 +167,12 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
 
 
 def _filter(images: np.ndarray, axis: int) -> np.ndarray:
-    """Return causal taps (k,) with a sum of squares of 1 that give white noise the images' (n, h, w) mean correlation
-    along an axis: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim and Schafer), as it is short."""
+    """Return the taps that give white noise the images' (n, h, w) mean correlation along an axis."""
+    from scenes.sensor.unit import taps_of
+
     images = np.moveaxis(np.nan_to_num(images), axis, -1)
     products = [np.mean(images[..., lag:] * images[..., : images.shape[-1] - lag]) for lag in range(LONGEST_LAG + 1)]
-    correlation = np.zeros(SPECTRUM)
-    correlation[: LONGEST_LAG + 1] = np.asarray(products) / max(products[0], 1e-30)
-    correlation[-LONGEST_LAG:] = correlation[LONGEST_LAG:0:-1]
-    spectrum = np.fft.fft(correlation).real
-    cepstrum = np.fft.ifft(0.5 * np.log(np.maximum(spectrum, LEAST_POWER * spectrum.max()))).real
-    cepstrum[1 : SPECTRUM // 2] *= 2.0
-    cepstrum[SPECTRUM // 2 + 1 :] = 0.0
-    taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
-    taps = taps[: 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())]
-    return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
+    return taps_of(np.asarray(products) / max(products[0], 1e-30))
 
 
 def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,7 @@ PROGRAMS = [
     "export",
     "flatfield",
     "gauge",
+    "characterise",
     "implant",
     "target",
     "validate",

@@ -38,7 +38,15 @@ from harness.vocabulary.provenance import RESULTS_VERSION, record
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, camera_names, camera_of, load_camera
+from scenes.sensor.camera import (
+    AnyCamera,
+    CameraConfig,
+    EffectsConfig,
+    camera_names,
+    camera_of,
+    guessed_precision,
+    load_camera,
+)
 from scenes.sensor.source import SimulatedUnit
 
 if TYPE_CHECKING:
@@ -354,7 +362,7 @@ def camera_of_size(lens: Lens) -> str:
     where there is none, or more than one."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
-    known = [name for name in fitting if load_camera(name).photons.signal_electrons.tag != "G"]
+    known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
         return (known or fitting)[0]
     wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not ones aligned to a"

@@ -14,23 +14,26 @@ from typing import TypeVar
 import numpy as np
 from scipy import optimize
 
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, load_camera
+from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 
 ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
-HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32)}
+HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}
 """Half height and width of the plane in pixels, by kind of camera."""
 RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
 FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}
 """Frames of some 3,000 pixels with common noise, which give a gain to 0.5 %."""
 
-Camera = TypeVar("Camera", bound=AmcwCamera | ScannedLidar)
+PhotonCamera = AmcwCamera | ScannedLidar
+"""Cameras whose noise follows from a photon budget."""
+Camera = TypeVar("Camera", bound=AnyCamera)
 
 
 def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
@@ -63,14 +66,14 @@ def with_jitter_m(camera: AnyCamera, sigma_m: float) -> float:
     return float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
 
 
-def calibrated_signal_electrons(camera: AnyCamera, frames: int | None = None, seed: int = 1) -> float:
+def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None, seed: int = 1) -> float:
     """Return the gain that meets the camera's calibration point, to 0.5 %."""
     photons, count = camera.photons, frames or FRAMES[camera.kind]
     wanted = photons.calibration_sigma_mm.value * MM
     distance_m, albedo = photons.calibration_distance_m.value, photons.calibration_albedo.value
 
     def excess(log_electrons: float) -> float:
-        trial: AnyCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
+        trial: PhotonCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
         sigma_m = temporal_sigma_m(trial, distance_m, albedo, count, seed)
         # a camera too dim to see the wall at all is as far too noisy as any
         return with_jitter_m(trial, sigma_m) / wanted - 1 if np.isfinite(sigma_m) else 100.0
@@ -78,7 +81,7 @@ def calibrated_signal_electrons(camera: AnyCamera, frames: int | None = None, se
     return float(np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3)))
 
 
-def calibrated_numbers(camera: AnyCamera) -> dict[str, float]:
+def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
     """Return the fitted numbers by their keys in the camera's file: the gain, then of a lidar the confidence threshold
     at which half of the pixels are valid at the published reach."""
     numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
@@ -101,7 +104,11 @@ def _main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
 
     def print_numbers() -> int:
-        for key, value in calibrated_numbers(load_camera(options.camera)).items():
+        camera = load_camera(options.camera)
+        if isinstance(camera, EmpiricalCamera):
+            fix = "measure it anew with python -m harness.characterise"
+            raise UserError(f"{options.camera}: an empirical camera has no gain to calibrate", fix=fix)
+        for key, value in calibrated_numbers(camera).items():
             print(f"{options.camera}: {key} = {value:.5g}")
         return 0
 

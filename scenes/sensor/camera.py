@@ -20,6 +20,7 @@ from harness.vocabulary.geometry import OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
@@ -34,10 +35,14 @@ CAMERAS = PlugIns(
     fix=f"to add one, write its file in scenes/cameras/, or install a package that offers it by {GROUP!r}",
 )
 
-AnyCamera = AmcwCamera | ScannedLidar
+AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
 
-KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar]] = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar}
+KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar] | type[EmpiricalCamera]] = {
+    "amcw_imager": AmcwCamera,
+    "scanned_lidar": ScannedLidar,
+    "empirical": EmpiricalCamera,
+}
 
 
 class EffectsConfig(Config):
@@ -158,6 +163,8 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 def guessed_precision(camera: AnyCamera) -> str:
     """Return a sentence on a camera whose precision nobody publishes; empty for others. Noise goes with the root of the
     gain where shot noise rules."""
+    if isinstance(camera, EmpiricalCamera):
+        return ""
     gain = camera.photons.signal_electrons
     if gain.range is None:
         return ""

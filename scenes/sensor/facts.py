@@ -21,11 +21,12 @@ STEEPEST = 6.0  # slope from the axis up to which distortion is examined: 80 deg
 
 class Fact(Config, Generic[T]):
     """One number of a camera with where it comes from. ``tag``: R read in the named public source, D derived from such,
-    S one secondary source, W measured on public captures, C calibrated, M a guess, G a guess of the precision with the
+    S one secondary source, W measured on public captures, O measured on the
+    owner's captures by `harness.characterise`, C calibrated, M a guess, G a guess of the precision with the
     ``range`` that it may lie in, U set by the user of an experiment."""
 
     value: T
-    tag: Literal["R", "D", "S", "W", "C", "M", "G", "U"]
+    tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
     source: str
     range: tuple[float, float] | None = None
 

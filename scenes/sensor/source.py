@@ -16,7 +16,7 @@ from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw.at_once import AtOnce, at_once
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera, CameraConfig
-from scenes.sensor.lidar.facts import ScannedLidar
+from scenes.sensor.empirical.imager import EmpiricalImager
 from scenes.sensor.lidar.scanner import LidarScanner
 from scenes.sensor.unit import FrameTotals, frame_errors_m
 
@@ -30,10 +30,10 @@ class SimulatedUnit:
     view: NoiseFreeView
 
     @cached_property
-    def model(self) -> AmcwImager | LidarScanner:
+    def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:
         """The model of the camera's kind on the view's region, with its `expose` and `frame`."""
-        kind = LidarScanner if isinstance(self.camera, ScannedLidar) else AmcwImager
-        return kind(self.camera, self.config, self.view.region, self.view.slopes)  # type: ignore[arg-type]
+        kinds = {"amcw_imager": AmcwImager, "scanned_lidar": LidarScanner, "empirical": EmpiricalImager}
+        return kinds[self.camera.kind](self.camera, self.config, self.view.region, self.view.slopes)
 
     @cached_property
     def exposure(self) -> Any:
@@ -42,7 +42,8 @@ class SimulatedUnit:
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of the view without drawing each; None where only frames will do, as of lidars."""
+        """Sums of frames of the view without drawing each; None where only frames will do, as of all
+        but continuous-wave imagers."""
         if not isinstance(self.model, AmcwImager):
             return None
         asked = np.zeros(self.view.range_m.shape, bool)

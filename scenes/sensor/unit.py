@@ -73,6 +73,26 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     return np.asarray(smooth / np.sqrt(np.prod(power)))
 
 
+SPECTRUM, LEAST_POWER, FAINT = 256, 3e-3, 0.05
+"""Frequencies of a filter's spectrum, the least power there relative to the largest, and the share of the largest tap
+below which further taps are left out: correlations are met to 0.03."""
+
+
+def taps_of(correlation: np.ndarray) -> np.ndarray:
+    """Return causal taps (k,) with a sum of squares of 1 that give white noise this correlation (n,) at lags 0 to
+    n - 1: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim and Schafer), as it is short."""
+    lags, circle = len(correlation), np.zeros(SPECTRUM)
+    circle[:lags] = correlation
+    circle[SPECTRUM - lags + 1 :] = correlation[:0:-1]
+    spectrum = np.fft.fft(circle).real
+    cepstrum = np.fft.ifft(0.5 * np.log(np.maximum(spectrum, LEAST_POWER * spectrum.max()))).real
+    cepstrum[1 : SPECTRUM // 2] *= 2.0
+    cepstrum[SPECTRUM // 2 + 1 :] = 0.0
+    taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
+    taps = taps[: 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())]
+    return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
+
+
 def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return phasors (f, h, w) and intensity (h, w) of all light, or of direct light only where multipath is off: then
     the longest phasor over the frequencies, too small where two surfaces cancel at every frequency."""

@@ -1,0 +1,131 @@
+"""``python -m harness.characterise``: your own camera measured on static captures, as a page and a camera file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.vocabulary.errors import UserError, exit_code_of
+
+if TYPE_CHECKING:
+    from detectors.recordings import Recording
+    from harness.tables.characteristics import OwnFigure
+
+CAMERA_FILE = "my_camera.yaml"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(given)
+    return exit_code_of(lambda: _run(options, "python -m harness.characterise " + shlex.join(given)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m harness.characterise",
+        description="Measure a depth camera on static captures, best of a matte wall that fills the view: noise "
+        "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
+        "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
+        "Each PATH is one capture of 50 frames or more, in any format that harness.detect reads, in the order of time; "
+        "captures at several distances, moved by 30 mm or more, tell most.",
+        epilog="example: python -m harness.characterise near far --like azure_kinect_nfov --out my_camera",
+    )
+    add = parser.add_argument
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures of one camera in one mode")
+    add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
+    like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
+    add("--like", metavar="CAMERA", help=like)
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as harness.detect has it")
+    add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
+    add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
+    add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
+    return parser
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.inspection.arguments import read_poses
+    from harness.inspection.told import print_notes, print_warnings
+    from harness.own_camera.camera_file import Origin, Stated, simulated, write_camera
+    from harness.own_camera.measure import characteristics, read_still
+    from harness.own_camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
+    from harness.scorecard.capture import camera_of_size, twin_of
+    from harness.tables.characteristics import OWN_FIGURES
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+    from scenes.sensor.camera import load_camera
+
+    if not 0 < options.albedo <= 1:
+        raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+    if options.rate is not None and not options.rate > 0:
+        raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
+    poses = read_poses(options.poses, len(options.paths)) if options.poses else None
+    captures = []
+    for path in options.paths:
+        recording = _opened(options, path)
+        captures.append(read_still(recording))
+        print(f"{recording.name}: {len(captures[-1].z_m)} frames, {recording.unit_text}", flush=True)
+        print_notes(recording.notes)
+        print_warnings(recording.warnings)
+    found = characteristics(captures, poses)
+    print_warnings(found.doubts())
+    known = options.like
+    if known is None:
+        try:
+            known = camera_of_size(captures[0].lens)
+        except UserError:
+            known = None
+    rate = Stated("unit", "frames_per_second", options.rate, "stated by the user", "U")
+    if options.rate is None:
+        of_like = load_camera(options.like).unit.frames_per_second if options.like else None
+        value, source = (30.0, "assumed") if of_like is None else (of_like.value, f"of {options.like}")
+        rate = Stated("unit", "frames_per_second", value, source, "M")
+    names = ", ".join(capture.name for capture in captures)
+    origin = Origin(options.title, names, rate, options.albedo)
+    print("fitting the camera file ..", flush=True)
+    camera = write_camera(options.out / CAMERA_FILE, options.like, found, origin)
+    print("simulating the captures from it ..", flush=True)
+    twin = characteristics(simulated(camera, found, options.albedo), poses)
+    sources = {MEASURED: found, SIMULATED: twin}
+    if known is not None:
+        other = twin_of(known, captures[0].lens, options.albedo).camera
+        sources[KNOWN] = characteristics(simulated(other, found, options.albedo), poses)
+    rows = beside(found, twin, sources.get(KNOWN))
+    show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": known or ""})])
+    noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
+    answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
+    answer += f" {CAMERA_FILE} repeats it within {100 * _worst(rows):.0f} %." if noise else ""
+    print(answer)
+    write_page(options.out, sources, rows, f"{options.title}, characterised", answer, known or "", command)
+    told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts(), "like": options.like}
+    write_text(options.out / "provenance.json", json.dumps(told, indent=2) + "\n")
+    print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")
+    return 0
+
+
+def _opened(options: argparse.Namespace, path: Path) -> Recording:
+    """Open a capture; without a lens anywhere, the nominal one of --like counts."""
+    from harness.inspection.arguments import opened
+
+    try:
+        return opened([path], options.intrinsics, unit=options.unit)
+    except UserError:
+        if not options.like or options.intrinsics is not None:
+            raise
+        print(f"note: the capture names no lens; the nominal one of {options.like} counts")
+        return opened([path], options.like, unit=options.unit)
+
+
+def _worst(rows: list[OwnFigure]) -> float:
+    return max(abs(row.ratio - 1) for row in rows if row.figure == "temporal noise")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The empirical camera: what captures of a real unit show, without a model of how it measures."""

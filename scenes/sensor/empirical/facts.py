@@ -1,0 +1,138 @@
+"""The numbers of an empirical camera, as its file holds them: statistics of a real unit's captures."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import model_validator
+
+from harness.vocabulary.config import Config
+from harness.vocabulary.geometry import MM
+from scenes.optics import Optics
+from scenes.sensor.facts import CameraFacts, Fact, NonNegative, Positive, checked
+
+CARRIER_HZ = 1e6
+"""Frequency whose phase tells the mean distance over a pixel's footprint, without ambiguity up to 150 m; complex64
+rounds it by 2 um."""
+BLUR_REACH = 3.0
+"""Deviations of the edge's kernel that a region needs as margin: 0.3 % of it lies beyond."""
+
+Values = Annotated[Fact[tuple[float, ...]], checked("above 0", lambda value: value > 0)]
+Shares = Annotated[Fact[tuple[float, ...]], checked("from 0 to 1", lambda value: 0 <= value <= 1)]
+Taps = Fact[tuple[float, ...]]
+"""Taps of a causal filter; their squares sum to 1."""
+
+
+class SurfaceLightFacts(Config):
+    """The recorded surface as a standard of brightness. ``amplitude_at_1m``: in the recording's units, facing the
+    camera; amplitudes fall with the square of the distance. ``albedo`` that the surface is taken to have."""
+
+    amplitude_at_1m: Positive
+    albedo: Annotated[Fact[float], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
+
+
+class NoiseLawFacts(Config):
+    """Temporal noise of single pixels along the ray, before rounding. ``sigma_mm`` of the recorded surface, facing, at
+    each of ``range_mm``; logarithms are interpolated, and beyond the ends the power ``range_exponent`` holds. A surface
+    of another brightness b, relative to it, has b^-``brightness_exponent`` times as much. ``rows`` and ``columns``:
+    filters down and across, which give neighbours their correlation."""
+
+    range_mm: Values
+    sigma_mm: Values
+    range_exponent: NonNegative
+    brightness_exponent: NonNegative
+    rows: Taps
+    columns: Taps
+
+    @model_validator(mode="after")
+    def _one_deviation_for_each_range(self) -> NoiseLawFacts:
+        ranges = self.range_mm.value
+        if len(ranges) != len(self.sigma_mm.value) or not ranges or list(ranges) != sorted(set(ranges)):
+            raise ValueError("noise.range_mm must increase, and noise.sigma_mm needs one value for each of them")
+        return self
+
+
+class FilteredPatternFacts(Config):
+    """Fixed pattern, the same in every frame of a unit: white noise of ``deviation_mm`` after two filters."""
+
+    deviation_mm: NonNegative
+    rows: Taps
+    columns: Taps
+
+
+class DropoutFacts(Config):
+    """Chance of no return in a frame: ``share`` at each of ``amplitude``, interpolated over its logarithm."""
+
+    amplitude: Values
+    share: Shares
+
+    @model_validator(mode="after")
+    def _one_share_for_each_amplitude(self) -> DropoutFacts:
+        levels = self.amplitude.value
+        if len(levels) != len(self.share.value) or not levels or list(levels) != sorted(set(levels)):
+            raise ValueError("dropouts.amplitude must increase, and dropouts.share needs one value for each of them")
+        return self
+
+
+class EdgeKernelFacts(Config):
+    """What happens at a step of depth of ``least_step_mm`` or more between neighbours: no return within a band of
+    ``gap_px`` across it. ``blur_px``: deviation of the Gaussian that depth is smoothed by everywhere."""
+
+    gap_px: Annotated[Fact[float], checked("from 0 to 100 pixels", lambda value: 0 <= value <= 100)]
+    blur_px: Annotated[Fact[float], checked("from 0 to 30 pixels", lambda value: 0 <= value <= 30)]
+    least_step_mm: Positive
+
+
+class OutputFacts(Config):
+    """Limits of range along the ray, and the step of the stored z."""
+
+    min_range_mm: NonNegative
+    max_range_mm: Positive
+    output_step_mm: Positive
+
+
+class EmpiricalCamera(CameraFacts):
+    """Any depth camera, described by what its captures show."""
+
+    kind: Literal["empirical"]
+    light: SurfaceLightFacts
+    noise: NoiseLawFacts
+    fixed_pattern: FilteredPatternFacts
+    dropouts: DropoutFacts
+    edge: EdgeKernelFacts
+    engine: OutputFacts
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> EmpiricalCamera:
+        if self.engine.min_range_mm.value >= self.engine.max_range_mm.value:
+            raise ValueError("engine.min_range_mm must be less than engine.max_range_mm")
+        return self
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels beyond a region whose depth reaches it through the edge's kernel."""
+        return int(np.ceil(BLUR_REACH * self.edge.blur_px.value) + np.ceil(self.edge.gap_px.value / 2)) + 1
+
+    @property
+    def z_step_m(self) -> float:
+        """The rounding step of the output's z."""
+        return self.engine.output_step_mm.value * MM
+
+    @cached_property
+    def optics(self) -> Optics:
+        """Optics for the render: a source of light in the lens itself, which leaves no shadows."""
+        return Optics(
+            title=self.title,
+            lens=self.nominal_lens,
+            emitter_m=np.zeros(3),
+            full_half_angle_deg=89.0,
+            cutoff_half_angle_deg=89.9,
+            frequencies_hz=(CARRIER_HZ,),
+            beam_fwhm_rad=None,
+            wavelength_nm=self.wavelength_nm.value,
+            margin_px=self.margin_px,
+            nearest_m=self.engine.min_range_mm.value * MM,
+            farthest_m=self.engine.max_range_mm.value * MM,
+        )

@@ -1,0 +1,125 @@
+"""Frames of an empirical camera: the ideal range of the view with the noise that a real unit's captures show.
+
+Modelled: noise that grows with range and darkness as measured, its correlation between neighbours, a fixed pattern with
+the measured spectrum, dropouts by amplitude, smoothed depth and missing pixels at steps, displacements of whole frames,
+drift, rounding. Not modelled by measurement: light that met more than one surface (the direct light alone counts),
+shadows of an emitter or of a second lens, texture that a stereo camera needs, noise shared by successive frames, and
+dropouts that come in clusters. The effects multipath, wiggling, ambient and saturation change nothing.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from harness.vocabulary.geometry import MM, Reason, Region
+from harness.vocabulary.seeds import random_stream
+from scenes.optics import NoiseFreeView, wave_numbers
+from scenes.sensor.camera import CameraConfig
+from scenes.sensor.empirical.facts import EmpiricalCamera
+from scenes.sensor.normals import standard_normals
+from scenes.sensor.tabled import filtered
+from scenes.sensor.unit import DecodedFrame, unit_error_m
+
+f4 = np.float32
+
+
+class IdealRange(NamedTuple):
+    """A view before noise, (h, w) each: ``range_m`` with the unit's errors, NaN for nothing; ``sigma_m``; ``amplitude``
+    in the recording's units; ``chance`` of no return in a frame."""
+
+    range_m: np.ndarray
+    sigma_m: np.ndarray
+    amplitude: np.ndarray
+    chance: np.ndarray
+
+
+class EmpiricalImager:
+    """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
+
+    def __init__(self, camera: EmpiricalCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
+        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+        self._stretch = np.sqrt(1 + (slopes**2).sum(axis=-1)).astype(f4)
+        self._filters = [np.asarray(taps.value, f4) for taps in (camera.noise.rows, camera.noise.columns)]
+
+    @cached_property
+    def static_error_m(self) -> np.ndarray:
+        """(h, w): all errors of range that frames of this unit share; the fixed pattern is cut from the sensor's."""
+        camera, config = self.camera, self.config
+        error = unit_error_m(camera, config, self.slopes[..., 0])
+        if not config.effects.fixed_pattern:
+            return error
+        facts, lens = camera.fixed_pattern, camera.nominal_lens
+        rng = random_stream(config.unit_seed, "fixed pattern", camera.name)
+        white = rng.standard_normal((lens.height, lens.width), dtype=f4)
+        field = filtered(white, *(np.asarray(taps.value, f4) for taps in (facts.rows, facts.columns)))
+        pattern_m = field * facts.deviation_mm.value * MM * config.fixed_pattern_scale
+        return np.asarray(error + pattern_m[self.region.within(lens.whole)])
+
+    def sigma_m(self, range_m: np.ndarray, brightness: np.ndarray) -> np.ndarray:
+        """Return the temporal deviation of range before rounding, metres, at a range and at a brightness relative to
+        the recorded surface, facing the camera."""
+        law = self.camera.noise
+        ends = np.clip(range_m, law.range_mm.value[0] * MM, law.range_mm.value[-1] * MM)
+        logs = np.interp(np.log(ends / MM), np.log(law.range_mm.value), np.log(law.sigma_mm.value))
+        beyond = (range_m / ends) ** law.range_exponent.value
+        return np.asarray(MM * np.exp(logs) * beyond * brightness**-law.brightness_exponent.value)
+
+    def expose(self, view: NoiseFreeView) -> IdealRange:
+        """Return the range, noise and chances of a view that covers this region."""
+        camera, effects = self.camera, self.config.effects
+        direct = view.phasor_direct[0].astype(complex)
+        light = np.abs(direct)
+        lit = light > 0
+        phase = np.mod(np.angle(direct), 2 * np.pi)
+        range_m = np.where(lit, phase / wave_numbers(view.frequencies_hz)[0] / 2, np.nan)
+        amplitude = light * camera.light.amplitude_at_1m.value / camera.light.albedo.value
+        with np.errstate(divide="ignore", invalid="ignore"):
+            brightness = np.where(lit, amplitude * range_m**2 / camera.light.amplitude_at_1m.value, np.nan)
+            sigma_m = np.where(lit, self.sigma_m(range_m, brightness), 0.0)
+            level = np.log(np.where(lit, amplitude, camera.dropouts.amplitude.value[0]))
+        chance = np.interp(level, np.log(camera.dropouts.amplitude.value), camera.dropouts.share.value)
+        if not effects.noise:
+            sigma_m, chance = np.zeros(lit.shape), np.zeros(lit.shape)
+        chance = np.where(lit, 1 - (1 - chance) * (1 - self._gap(range_m)), 1.0)
+        range_m = self._blurred(range_m) + self.static_error_m
+        return IdealRange(*(each.astype(f4) for each in (range_m, sigma_m, amplitude, chance)))
+
+    def _gap(self, range_m: np.ndarray) -> np.ndarray:
+        """Return the chance (h, w) that a step of depth takes a pixel's return; a share of a pixel is a chance."""
+        edge = self.camera.edge
+        far, near = (
+            fold(np.where(np.isfinite(range_m), range_m, empty), 3)
+            for fold, empty in ((ndimage.maximum_filter, -np.inf), (ndimage.minimum_filter, np.inf))
+        )
+        step = np.isfinite(range_m) & (far - near > edge.least_step_mm.value * MM)
+        if not step.any():
+            return np.zeros(range_m.shape)
+        return np.clip(edge.gap_px.value / 2 - ndimage.distance_transform_edt(~step), 0, 1)
+
+    def _blurred(self, range_m: np.ndarray) -> np.ndarray:
+        known, blur_px = np.isfinite(range_m), self.camera.edge.blur_px.value
+        if blur_px == 0:
+            return range_m
+        # of 1/z a plane is linear, so that only steps and curvature change
+        weight = ndimage.gaussian_filter(known.astype(float), blur_px)
+        inverse = ndimage.gaussian_filter(np.where(known, 1 / (range_m / self._stretch), 0.0), blur_px)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(known, weight / inverse * self._stretch, np.nan)
+
+    def frame(self, exposure: IdealRange, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
+        """Draw a frame with noise from ``rng``; ``error_m`` displaces it as a whole."""
+        engine, shape = self.camera.engine, exposure.range_m.shape
+        noise = filtered(standard_normals(rng, shape), *self._filters)
+        range_m = exposure.range_m + exposure.sigma_m * noise + f4(error_m)
+        step_m = self.camera.z_step_m
+        z_m = np.round(range_m / self._stretch / step_m) * step_m
+        with np.errstate(invalid="ignore"):
+            beyond = (range_m < engine.min_range_mm.value * MM) | (range_m > engine.max_range_mm.value * MM)
+        lost = np.isnan(exposure.range_m) | (rng.random(shape, dtype=f4) < exposure.chance)
+        reason = np.where(lost, Reason.NO_RETURN, np.where(beyond, Reason.OUT_OF_RANGE, Reason.VALID)).astype(np.uint8)
+        z_m = np.where(reason == Reason.VALID, z_m, np.nan).astype(f4)
+        return DecodedFrame(z_m, reason, exposure.amplitude)
