@@ -148,12 +148,12 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
     from detectors.recordings import open_capture
 
     file = None
-    if intrinsics is not None:
+    if intrinsics is not None and not (file := Path(intrinsics)).is_file():
         from scenes.sensor.camera import lens_named, lens_names
 
         if intrinsics in lens_names():
-            lens = lens_named(intrinsics)
-        elif not (file := Path(intrinsics)).exists():
+            file, lens = None, lens_named(intrinsics)
+        elif not file.exists():
             legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
     return open_capture(list(paths), intrinsics=file, lens=lens, **reading)

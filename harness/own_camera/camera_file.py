@@ -51,7 +51,7 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Origin:
-    """What the file says of itself: ``title``, names of the captures, frames per second with their tag and source, and
+    """A camera file's own words: ``title``, names of the captures, frames per second with their tag and source, and
     the surface's assumed albedo."""
 
     title: str

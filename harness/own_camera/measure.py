@@ -1,4 +1,4 @@
-"""What static captures of a depth camera tell: noise, correlation, dropouts, displaced frames, pattern, edges.
+"""Characteristics that static captures of a depth camera tell: noise, correlation, dropouts, displaced frames, pattern, edges.
 
 Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
 nor fixed pattern nor edges are told. Temporal noise is that of single pixels about their own mean, each frame's
@@ -180,7 +180,7 @@ def read_still(recording: Recording) -> StillCapture:
 
 
 @dataclass(frozen=True)
-class Cell:
+class NoiseCell:
     """Temporal noise ``sigma_m`` along the ray, before rounding, of ``pixels`` at like conditions, means of
     ``range_m``, ``angle_deg``, ``amplitude`` (NaN where not recorded) and ``light``: amplitude times range squared,
     or the cosine of the angle where no amplitude is recorded."""
@@ -194,7 +194,7 @@ class Cell:
     sigma_m: float
 
 
-def cells_of(capture: StillCapture) -> Iterator[Cell]:
+def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
     """Yield the noise of a capture in cells of range, angle and brightness."""
     use = capture.steady & np.isfinite(capture.variance_m2)
     range_m, cosine = (capture.mean_m * capture.stretch)[use], capture.cosine[use]
@@ -212,7 +212,7 @@ def cells_of(capture: StillCapture) -> Iterator[Cell]:
     for number in np.flatnonzero(counts >= LEAST_CELL_PX):
         r, angle, amp, bright, variance, stretch = (float(mean[number]) for mean in means)
         sigma_m = np.sqrt(before_rounding_m2(variance, capture.step_m)) * stretch
-        yield Cell(capture.name, int(counts[number]), r, angle, amp, bright, float(sigma_m))
+        yield NoiseCell(capture.name, int(counts[number]), r, angle, amp, bright, float(sigma_m))
 
 
 def before_rounding_m2(variance_m2: float, step_m: float) -> float:
@@ -229,7 +229,7 @@ def before_rounding_m2(variance_m2: float, step_m: float) -> float:
 
 
 @dataclass(frozen=True)
-class NoiseLaw:
+class RangeLaw:
     """Noise of the recorded surface, facing, before rounding: ``sigma_m`` at ``range_m`` (k,); as the power of range
     and of brightness, each with its standard error, which is NaN for an exponent that is assumed. ``light_at_1m``: the
     brightness that counts as 1."""
@@ -243,7 +243,7 @@ class NoiseLaw:
     light_at_1m: float
 
 
-def noise_law(cells: Sequence[Cell]) -> NoiseLaw:
+def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     """Return the law that fits the cells of all captures by weighted least squares of the logarithms."""
     r, light, sigma, angle = (
         np.array([getattr(c, k) for c in cells]) for k in ("range_m", "light", "sigma_m", "angle_deg")
@@ -269,7 +269,7 @@ def noise_law(cells: Sequence[Cell]) -> NoiseLaw:
         for values in (np.log(r), facing)
     )
     exponents = max(float(assumed[1]), 0.0), float(errors[1]), max(-float(assumed[2]), 0.0), float(errors[2])
-    return NoiseLaw(np.exp(at), np.exp(level), *exponents, light_at_1m)
+    return RangeLaw(np.exp(at), np.exp(level), *exponents, light_at_1m)
 
 
 def correlations(capture: StillCapture) -> np.ndarray:
@@ -433,8 +433,8 @@ class Characteristics:
     ``pattern_correlation`` likewise of the fixed pattern, None where that is not told."""
 
     captures: tuple[StillCapture, ...]
-    cells: tuple[Cell, ...]
-    law: NoiseLaw
+    cells: tuple[NoiseCell, ...]
+    law: RangeLaw
     correlation: np.ndarray
     dropouts: Dropouts
     surfaces: tuple[SurfaceFigures, ...]
@@ -444,7 +444,7 @@ class Characteristics:
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether every capture records amplitudes."""
+        """True where every capture records amplitudes."""
         return all(capture.amplitude is not None for capture in self.captures)
 
     @property

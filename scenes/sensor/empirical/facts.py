@@ -77,8 +77,8 @@ class DropoutFacts(Config):
 
 
 class EdgeKernelFacts(Config):
-    """What happens at a step of depth of ``least_step_mm`` or more between neighbours: no return within a band of
-    ``gap_px`` across it. ``blur_px``: deviation of the Gaussian that depth is smoothed by everywhere."""
+    """Losses at steps of depth of ``least_step_mm`` or more between neighbours: no return within a band of ``gap_px``
+    across them. ``blur_px``: deviation of the Gaussian that depth is smoothed by everywhere."""
 
     gap_px: Annotated[Fact[float], checked("from 0 to 100 pixels", lambda value: 0 <= value <= 100)]
     blur_px: Annotated[Fact[float], checked("from 0 to 30 pixels", lambda value: 0 <= value <= 30)]
