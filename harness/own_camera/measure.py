@@ -1,4 +1,4 @@
-"""Characteristics that static captures of a depth camera tell: noise, correlation, dropouts, displaced frames, pattern, edges.
+"""Characteristics that static captures of a depth camera tell: noise, correlation, dropouts, whole frames, edges.
 
 Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
 nor fixed pattern nor edges are told. Temporal noise is that of single pixels about their own mean, each frame's
