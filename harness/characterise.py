@@ -46,13 +46,23 @@ def _parser() -> argparse.ArgumentParser:
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
     add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
+    add(
+        "--certificate", action="store_true", help="write two pages to file or to send, certificate.html and .json, too"
+    )
+    study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"
+    add("--study", type=Path, metavar="DIR", help=study)
+    about = "what the certificate says of the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; repeat it"
+    add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
     return parser
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings
     from harness.own_camera.camera_file import Origin, Stated, simulated, write_camera
+    from harness.own_camera.certificate import write_certificate
     from harness.own_camera.measure import characteristics, read_still
     from harness.own_camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
     from harness.scorecard.capture import camera_of_size, twin_of
@@ -64,8 +74,13 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+    if not options.certificate and (options.study or options.about):
+        raise UserError("--study and --about concern the certificate", fix="give --certificate too, or leave them out")
+    if odd := [text for text in options.about if not text.partition("=")[2]]:
+        raise UserError(f"--about {odd[0]}: is no KEY=TEXT", legal="such as --about firmware=1.6")
     if options.rate is not None and not options.rate > 0:
         raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
+    study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     captures = []
     for path in options.paths:
@@ -104,6 +119,13 @@ def _run(options: argparse.Namespace, command: str) -> int:
     answer += f" {CAMERA_FILE} repeats it within {100 * _worst(rows):.0f} %." if noise else ""
     print(answer)
     write_page(options.out, sources, rows, f"{options.title}, characterised", answer, known or "", command)
+    if options.certificate:
+        lens = captures[0].lens
+        size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")
+        about = {"unit": options.title, "mode": size, "firmware": "not recorded", "warm-up": "not stated"}
+        about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
+        limits = [limit_of(one) for one in study.set_ups] if study else []
+        write_certificate(options.out, found, about, poses, study, limits, command)
     told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts(), "like": options.like}
     write_text(options.out / "provenance.json", json.dumps(told, indent=2) + "\n")
     print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")

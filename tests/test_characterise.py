@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -90,15 +91,15 @@ def recorded(path: Path, camera, z_m: np.ndarray, light: np.ndarray, frames: int
     return path
 
 
-def wall(camera, distance_m: float, slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of a tilted wall, and its light: a grey ramp of albedo 0.3 to 0.9 times the cosine over range squared."""
+def wall(camera, distance_m: float, slope: float = 0.0, albedos=(0.3, 0.9)) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a tilted wall, and its light: a grey ramp times the cosine over range squared."""
     slopes = camera.nominal_lens.region_slopes(camera.nominal_lens.whole)
     plane = Plane(distance_m, slope)
     z_m = plane.z_along_m(slopes)
     rays = np.concatenate([slopes, np.ones((*z_m.shape, 1))], axis=-1)
     range_m = z_m * np.linalg.norm(rays, axis=-1)
     cosine = -(rays @ plane.normal) / np.linalg.norm(rays, axis=-1)
-    albedo = np.linspace(0.3, 0.9, z_m.shape[0])[:, None]
+    albedo = np.linspace(*albedos, z_m.shape[0])[:, None]
     return z_m, albedo * cosine / range_m**2
 
 
@@ -114,6 +115,7 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     ]
     out = tmp_path / "out"
     given = [*map(str, paths), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(out)]
+    given += ["--certificate", "--about", "firmware=1.6"]
     assert characterise.main(given) == 0
     printed = capsys.readouterr().out
     assert "displaced as a whole" in printed
@@ -139,6 +141,12 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     first = table[table["figure"] == "noise correlation"].set_index("where")["measured"]
     assert first["x, lag 1"] == pytest.approx(0.5, abs=0.05) and first["y, lag 1"] == pytest.approx(0.48, abs=0.05)
     page = (out / "characterise.html").read_text()
+    certificate = (out / "certificate.html").read_text()
+    for words in ("firmware: 1.6", "warm-up: not stated", "LoD95", "ISO 10360-13", "No accreditation"):
+        assert words in certificate
+    told = json.loads((out / "certificate.json").read_text())
+    flat = [row for row in told["figures"] if row["quantity"] == "temporal noise"]
+    assert flat[0]["value"].startswith(f"{table['measured'].iloc[0]:.3g} (")
     assert "Measured and simulated" in page and "/tmp" not in re.sub(r"<pre>.*?</pre>", "", page, flags=re.DOTALL)
 
 
@@ -176,7 +184,7 @@ def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
         f"fixed_pattern: {{smooth_mm: {{value: {ripples}, tag: M, source: test}}}}\n"
     )
     camera = read_camera(other)
-    path = recorded(tmp_path / "wall.npz", camera, *wall(camera, 1.0, 0.2), 24)
+    path = recorded(tmp_path / "wall.npz", camera, *wall(camera, 1.0, 0.2, (0.6, 0.6)), 16, keep=False)
     given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--like", str(known), "--out"]
     assert characterise.main([*given, str(tmp_path / "out")]) == 0
     own = read_camera(tmp_path / "out" / "my_camera.yaml")
@@ -208,6 +216,8 @@ def test_bad_input_is_one_message(tmp_path, capsys):
         ("short.npz", [], "2 frames; temporal noise needs repeats"),
         ("equal.npz", ["--albedo", "0"], "--albedo 0"),
         ("equal.npz", ["--rate", "-1"], "--rate -1"),
+        ("equal.npz", ["--about", "firmware=1"], "concern the certificate"),
+        ("equal.npz", ["--certificate", "--about", "firmware"], "is no KEY=TEXT"),
         ("none.npz", [], "no such file"),
     ):
         assert characterise.main([str(tmp_path / name), *lens, *more]) == 2

@@ -147,12 +147,12 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
     options of `detectors.recordings.open_capture`."""
     from detectors.recordings import open_capture
 
-    file = None
-    if intrinsics is not None and not (file := Path(intrinsics)).is_file():
+    file = None if intrinsics is None else Path(intrinsics)
+    if file is not None and not file.is_file():
         from scenes.sensor.camera import lens_named, lens_names
 
-        if intrinsics in lens_names():
-            file, lens = None, lens_named(intrinsics)
+        if str(intrinsics) in lens_names():
+            file, lens = None, lens_named(str(intrinsics))
         elif not file.exists():
             legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)

@@ -332,8 +332,8 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
 class SurfaceFigures:
     """Figures of one flat surface, as makers name them. ``temporal``: temporal noise with its interval, mm.
     ``frame_rms_mm``: distance of a single frame's points from their own plane; ``average_rms_mm`` of the average's.
-    ``form95_mm``: width that 95 % of a single frame's points need about their plane. ``fill_rate``: share of pixels and
-    frames with a return."""
+    ``form95_mm``, ``form997_mm``: width that 95 and 99.7 % of a single frame's points need about it. ``fill_rate``:
+    share of pixels and frames with a return."""
 
     capture: str
     number: int
@@ -344,6 +344,7 @@ class SurfaceFigures:
     frame_rms_mm: float
     average_rms_mm: float
     form95_mm: float
+    form997_mm: float
     fill_rate: float
 
     @property
@@ -365,24 +366,24 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         noise = capture.noise_m.reshape(-1, use.size)[:, few]
         temporal = bench.jackknifed(noise[:, None], lambda part: bench.temporal_sigma_m(part) / MM)
         every = [_form(frame, slopes) for frame in z_m[:: max(1, len(z_m) // 5)]]
-        average_rms_mm, _ = _form(capture.mean_m.ravel()[few], slopes)
+        average_rms_mm, *_ = _form(capture.mean_m.ravel()[few], slopes)
         fill = float(np.isfinite(capture.z_m[:, surface_pixels(mask)]).mean())
         distance_m = float(np.median(capture.mean_m.ravel()[few]))
         angle_deg = float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[few]))))
-        rms_mm, form95_mm = np.mean(every, axis=0).tolist()
-        told = (distance_m, angle_deg, len(pixels), temporal, rms_mm, average_rms_mm, form95_mm, fill)
+        rms_mm, *forms_mm = np.mean(every, axis=0).tolist()
+        told = (distance_m, angle_deg, len(pixels), temporal, rms_mm, average_rms_mm, *forms_mm, fill)
         yield SurfaceFigures(capture.name, number, *told)
 
 
-def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float]:
-    """Return the rms in mm of points about their own plane, and the width that 95 % of them need."""
+def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
+    """Return the rms in mm of points about their own plane, and the widths that 95 and 99.7 % of them need."""
     there = np.isfinite(z_m)
     z_m, slopes = z_m[there].astype(float), slopes[there]
     plane = bench.fit_plane(z_m, slopes)
     off_mm = (z_m - plane.z_along_m(slopes)) * (1 - slopes @ np.array([plane.slope_x, plane.slope_y])) / MM
     off_mm /= np.sqrt(1 + plane.slope_x**2 + plane.slope_y**2)
-    low, high = np.quantile(off_mm, (0.025, 0.975))
-    return float(np.sqrt((off_mm**2).mean())), float(high - low)
+    least, low, high, most = np.quantile(off_mm, (0.0015, 0.025, 0.975, 0.9985))
+    return float(np.sqrt((off_mm**2).mean())), float(high - low), float(most - least)
 
 
 @dataclass(frozen=True)

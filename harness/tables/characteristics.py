@@ -98,4 +98,16 @@ DROPOUTS = Table(
     ),
     formats=("csv",),
 )
-OWN_CAMERA_TABLES = (OWN_FIGURES, NOISE_CELLS, CORRELATIONS, OWN_FRAMES, DROPOUTS)
+CERTIFIED = Table(
+    "certificate",
+    "one row per figure of a certificate",
+    (
+        Column("quantity", "quantity", note="what was measured"),
+        Column("conditions", "conditions", note="capture, distance and angle, or frames"),
+        Column("value", "value", note="with its unit"),
+        Column("manner", "how", note="definition, and the standard in whose manner it is"),
+        Column("share", "", note="measured or simulated"),
+    ),
+    formats=(),
+    left=4,
+)
