@@ -67,22 +67,25 @@ class StillCapture:
         return np.array([np.nanmean(z[use] - middle) for z in self.z_m])
 
     @cached_property
-    def trend(self) -> tuple[float, float, float]:
-        """Slope of the frames' displacement, metres a frame, and its 95 % interval (Theil and Sen)."""
-        return tuple(map(float, np.array(stats.theilslopes(self.offsets_m))[[0, 2, 3]]))  # type: ignore[return-value]
+    def drift_m(self) -> float:
+        """Change of the frames' displacement over the capture by its robust slope (Theil and Sen)."""
+        return float(stats.theilslopes(self.offsets_m)[0]) * (len(self.z_m) - 1)
+
+    @cached_property
+    def apart_m(self) -> np.ndarray:
+        """(n,) displacement of the frames without the drift."""
+        apart = self.offsets_m - self.drift_m * np.linspace(0, 1, len(self.z_m))
+        return np.asarray(apart - np.median(apart))
 
     @cached_property
     def kept(self) -> np.ndarray:
         """(n,) bool: frames that do not jump."""
-        apart = self.offsets_m - self.trend[0] * np.arange(len(self.z_m))
-        apart = apart - np.median(apart)
-        return np.abs(apart) <= max(JUMP_M, JUMP_SIGMAS * 1.4826 * float(np.median(np.abs(apart))))
+        return np.abs(self.apart_m) <= max(JUMP_M, JUMP_SIGMAS * 1.4826 * float(np.median(np.abs(self.apart_m))))
 
-    @cached_property
+    @property
     def jitter_m(self) -> float:
-        """Standard deviation of the displacement of frames that do not jump, their trend taken off."""
-        apart = self.offsets_m - self.trend[0] * np.arange(len(self.z_m))
-        return float(apart[self.kept].std(ddof=1))
+        """Standard deviation of the displacement of frames that do not jump."""
+        return float(self.apart_m[self.kept].std(ddof=1))
 
     @cached_property
     def steady(self) -> np.ndarray:
@@ -461,7 +464,7 @@ class Characteristics:
     @property
     def jump_m(self) -> float:
         """Mean size of their displacement, 0 without any."""
-        sizes = [np.abs(one.offsets_m - np.median(one.offsets_m))[~one.kept] for one in self.captures]
+        sizes = [np.abs(one.apart_m)[~one.kept] for one in self.captures]
         return float(np.concatenate(sizes).mean()) if self.jumped else 0.0
 
     @property

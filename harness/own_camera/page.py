@@ -9,16 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.own_camera.measure import Characteristics
-from harness.report.blocks import BLUE, COLOURS, GREY, ORANGE, RED, command_of, figure, heading, page, paragraph, svg
+from harness.report.blocks import BLUE, GREY, ORANGE, command_of, figure, heading, page, paragraph, svg
 from harness.scorecard.bench import Reading
-from harness.tables.characteristics import (
-    CORRELATIONS,
-    DROPOUTS,
-    NOISE_CELLS,
-    OWN_FIGURES,
-    OWN_FRAMES,
-    OwnFigure,
-)
+from harness.tables.characteristics import OWN_CURVES, OWN_FIGURES, OwnFigure
 from harness.tables.schema import Estimate, write_table
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM
@@ -28,6 +21,9 @@ if TYPE_CHECKING:
 
 MEASURED, SIMULATED, KNOWN = "measured", "simulated", "known camera"
 LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
+RANGE, ANGLE, AMPLITUDE = (f"noise, mm against {x}" for x in ("range, m", "angle, deg", "amplitude"))
+NEIGHBOURS, PATTERN = (f"correlation of {of} against pixels apart" for of in ("noise", "fixed pattern"))
+FRAMES, DROPPED = "displacement, mm against frame", "share without return against amplitude"
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
     "Upper row: the surfaces that were found; temporal noise against range, the dots in cells of like angle and "
@@ -53,6 +49,14 @@ def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading
             alike = Reading(float(found.correlation[axis, lag]))
             yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
     yield "frame jitter", "all", "mm", Reading(found.jitter_m / MM), "deviation of whole frames' displacement"
+    for capture in found.captures:
+        yield (
+            "drift",
+            capture.name,
+            "mm",
+            Reading(capture.drift_m / MM),
+            "change of the distance from first to last frame",
+        )
     share = Reading(found.jumped / found.frames)
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
     if found.pattern is not None and found.pattern_correlation is not None:
@@ -98,14 +102,9 @@ def write_page(
     where there is one, the ``known`` camera's by their names. Raises UserError where the folder cannot be written."""
     found = sources[MEASURED]
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
-    write_table(folder, NOISE_CELLS, NOISE_CELLS.frame(_cells(sources)))
-    write_table(folder, CORRELATIONS, CORRELATIONS.frame(_correlations(sources)))
-    write_table(folder, OWN_FRAMES, OWN_FRAMES.frame(_frames(found)))
-    drops = found.dropouts
-    levels = zip(drops.amplitude, drops.share, drops.pixels, strict=True)
-    steps = [dict(zip(("amplitude", "share", "pixels"), each, strict=True)) for each in levels]
-    write_table(folder, DROPOUTS, DROPOUTS.frame(steps))
-    drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, sources))
+    curves = [row for source, one in sources.items() for row in _curves(source, one)]
+    write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
+    drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, found, curves))
     heads = {"known camera": known, "its ratio": "its ratio" if known else ""}
     body = [
         figure({"captures": drawn}, "captures", CAPTION),
@@ -120,68 +119,44 @@ def write_page(
     write_text(folder / "characterise.html", page(title, answer, body, warnings=found.doubts()))
 
 
-def _cells(sources: Mapping[str, Characteristics]) -> list[dict[str, Any]]:
-    return [
-        {"source": source, **vars(cell), "sigma_mm": cell.sigma_m / MM}
-        for source, found in sources.items()
-        for cell in found.cells
-    ]
+def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
+    """Yield the points of all diagrams."""
 
+    def point(diagram: str, series: str, x: float, y: float) -> dict[str, Any]:
+        return {"diagram": diagram, "source": source, "series": series, "x": x, "y": y}
 
-def _correlations(sources: Mapping[str, Characteristics]) -> list[dict[str, Any]]:
-    return [
-        {"source": source, "of": of, "axis": axis, "lag_px": lag, "correlation": value}
-        for source, found in sources.items()
-        for of, both in (("noise", found.correlation), ("fixed pattern", found.pattern_correlation))
-        if both is not None
-        for axis, along in zip("xy", both.tolist(), strict=True)
-        for lag, value in enumerate(along)
-    ]
-
-
-def _frames(found: Characteristics) -> list[dict[str, Any]]:
-    return [
-        {"capture": capture.name, "frame": number, "displacement_mm": offset / MM, "kept": bool(kept)}
-        for capture in found.captures
-        for number, (offset, kept) in enumerate(zip(capture.offsets_m, capture.kept, strict=True))
-    ]
-
-
-def _draw(canvas: Figure, sources: Mapping[str, Characteristics]) -> None:
-    from matplotlib.colors import to_rgb
-
-    found = sources[MEASURED]
-    axes = canvas.subplots(2, 3).ravel()
-    largest = found.captures[0]
-    low, high = np.nanpercentile(largest.mean_m, [2, 98])
-    shade = np.clip((high - largest.mean_m) / max(high - low, MM), 0, 1) * 0.5 + 0.45
-    picture = np.repeat(np.nan_to_num(shade, nan=0.05)[..., None], 3, axis=-1)
-    for number, (_, mask) in enumerate(largest.planes):
-        picture[mask] = 0.45 * picture[mask] + 0.55 * np.array(to_rgb(COLOURS[number % len(COLOURS)]))
-    axes[0].imshow(picture)
-    axes[0].set(title=f"{len(largest.planes)} flat surfaces, {largest.name[:24]}", xticks=[], yticks=[])
-    for source, one in sources.items():
-        colour, marker = LOOKS[source]
-        points = [(cell.range_m, cell.sigma_m / MM) for cell in one.cells]
-        axes[1].plot(*zip(*points, strict=True), marker, color=colour, markersize=4, label=source)
-        axes[2].plot(one.correlation.mean(axis=0), marker + "-", color=colour, markersize=4)
-        if one.pattern_correlation is not None:
-            axes[5].plot(one.pattern_correlation.mean(axis=0), marker + "-", color=colour, markersize=4)
-        if len(one.dropouts.amplitude) > 1:
-            axes[4].semilogx(one.dropouts.amplitude, one.dropouts.share, marker + "-", color=colour, markersize=4)
-    axes[1].set(title="Noise against range", xlabel="range, m", ylabel="temporal noise, mm", ylim=(0, None))
-    axes[1].legend(fontsize=8)
-    axes[2].set(title="Noise of neighbours", xlabel="pixels apart", ylabel="correlation")
+    for cell in found.cells:
+        for diagram, x in ((RANGE, cell.range_m), (ANGLE, cell.angle_deg), (AMPLITUDE, cell.amplitude)):
+            if np.isfinite(x):
+                yield point(diagram, cell.capture, x, cell.sigma_m / MM)
+    for diagram, both in ((NEIGHBOURS, found.correlation), (PATTERN, found.pattern_correlation)):
+        for axis, along in zip("xy", [] if both is None else both.tolist(), strict=False):
+            yield from (point(diagram, axis, lag, value) for lag, value in enumerate(along))
     for capture in found.captures:
-        numbers = np.arange(len(capture.offsets_m))
-        axes[3].plot(numbers, capture.offsets_m / MM, color=BLUE, linewidth=0.8)
-        axes[3].plot(numbers[~capture.kept], capture.offsets_m[~capture.kept] / MM, "x", color=RED)
-    axes[3].set(title="Whole frames", xlabel="frame", ylabel="displacement, mm")
-    axes[4].set(title="Dropouts", xlabel="amplitude", ylabel="share without return", ylim=(-0.02, 1.02))
-    axes[5].set(title="Fixed pattern of neighbours", xlabel="pixels apart", ylabel="correlation")
-    for axis, empty, words in (
-        (axes[4], len(found.dropouts.amplitude) < 2, "one brightness only"),
-        (axes[5], found.pattern_correlation is None, "no flat surface"),
-    ):
-        if empty:
-            axis.text(0.5, 0.5, words, transform=axis.transAxes, ha="center", color=GREY)
+        yield from (point(FRAMES, capture.name, k, off / MM) for k, off in enumerate(capture.offsets_m.tolist()))
+    drops = found.dropouts
+    for level, share in zip(drops.amplitude.tolist(), drops.share.tolist(), strict=True):
+        if np.isfinite(level):
+            yield point(DROPPED, "all", level, share)
+
+
+def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) -> None:
+    axes, first = canvas.subplots(2, 3).ravel(), found.captures[0]
+    labels = np.full(first.stretch.shape, np.nan)
+    for number, (_, mask) in enumerate(first.planes):
+        labels[mask] = number
+    axes[0].imshow(first.mean_m, cmap="gray_r")
+    axes[0].imshow(labels, cmap="tab10", vmin=0, vmax=9, alpha=0.5, interpolation="nearest")
+    axes[0].set(title=f"{len(first.planes)} flat surfaces, {first.name[:24]}", xticks=[], yticks=[])
+    for axis, diagram in zip(axes[1:], (RANGE, NEIGHBOURS, FRAMES, DROPPED, PATTERN), strict=True):
+        own = [row for row in curves if row["diagram"] == diagram]
+        for source, (colour, marker) in LOOKS.items():
+            points = [(row["x"], row["y"]) for row in own if row["source"] == source]
+            if points and not (diagram == FRAMES and source != MEASURED):
+                axis.plot(*zip(*points, strict=True), marker, color=colour, markersize=4, label=source)
+        x, y = diagram.split(" against ")[::-1]
+        axis.set(xlabel=x, ylabel=y)
+        if not own:
+            axis.text(0.5, 0.5, "not told by the captures", transform=axis.transAxes, ha="center", color=GREY)
+    axes[1].legend(fontsize=8)
+    axes[1].set(ylim=(0, None))

@@ -1,4 +1,4 @@
-"""Tables of one's own camera: figures of its captures beside simulations, and the data of its page's diagrams."""
+"""Tables of one's own camera: figures of its captures beside simulations, its diagrams' points, its certificate."""
 
 from __future__ import annotations
 
@@ -51,50 +51,15 @@ OWN_FIGURES = Table(
     left=3,
 )  # fmt: skip
 
-NOISE_CELLS = Table(
-    "noise",
-    "one row per cell of like range, angle and brightness",
+OWN_CURVES = Table(
+    "curves",
+    "one row per point of a diagram of one's own camera",
     (
+        Column("diagram", note="what y is, and against what"),
         Column("source", note="measured, simulated or known camera"),
-        Column("capture", note="name of the capture"),
-        Column("range_m", note="mean distance along the ray"),
-        Column("angle_deg", note="mean angle of incidence on the surface"),
-        Column("amplitude", note="mean amplitude in the recording's units, empty where not recorded"),
-        Column("pixels", note="number of pixels"),
-        Column("sigma_mm", note="temporal deviation along the ray, before rounding"),
-    ),
-    formats=("csv",),
-)
-CORRELATIONS = Table(
-    "correlation",
-    "one row per lag",
-    (
-        Column("source", note="measured, simulated or known camera"),
-        Column("of", note="noise, or fixed pattern"),
-        Column("axis", note="x along rows, y along columns"),
-        Column("lag_px", note="pixels between the two"),
-        Column("correlation", note="of pixels so far apart"),
-    ),
-    formats=("csv",),
-)
-OWN_FRAMES = Table(
-    "frames",
-    "one row per frame of one's own captures",
-    (
-        Column("capture", note="name of the capture"),
-        Column("frame", note="number of the frame, from 0"),
-        Column("displacement_mm", note="of the whole frame against the mean of all, along the optical axis"),
-        Column("kept", note="whether the frame counts for the noise"),
-    ),
-    formats=("csv",),
-)
-DROPOUTS = Table(
-    "dropouts",
-    "one row per step of brightness",
-    (
-        Column("amplitude", note="mean amplitude in the recording's units, empty where not recorded"),
-        Column("share", note="share of frames in which a pixel of a surface returns nothing"),
-        Column("pixels", note="number of pixels"),
+        Column("series", note="capture, or direction"),
+        Column("x", note="m, degrees, amplitude, pixels or number of the frame, by the diagram"),
+        Column("y", note="mm, share or correlation, by the diagram"),
     ),
     formats=("csv",),
 )
