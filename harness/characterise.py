@@ -57,7 +57,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
-    from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings
@@ -124,8 +123,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")
         about = {"unit": options.title, "mode": size, "firmware": "not recorded", "warm-up": "not stated"}
         about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
-        limits = [limit_of(one) for one in study.set_ups] if study else []
-        write_certificate(options.out, found, about, poses, study, limits, command)
+        write_certificate(options.out, found, about, poses, study, command)
     told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts(), "like": options.like}
     write_text(options.out / "provenance.json", json.dumps(told, indent=2) + "\n")
     print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")

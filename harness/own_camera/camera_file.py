@@ -8,6 +8,7 @@ measured, and the gain holds for it.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date
@@ -19,12 +20,13 @@ from scipy import ndimage
 
 from harness.own_camera.measure import WIDEST_PX, Characteristics, StillCapture, characteristics, surfaces_of
 from harness.scorecard.capture import twin_of
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM, Lens
 from scenes.closed_form import image_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import with_number
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, read_camera
+from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, is_camera_path, read_camera
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import taps_of
@@ -69,6 +71,8 @@ def write_camera(path: Path, like: str | None, found: Characteristics, origin: O
     """Write the camera's file, of a known camera ``like`` or empirical, and return the camera. Raises UserError where
     the known camera has another image size, and where the file cannot be written."""
     facts = list(_refitted(like, found, origin) if like else _empirical(found, origin))
+    if like and is_camera_path(like):
+        like = os.path.relpath(like, path.parent)  # a path counts from the file that names it
     kind = f"like: {json.dumps(like)}" if like else "kind: empirical"
     lines = [f"# {one}" for one in ("Tags: O measured on the owner's captures, M assumed.", *found.doubts())]
     lines += [f"name: {path.stem}", f"title: {json.dumps(origin.title)}", kind]
@@ -157,7 +161,9 @@ def _filters(section: str, correlation: np.ndarray, source: str, tag: str) -> It
 def _refitted(like: str, found: Characteristics, origin: Origin) -> Iterator[Stated]:
     source = origin.source
     camera = twin_of(like, found.captures[0].lens, origin.albedo).camera
-    assert not isinstance(camera, EmpiricalCamera)
+    if isinstance(camera, EmpiricalCamera) or not found.surfaces:
+        what = "is an empirical camera" if found.surfaces else "is refitted on flat surfaces, and none was found"
+        raise UserError(f"--like {like}: {what}", fix="leave out --like: the file is then an empirical camera")
     yield from _lens(found.captures[0].lens, f"lens of the recording; {source}")
     camera, gain = _gain(camera, found, origin.albedo)
     yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise, albedo {origin.albedo:g}; {source}")

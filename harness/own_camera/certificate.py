@@ -11,13 +11,12 @@ import json
 from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from detectors.noise import rounding_left_m2
-from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import StudyRecord
 from harness.own_camera.measure import Characteristics
 from harness.report.blocks import bullets, heading, note, page
@@ -61,52 +60,45 @@ def spacings_mm(found: Characteristics, poses: Sequence[np.ndarray] | None) -> l
     return errors
 
 
-def certified(
-    found: Characteristics, poses: Sequence[np.ndarray] | None, limits: Sequence[SetUpLimit]
-) -> Iterator[dict[str, Any]]:
-    """Yield the certificate's rows: quantity, conditions, value as text, manner, and whether measured or simulated."""
+def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Iterator[dict[str, str]]:
+    """Yield the certificate's rows."""
 
-    def row(quantity: str, conditions: str, value: str, manner: str, share: str = "measured") -> dict[str, Any]:
-        return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner, "share": share}
+    def row(quantity: str, conditions: str, value: str, manner: str) -> dict[str, str]:
+        return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner}
 
     for one in found.surfaces:
-        at = f"{one.capture}: {one.distance_m:.2f} m, {one.angle_deg:.0f}°"
-        ends = one.temporal.interval
+        at, ends = f"{one.capture}: {one.distance_m:.2f} m, {one.angle_deg:.0f}°", one.temporal.interval
         told = f" ({ends.low:.3g} to {ends.high:.3g})" if np.isfinite(ends.low) else ""
         yield row(
-            "temporal noise", at, f"{one.temporal.value:.3g}{told} mm", "standard deviation of single pixels, 95 %"
+            "temporal noise", at, f"{one.temporal.value:.3g}{told} mm", "deviation of single pixels, 95 % interval"
         )
         for name, value, manner in (
             ("plane-fit rms, one frame", one.frame_rms_mm, "of all points about their plane"),
             ("plane-fit rms, average", one.average_rms_mm, "of the average of all frames"),
             ("flat-form dispersion, 95 %", one.form95_mm, "in the manner of ISO 10360-13; the flat is not calibrated"),
-            ("flatness measurement error", one.form997_mm, "in the manner of VDI/VDE 2634-2, 0.3 % of points left out;"
-             " likewise"),
-        ):  # fmt: skip
+            ("flatness measurement error", one.form997_mm, "in the manner of VDI/VDE 2634-2, without 0.3 % of points"),
+        ):
             yield row(name, at, f"{value:.3g} mm", manner)
         yield row("fill rate", at, f"{100 * one.fill_rate:.2f} %", "share of pixels and frames with a return")
-        variance_m2 = (one.temporal.value * MM) ** 2
-        for frames in LOD_FRAMES:
-            value = f"{level_of_detection_mm(found, variance_m2, frames):.3g} mm"
-            yield row("level of detection, LoD95", f"{at}, {frames} frames", value, "1.96 deviations of a pixel's z")
+        lods = (level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES)
+        frames_at = f"{at}, {' / '.join(map(str, LOD_FRAMES))} frames"
+        value = " / ".join(f"{lod:.3g}" for lod in lods)
+        yield row(
+            "level of detection, LoD95", frames_at, f"{value} mm", "1.96 deviations of a pixel's z, pattern included"
+        )
     lags = ", ".join(f"{value:.2f}" for value in found.correlation.mean(axis=0)[1:6])
-    yield row("noise correlation", "lags 1 to 5 pixels", lags, "mean of rows and columns")
+    yield row("spectrum: noise correlation", "lags 1 to 5 pixels", lags, "mean of rows and columns")
     if found.pattern is not None and found.pattern_correlation is not None:
         near, far = found.pattern.field.distances_m
         value = f"{found.pattern.field.rms_m / MM:.3g} mm"
         yield row(
             "fixed pattern", f"{near:.2f} to {far:.2f} m", value, "error of range that all frames share, less a fit"
         )
-        below = np.flatnonzero(found.pattern_correlation.mean(axis=0) < 0.5)
-        reach = f"{below[0]} pixels" if len(below) else f"over {found.pattern_correlation.shape[1] - 1} pixels"
-        yield row("reach of the pattern", "all", reach, "lag at which its correlation falls below one half")
     errors = spacings_mm(found, poses)
     value = f"{max(map(abs, errors)):.3g} mm at most" if errors else NOT_MEASURED
-    manner = (
-        "plane spacing by the stated poses, in the manner of ISO 10360-13" if errors else "needs captures with --poses"
-    )
-    yield row("spacing error", f"{len(errors)} spacings" if errors else "none", value, manner)
-    yield row("probing-form and size error", "none", NOT_MEASURED, "VDI/VDE 2634-2 asks for a calibrated sphere")
+    manner = "spacing of planes by the stated poses, in the manner of ISO 10360-13; needs --poses"
+    yield row("spacing error", f"{len(errors)} spacings", value, manner)
+    yield row("probing-form and size error", "", NOT_MEASURED, "VDI/VDE 2634-2 asks for a calibrated sphere")
 
 
 def write_certificate(
@@ -115,12 +107,11 @@ def write_certificate(
     about: dict[str, str],
     poses: Sequence[np.ndarray] | None,
     study: StudyRecord | None,
-    limits: Sequence[SetUpLimit],
     command: str,
 ) -> None:
     """Write ``certificate.html`` and ``certificate.json`` into a folder. ``about``: unit, mode, firmware, warm-up and
-    such, in words. ``study`` with its ``limits``, where there is one. Raises UserError where they cannot be written."""
-    rows = list(certified(found, poses, limits))
+    such, in words. Raises UserError where they cannot be written."""
+    rows, limits = list(certified(found, poses)), [limit_of(one) for one in study.set_ups] if study else []
     implanted = study is not None and study.name == "implant"
     share = "The camera's figures are measured."
     if study is not None:

@@ -160,7 +160,7 @@ def read_still(recording: Recording) -> StillCapture:
     if not recording.organised or recording.lens is None or recording.slopes is None:
         what = f"{recording.name}: points without a pixel grid and a lens do not tell a camera's noise"
         raise UserError(what, legal="depth images with a lens", fix="name a lens with --intrinsics")
-    frames = list(islice(recording.frames(), MOST_FRAMES))
+    frames = [frame for frame in islice(recording.frames(), MOST_FRAMES) if np.isfinite(frame.z_m).any()]
     if len(frames) < LEAST_FRAMES:
         what = f"{recording.name}: {len(frames)} frame{'s' * (len(frames) > 1)}; temporal noise needs repeats"
         raise UserError(what, legal=f"{LEAST_FRAMES} frames or more of a static scene", fix="record 50 or more")

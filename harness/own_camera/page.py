@@ -57,6 +57,8 @@ def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading
             Reading(capture.drift_m / MM),
             "change of the distance from first to last frame",
         )
+    step = Reading(found.captures[0].step_m / MM)
+    yield "rounding step", "all", "mm", step, "of the stored distance along the axis"
     share = Reading(found.jumped / found.frames)
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
     if found.pattern is not None and found.pattern_correlation is not None:

@@ -71,7 +71,6 @@ CERTIFIED = Table(
         Column("conditions", "conditions", note="capture, distance and angle, or frames"),
         Column("value", "value", note="with its unit"),
         Column("manner", "how", note="definition, and the standard in whose manner it is"),
-        Column("share", "", note="measured or simulated"),
     ),
     formats=(),
     left=4,
