@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings
-    from harness.own_camera.camera_file import Origin, Stated, simulated, write_camera
+    from harness.own_camera.camera_file import Stated, simulated, write_camera
     from harness.own_camera.certificate import write_certificate
     from harness.own_camera.measure import characteristics, read_still
     from harness.own_camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
@@ -89,7 +89,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         print_notes(recording.notes)
         print_warnings(recording.warnings)
     found = characteristics(captures, poses)
-    print_warnings(found.doubts())
+    print_warnings(found.doubts)
     known = options.like
     if known is None:
         try:
@@ -102,9 +102,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
         value, source = (30.0, "assumed") if of_like is None else (of_like.value, f"of {options.like}")
         rate = Stated("unit", "frames_per_second", value, source, "M")
     names = ", ".join(capture.name for capture in captures)
-    origin = Origin(options.title, names, rate, options.albedo)
     print("fitting the camera file ..", flush=True)
-    camera = write_camera(options.out / CAMERA_FILE, options.like, found, origin)
+    camera = write_camera(options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate)
     print("simulating the captures from it ..", flush=True)
     twin = characteristics(simulated(camera, found, options.albedo), poses)
     sources = {MEASURED: found, SIMULATED: twin}
@@ -124,7 +123,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         about = {"unit": options.title, "mode": size, "firmware": "not recorded", "warm-up": "not stated"}
         about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
         write_certificate(options.out, found, about, poses, study, command)
-    told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts(), "like": options.like}
+    told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts, "like": options.like}
     write_text(options.out / "provenance.json", json.dumps(told, indent=2) + "\n")
     print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")
     return 0

@@ -122,7 +122,7 @@ def write_certificate(
         share,
         "The figures hold for this unit, mode, distance, angle and surface, and for the warm-up that is stated.",
         "Tags of the camera file say of each of its numbers whether it was measured, taken over or assumed.",
-        f"Frames: {found.frames} in {len(found.captures)} captures, {found.jumped} of them left out as displaced.",
+        f"Frames: {found.frames} in {len(found.captures)} captures, {len(found.jumps_m)} left out as displaced.",
         "No accreditation is claimed: artefacts were not calibrated, and procedures are in the manner of the standards"
         " that are named.",
     ]  # fmt: skip
@@ -142,14 +142,14 @@ def write_certificate(
         ]
     body += [heading("Validity"), bullets(conditions), note(f"Issued {date.today().isoformat()} by: {command}")]
     answer = f"{found.frames} frames, {len(found.surfaces)} flat surfaces" + (f", study {study.name}" if study else "")
-    text = page(f"Certificate of measurement: {about['unit']}", answer, body, warnings=found.doubts())
+    text = page(f"Certificate of measurement: {about['unit']}", answer, body, warnings=found.doubts)
     told = {
         "results_version": RESULTS_VERSION,
         "about": about,
         "figures": CERTIFIED.data(rows),
         "conditions": conditions,
     }
-    told |= {"limits": LIMITS.data(limits), "doubts": found.doubts(), "command": command}
+    told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)
     write_text(folder / "certificate.json", json.dumps(told, indent=2, ensure_ascii=False) + "\n")
 

@@ -59,7 +59,7 @@ def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading
         )
     step = Reading(found.captures[0].step_m / MM)
     yield "rounding step", "all", "mm", step, "of the stored distance along the axis"
-    share = Reading(found.jumped / found.frames)
+    share = Reading(len(found.jumps_m) / found.frames)
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
     if found.pattern is not None and found.pattern_correlation is not None:
         rms = Reading(found.pattern.field.rms_m / MM)
@@ -118,7 +118,7 @@ def write_page(
         OWN_FIGURES.grid(rows, heads=heads).html(),
         *command_of(command),
     ]
-    write_text(folder / "characterise.html", page(title, answer, body, warnings=found.doubts()))
+    write_text(folder / "characterise.html", page(title, answer, body, warnings=found.doubts))
 
 
 def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
