@@ -40,7 +40,12 @@ def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading
         for name, value, meaning in (
             ("plane-fit rms, one frame", one.frame_rms_mm, f"spatial noise of points about their own plane; {relief}"),
             ("plane-fit rms, average", one.average_rms_mm, f"the same of the average of all frames; {relief}"),
-            ("form, 95 %", one.form95_mm, f"width that 95 % of one frame's points need; {relief}"),
+            (
+                "flat-form dispersion, 95 %",
+                one.form95_mm,
+                f"width that 95 % of a frame's points need, in the manner of ISO 10360-13; {relief}",
+            ),
+            ("flatness, 99.7 %", one.form997_mm, f"in the manner of VDI/VDE 2634-2; {relief}"),
         ):
             yield name, one.where, "mm", Reading(value), meaning
         yield "fill rate", one.where, "1", Reading(one.fill_rate), "share of pixels and frames with a return"
