@@ -6,6 +6,7 @@ import argparse
 import json
 import shlex
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,24 +91,19 @@ def _run(options: argparse.Namespace, command: str) -> int:
         print_warnings(recording.warnings)
     found = characteristics(captures, poses)
     print_warnings(found.doubts)
-    known = options.like
-    if known is None:
-        try:
-            known = camera_of_size(captures[0].lens)
-        except UserError:
-            known = None
-    rate = Stated("unit", "frames_per_second", options.rate, "stated by the user", "U")
-    if options.rate is None:
-        of_like = load_camera(options.like).unit.frames_per_second if options.like else None
-        value, source = (30.0, "assumed") if of_like is None else (of_like.value, f"of {options.like}")
-        rate = Stated("unit", "frames_per_second", value, source, "M")
+    told = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
+    if options.like and not options.rate:
+        told = (load_camera(options.like).unit.frames_per_second.value, f"of {options.like}", "M")
+    rate = Stated("unit", "frames_per_second", *told)
     names = ", ".join(capture.name for capture in captures)
     print("fitting the camera file ..", flush=True)
     camera = write_camera(options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate)
     print("simulating the captures from it ..", flush=True)
     twin = characteristics(simulated(camera, found, options.albedo), poses)
     sources = {MEASURED: found, SIMULATED: twin}
-    if known is not None:
+    known = options.like
+    with suppress(UserError):  # none is as large, or it sees nothing of the surfaces
+        known = known or camera_of_size(captures[0].lens)
         other = twin_of(known, captures[0].lens, options.albedo).camera
         sources[KNOWN] = characteristics(simulated(other, found, options.albedo), poses)
     rows = beside(found, twin, sources.get(KNOWN))
@@ -123,8 +119,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
         about = {"unit": options.title, "mode": size, "firmware": "not recorded", "warm-up": "not stated"}
         about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
         write_certificate(options.out, found, about, poses, study, command)
-    told = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts, "like": options.like}
-    write_text(options.out / "provenance.json", json.dumps(told, indent=2) + "\n")
+    origin = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts, "like": options.like}
+    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
     print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")
     return 0
 

@@ -46,13 +46,6 @@ class NoiseLawFacts(Config):
     rows: Taps
     columns: Taps
 
-    @model_validator(mode="after")
-    def _one_deviation_for_each_range(self) -> NoiseLawFacts:
-        ranges = self.range_mm.value
-        if len(ranges) != len(self.sigma_mm.value) or not ranges or list(ranges) != sorted(set(ranges)):
-            raise ValueError("noise.range_mm must increase, and noise.sigma_mm needs one value for each of them")
-        return self
-
 
 class FilteredPatternFacts(Config):
     """Fixed pattern, the same in every frame of a unit: white noise of ``deviation_mm`` after two filters."""
@@ -67,13 +60,6 @@ class DropoutFacts(Config):
 
     amplitude: Values
     share: Shares
-
-    @model_validator(mode="after")
-    def _one_share_for_each_amplitude(self) -> DropoutFacts:
-        levels = self.amplitude.value
-        if len(levels) != len(self.share.value) or not levels or list(levels) != sorted(set(levels)):
-            raise ValueError("dropouts.amplitude must increase, and dropouts.share needs one value for each of them")
-        return self
 
 
 class EdgeKernelFacts(Config):
@@ -105,7 +91,11 @@ class EmpiricalCamera(CameraFacts):
     engine: OutputFacts
 
     @model_validator(mode="after")
-    def _limits_in_order(self) -> EmpiricalCamera:
+    def _possible(self) -> EmpiricalCamera:
+        for section, key, other in (("noise", "range_mm", "sigma_mm"), ("dropouts", "amplitude", "share")):
+            levels, values = (getattr(getattr(self, section), name).value for name in (key, other))
+            if not levels or len(levels) != len(values) or list(levels) != sorted(set(levels)):
+                raise ValueError(f"{section}.{key} must increase, and {section}.{other} needs a value for each of them")
         if self.engine.min_range_mm.value >= self.engine.max_range_mm.value:
             raise ValueError("engine.min_range_mm must be less than engine.max_range_mm")
         return self

@@ -59,9 +59,7 @@ class EmpiricalImager:
         pattern_m = field * facts.deviation_mm.value * MM * config.fixed_pattern_scale
         return np.asarray(error + pattern_m[self.region.within(lens.whole)])
 
-    def sigma_m(self, range_m: np.ndarray, brightness: np.ndarray) -> np.ndarray:
-        """Return the temporal deviation of range before rounding, metres, at a range and at a brightness relative to
-        the recorded surface, facing the camera."""
+    def _sigma_m(self, range_m: np.ndarray, brightness: np.ndarray) -> np.ndarray:
         law = self.camera.noise
         ends = np.clip(range_m, law.range_mm.value[0] * MM, law.range_mm.value[-1] * MM)
         logs = np.interp(np.log(ends / MM), np.log(law.range_mm.value), np.log(law.sigma_mm.value))
@@ -79,7 +77,7 @@ class EmpiricalImager:
         amplitude = light * camera.light.amplitude_at_1m.value / camera.light.albedo.value
         with np.errstate(divide="ignore", invalid="ignore"):
             brightness = np.where(lit, amplitude * range_m**2 / camera.light.amplitude_at_1m.value, np.nan)
-            sigma_m = np.where(lit, self.sigma_m(range_m, brightness), 0.0)
+            sigma_m = np.where(lit, self._sigma_m(range_m, brightness), 0.0)
             level = np.log(np.where(lit, amplitude, camera.dropouts.amplitude.value[0]))
         chance = np.interp(level, np.log(camera.dropouts.amplitude.value), camera.dropouts.share.value)
         if not effects.noise:
