@@ -23,6 +23,7 @@ from harness.own_camera.page import own_figures
 from harness.report.blocks import bullets, heading, note, page
 from harness.tables.characteristics import CERTIFIED
 from harness.tables.limits import LIMITS
+from harness.tables.text import many
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -31,7 +32,7 @@ LOD_FRAMES = (1, 10, 50)
 PRINTED = Markup(
     "<style>@page { margin: 14mm } @media print { body { font-size: 9pt } table { font-size: 7.6pt }"
     " th, td { padding: 2px 5px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { font-size: 10.5pt }"
-    " }</style>"
+    " input { display: none } }</style>"
 )
 SHOWN_LIMITS = ("set-up", "a90/95 (mm)", "over boards (mm)", "a90 (mm)", "a50 (mm)", "calls/m² (95 %)", "found")
 POD = (
@@ -70,6 +71,8 @@ def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Ite
         return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner}
 
     for name, where, unit, reading, meaning in own_figures(found):
+        if name.endswith("correlation") and not where.endswith(" lag 1"):
+            continue  # the rest stands on the page
         ends = reading.interval
         told = f" ({ends.low:.3g} to {ends.high:.3g})" if np.isfinite(ends.low) else ""
         yield row(name, where, f"{reading.value:.3g}{told} {unit}".removesuffix(" 1"), meaning)
@@ -99,7 +102,7 @@ def write_certificate(
     if study is not None:
         implanted = "Of the detection limits the frames are measured and the damage is simulated."
         share += f" {implanted if study.name == 'implant' else 'The detection limits are simulated.'}"
-    frames = f"{found.frames} frames in {len(found.captures)} captures, {len(found.jumps_m)} left out as displaced"
+    frames = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]
     body += [heading("Measured"), CERTIFIED.grid(rows).html()]
     if study is not None:

@@ -35,7 +35,7 @@ CAPTION = (
 def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading, str]]:
     """Yield name, place, unit, value and meaning of each figure; the same of every source, in the same order."""
     for one in found.surfaces:
-        relief = "the surface's own shape and the lens' error included, which no simulation has"
+        relief = "the surface's own shape and the lens' error included"
         yield "temporal noise", one.where, "mm", one.temporal, "deviation of single pixels over frames, of z"
         for name, value, meaning in (
             ("plane-fit rms, one frame", one.frame_rms_mm, f"spatial noise of points about their own plane; {relief}"),

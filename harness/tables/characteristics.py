@@ -45,7 +45,7 @@ OWN_FIGURES = Table(
         Column("ratio", "ratio", "ratio", "simulated by measured"),
         Column("known", "known camera", "known", "of the nearest known camera, simulated before the same surfaces"),
         Column("known_ratio", "its ratio", "known_ratio", "known camera's by measured", brief=False),
-        Column("meaning", "meaning", "meaning", "what the figure says", brief=False),
+        Column("meaning", "", "meaning", "what the figure says"),
     ),
     formats=("csv",),
     left=3,
