@@ -94,6 +94,12 @@ def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
     yield Stated("unit", "jump_rate", len(jumps_m) / found.frames, f"{len(jumps_m)} of {found.frames} frames; {source}")
     yield Stated("unit", "jump_mm", jumps_m.mean() / MM if len(jumps_m) else 0.0, source)
     yield Stated("unit", "jitter_mm", found.jitter_m / MM, source)
+    yield Stated("engine", "output_step_mm", _step_mm(found), f"step of the stored depth; {source}")
+
+
+def _step_mm(found: Characteristics) -> float:
+    """Return the step that the captures were stored in; a micrometre for numbers that are not rounded."""
+    return found.captures[0].step_m / MM or 1e-3
 
 
 def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
@@ -128,8 +134,6 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
     yield Stated("edge", "least_step_mm", 20.0, "smaller steps are taken to cost no return; not measured", "M")
     yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {NOT_TOLD}", "M")
     yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {NOT_TOLD}", "M")
-    step_m = found.captures[0].step_m
-    yield Stated("engine", "output_step_mm", step_m / MM if step_m > 0 else 1e-3, f"step of the stored depth; {source}")
 
 
 # ---------------------------------------------------------------- a known camera's model, refitted
@@ -140,7 +144,7 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
     if isinstance(camera, EmpiricalCamera) or not found.surfaces:
         what = "is an empirical camera" if found.surfaces else "is refitted on flat surfaces, and none was found"
         raise UserError(f"--like {like}: {what}", fix="leave out --like: the file is then an empirical camera")
-    camera, gain = _gain(camera, found, albedo)
+    camera, gain = _gain(with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo)
     yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise, albedo {albedo:g}; {source}")
     again = simulated(camera, found, albedo, FEW_FRAMES)
     own = characteristics(again).pattern

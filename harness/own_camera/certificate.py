@@ -80,8 +80,8 @@ def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Ite
         lods = [level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES]
         value, manner = " / ".join(f"{lod:.3g}" for lod in lods), "1.96 deviations of a pixel's z, pattern included"
         yield row(f"LoD95, {' / '.join(map(str, LOD_FRAMES))} frames", one.where, f"{value} mm", manner)
-    told = poses is not None and len(poses) > 1 and all(capture.planes for capture in found.captures)
-    errors = list(spacings_mm(found, poses)) if told and poses is not None else []
+    flat = all(capture.planes for capture in found.captures)
+    errors = [] if poses is None or not flat else list(spacings_mm(found, poses))
     value = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
     yield row("spacing error", f"{len(errors)} spacings", value, "of planes by --poses, in the manner of ISO 10360-13")
     yield row("probing-form and size error", "", "not measured", "VDI/VDE 2634-2 asks for a calibrated sphere")

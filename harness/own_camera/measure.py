@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage, optimize, stats
@@ -197,7 +197,7 @@ def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
         *at, variance, stretch = (float(mean[number]) for mean in means)
         sigma_m = np.sqrt(before_rounding_m2(variance, capture.step_m)) * stretch
         if sigma_m > 0:
-            yield NoiseCell(capture.name, int(counts[number]), *at, float(sigma_m))
+            yield NoiseCell._make((capture.name, int(counts[number]), *at, float(sigma_m)))
 
 
 def before_rounding_m2(variance_m2: float, step_m: float) -> float:
@@ -279,9 +279,8 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
     groups = [number == one for one in np.unique(number[np.isfinite(level)]) if (number == one).sum() >= LEAST_BIN_PX]
     if not groups:
         return Dropouts(np.array([np.nan]), np.array([share.mean() if len(share) else 0.0]), np.array([len(share)]))
-    return Dropouts(
-        *(np.array([of[g].mean() for g in groups]) for of in (level, share)), np.array([g.sum() for g in groups])
-    )
+    means = [np.array([of[group].mean() for group in groups]) for of in (level, share)]
+    return Dropouts._make((*means, np.array([group.sum() for group in groups])))
 
 
 @dataclass(frozen=True)
@@ -320,7 +319,8 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         rms_mm, *forms_mm = np.mean([_form(frame, slopes) for frame in z_m[:: max(1, len(z_m) // 5)]], axis=0).tolist()
         at = float(np.median(mean_m)), float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[few]))))
         fill = float(np.isfinite(capture.z_m[:, surface_pixels(mask)]).mean())
-        yield SurfaceFigures(capture.name, number, *at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill)
+        told: list[Any] = [*at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill]
+        yield SurfaceFigures(capture.name, number, *told)
 
 
 def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
