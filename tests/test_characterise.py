@@ -18,7 +18,7 @@ from scenes.sensor.camera import CameraConfig, EffectsConfig, load_camera, read_
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
 
-FRAMES = 40
+FRAMES = 30
 TRUTH = """
 name: true_camera
 title: A stereo camera
@@ -170,7 +170,7 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
 def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
     """A unit of the L515 with other numbers: its gain within 10 %."""
     data = YAML(typ="safe").load((Path(load_camera.__globals__["CAMERA_FOLDER"]) / "realsense_l515.yaml").read_text())
-    small = {"width_px": 200, "height_px": 160, "fx_px": 220.0, "fy_px": 220.0, "cx_px": 100.0, "cy_px": 80.0}
+    small = {"width_px": 110, "height_px": 90, "fx_px": 150.0, "fy_px": 150.0, "cx_px": 55.0, "cy_px": 45.0}
     lines = ["name: known", "title: known", "like: realsense_l515", "lens:"]
     lines += [f"  {key}: {{value: {value}, tag: M, source: test}}" for key, value in small.items()]
     known = tmp_path / "known.yaml"
