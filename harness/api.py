@@ -25,10 +25,8 @@ Units are SI; where they are not, names say so.
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,17 +34,20 @@ from detectors import load_detector
 from detectors.average import AverageConfig
 from detectors.average import average as averaged
 from detectors.recordings import open_capture
+from harness.engine.work import EngineOptions
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
+from harness.experiment.schema import SimulatedSource
 from harness.inspection.run import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
-from harness.report.pod import limits_figure
+from harness.report.study_page import draw_overlay
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, FrameSource
 from scenes.optics import RenderConfig
+from scenes.render.cache import cached_view
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
@@ -58,8 +59,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Cloud", "Finding", "Results", "UserError", "average", "detect", "findings_table", "frames", "load", "plot",
-    "plot_pod", "render", "results", "sweep", "target",
+    "Cloud", "Finding", "UserError", "average", "detect", "findings_table", "frames", "limits", "load", "plot",
+    "plot_pod", "render", "sweep", "table", "target",
 ]  # fmt: skip
 
 
@@ -94,24 +95,16 @@ def render(
     **work: Any,
 ) -> SimulatedUnit:
     """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
-    ``cache``: a folder in which renders are kept; ``work``: settings of `scenes.optics.RenderConfig`, such as
+    ``cache``: the folder in which renders are kept; ``work``: settings of `scenes.optics.RenderConfig`, such as
     ``bounces``. Raises UserError where the camera is unknown or does not see the target.
 
     >>> unit = tofpod.render(board, "kinect_v2", bounces=0)
     >>> unit.region.shape[1] > 50
     True
     """
-    from scenes.render.cache import cached_view
-    from scenes.render.view import render_view
-    from scenes.target.mesh import build_target
-
     config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
     facts, asked = camera_of(config), settings_of(RenderConfig, work, "render")
-    placed = target.at_wavelength(facts.optics.wavelength_nm)
-    if cache is not None:
-        view, _ = cached_view(placed, facts.optics, asked, Path(cache))
-    else:
-        view = render_view(build_target(placed), facts.optics, asked)
+    view, _ = cached_view(target.at_wavelength(facts.optics.wavelength_nm), facts.optics, asked, Path(cache))
     return SimulatedUnit(facts, config, view)
 
 
@@ -128,13 +121,7 @@ def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
 
 def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
     """Open a real capture of any format that ``python -m harness.detect`` reads: files, or one folder. ``unit``: of
-    stored depth, such as ``mm`` or ``4000/m``, where the files do not say. Raises UserError as that program does.
-
-    >>> tofpod.load("no_such_capture")
-    Traceback (most recent call last):
-    ...
-    harness.vocabulary.errors.UserError: no_such_capture: no such file or folder
-    """
+    stored depth, such as ``mm`` or ``4000/m``, where the files do not say. Raises UserError as that program does."""
     return open_capture([Path(path) for path in paths], unit=unit)
 
 
@@ -148,7 +135,7 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
     return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
 
 
-def detect(cloud: Cloud, detector: str = "thesis", threshold: float | None = None, **settings: Any) -> Judged:
+def detect(cloud: Cloud, detector: str = "matched", threshold: float | None = None, **settings: Any) -> Judged:
     """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
     ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
     ``settings``: the detector's. Raises UserError where the cloud cannot be judged.
@@ -183,45 +170,17 @@ def plot(found: Judged, title: str = "") -> Figure:
     return findings_figure(found.cloud, found.evidence, found.detections, title)
 
 
-@dataclass(frozen=True)
-class Results:
-    """A folder of results that a sweep wrote."""
-
-    folder: Path
-
-    @property
-    def tables(self) -> tuple[str, ...]:
-        """The names of its tables; `results/README.md` explains their columns."""
-        return tuple(sorted(path.stem for path in self.folder.glob("*.parquet")))
-
-    def table(self, name: str) -> pd.DataFrame:
-        """Read a table. Raises UserError where there is none of that name."""
-        import pandas as pd
-
-        if name not in self.tables:
-            raise UserError(f"{self.folder}: has no table {name!r}", legal=", ".join(self.tables))
-        return pd.read_parquet(self.folder / f"{name}.parquet")
-
-    @cached_property
-    def limits(self) -> tuple[SetUpLimit, ...]:
-        """Detection limits of a study: ``a90_mm``, ``a90_95``, ``statement`` (the curve) and so on. Raises UserError
-        for what is no study."""
-        return tuple(limit_of(record) for record in read_record(self.folder).set_ups)
-
-
-def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Results:
-    """Run an experiment, or what is missing of it, and return its results. ``changes``: as of ``--set``, such as
-    ``"repeats=5"``. More than one of ``jobs`` are processes: a script then needs ``if __name__ == "__main__":``. Raises
-    UserError for a wrong experiment, and where trials failed.
+def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Path:
+    """Run an experiment, or what is missing of it, and return the folder of its results. ``changes``: as of ``--set``,
+    such as ``"repeats=5"``. More than one of ``jobs`` are processes: a script then needs ``if __name__ ==
+    "__main__":``. Raises UserError for a wrong experiment, and where trials failed.
 
     >>> tofpod.sweep("averaging", "repeats=0")
     Traceback (most recent call last):
     ...
     harness.vocabulary.declaration.yaml_source.DeclarationError: ...
     """
-    from harness.engine.study import run_study
-    from harness.engine.work import EngineOptions
-    from harness.experiment.schema import SimulatedSource
+    from harness.engine.study import run_study  # imports pandas
 
     found, out = load_experiment(Path(experiment), changes), Path(out)
     if not isinstance(found.config.source, SimulatedSource):
@@ -230,19 +189,31 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        failed = json.loads((found.folder(out) / "provenance.json").read_text())["failures"]
-        raise UserError(f"{experiment}: {len(failed)} trials failed, such as {failed[0]['what']}: {failed[0]['why']}")
-    return Results(found.folder(out))
+        raise UserError(f"{experiment}: trials failed, as was printed", fix="mend that, and run it again")
+    return found.folder(out)
 
 
-def results(folder: str | Path) -> Results:
-    """Open a folder of results, such as ``results/detection_limit/latest``. Raises UserError where it is none."""
-    if not (Path(folder) / "provenance.json").is_file():
-        raise UserError(f"{folder}: is no folder of results", legal="results/<experiment>/<digest>, or .../latest")
-    return Results(Path(folder))
+def table(folder: str | Path, name: str) -> pd.DataFrame:
+    """Read a table of a folder of results; `results/README.md` explains them. Raises UserError where it has none of
+    that name."""
+    import pandas as pd
+
+    tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}
+    if name not in tables:
+        raise UserError(f"{folder}: has no table {name!r}", legal=", ".join(tables) or "a folder that a sweep wrote")
+    return pd.read_parquet(tables[name])
 
 
-def plot_pod(limits: Iterable[SetUpLimit]) -> Figure:
-    """Draw curves of detection with their bands and the inspections behind them, for limits such as
-    ``Results.limits``."""
-    return limits_figure([limit for limit in limits if limit.statement is not None])
+def limits(folder: str | Path) -> tuple[SetUpLimit, ...]:
+    """Return the detection limits of a study, such as ``results/detection_limit/latest``: ``a90_mm``, ``a90_95``,
+    ``statement`` (the curve) and so on. Raises UserError for what is no study."""
+    return tuple(limit_of(record) for record in read_record(Path(folder)).set_ups)
+
+
+def plot_pod(limits: Sequence[SetUpLimit]) -> Figure:
+    """Draw curves of detection with their bands on one chart, for what `limits` returns."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.6, 5.0), layout="constrained")
+    draw_overlay(figure, limits)
+    return figure

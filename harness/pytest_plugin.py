@@ -14,12 +14,8 @@ import contextlib
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from harness.api import Results
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -29,13 +25,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture
-def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Results]:
+def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
     """Return the gate: ``gate(experiment, *changes)`` runs a study (a YAML file beside the test, ``changes`` as of
-    ``--set``) and returns its results, or fails the test with what `harness.check` says."""
+    ``--set``) and returns the folder of its results, or fails the test with what `harness.check` says."""
 
-    def gate(experiment: str, *changes: str) -> Results:
+    def gate(experiment: str, *changes: str) -> Path:
         from harness import check
-        from harness.api import Results
         from harness.experiment.load import load_experiment
 
         path = Path(request.path).parent / experiment
@@ -46,11 +41,9 @@ def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Results]:
         arguments += ["--update"] if request.config.getoption("--tofpod-update") else []
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             code = check.main(arguments)
-        if code == 130:
-            raise KeyboardInterrupt
         if code:
             told = said.getvalue().replace("with --update", "with pytest --tofpod-update")
             pytest.fail(told.strip(), pytrace=False)
-        return Results(load_experiment(path, changes).folder(out))
+        return load_experiment(path, changes).folder(out)
 
     return gate

@@ -15,15 +15,18 @@ import argparse
 import shlex
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, write_text
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.provenance import record
+from harness.vocabulary.seeds import digest
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from harness.evaluation.study.limit import SetUpLimit
 
 ENDINGS = (".npy", ".tiff", ".tif")
@@ -69,9 +72,6 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from harness.tables.limits import LIMITS, SCORES
     from harness.tables.schema import write_table
     from harness.tables.text import show
-    from harness.vocabulary.files import write_text
-    from harness.vocabulary.provenance import record
-    from harness.vocabulary.seeds import digest
 
     index = read_index(options.dataset)
     if index["samples"] is None:
@@ -80,8 +80,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if not 0 < rate <= 1e6:
         raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 a square metre")
     maps = _found(options.predictions, options.dataset, index["samples"])
-    rows = [_judged(category, maps, options, index, rate) for category in index["categories"]]
-    limits, origin = [row.limit for row in rows], record(command)
+    judged = [_judged(category, maps, options, index, rate) for category in index["categories"]]
+    limits, rows, origin = [limit for limit, _ in judged], [row for _, row in judged], record(command)
     study = StudyRecord(
         name=index["name"],
         digest=digest([index["content"], options.name, rate]),
@@ -93,9 +93,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
     write_text(options.out / "study.json", record_text(study))
     for table, of in ((SCORES, rows), (LIMITS, limits)):
         write_table(options.out, table, table.frame(of), origin)
-    for row in rows:
-        if row.limit.statement is not None:
-            write_text(options.out / f"{row.category}.html", pod_html(row.limit.statement, command))
+    for limit in limits:
+        if limit.statement is not None:
+            write_text(options.out / f"{limit.record.variant}.html", pod_html(limit.statement, command))
     single = [name for name, one in index["categories"].items() if one["units"] == 1]
     warned = [f"warning: one unit of the camera, for which alone the limit holds: {', '.join(single)}"] * bool(single)
     show([*warned, LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
@@ -123,25 +123,22 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
         (inspected,) = read_arrays(dataset, name, "inspected")
         if fault := _fault(files[name][0], inspected):
             faults["not as they must be"].append(f"{name} ({fault})")
-    said = []
-    for what, names in faults.items():
-        if names:
-            more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-            said.append(f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{more}")
+    said = [
+        f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
+        for what, names in faults.items()
+        if names
+    ]
     if said:
-        legal = (
-            "one .npy or .tiff of real numbers, height x width of the pictures, for each board of validation and test"
-        )
+        legal = "for each board of validation and test one .npy or .tiff of real numbers, of the pictures' size"
         raise UserError(f"{predictions}: {'; '.join(said)}", legal=legal, fix="write maps for all boards anew")
     return {name: files[name][0] for name in wanted}
 
 
 def _fault(path: Path, inspected: np.ndarray) -> str:
     """Say what is wrong with a map; nothing where all is well."""
-    import numpy as np
-
-    scores = _read(path)
-    if scores is None:
+    try:
+        scores = _read(path)
+    except UserError:
         return "cannot be read as an array of numbers"
     if scores.shape != inspected.shape:
         return f"{' x '.join(map(str, scores.shape))} instead of {' x '.join(map(str, inspected.shape))}"
@@ -149,60 +146,42 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
     return f"no finite number on {lacking} inspected pixels; give the lowest score there" if lacking else ""
 
 
-def _read(path: Path) -> np.ndarray | None:
-    """A map's numbers; None where it holds none."""
+def _read(path: Path) -> np.ndarray:
+    """Return a map's numbers. Raises UserError where it holds none."""
     import cv2
-    import numpy as np
 
-    from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes
+    from detectors.recordings.arrays import load_npy
 
-    content = bounded_bytes(path, PICTURE_BYTES)
-    if path.suffix.lower() != ".npy":
-        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    if path.suffix.lower() == ".npy":
+        (found,) = load_npy(path).values()
     else:
-        import io
-
-        try:
-            found = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-        except (ValueError, EOFError, OSError):
-            return None
-    return None if found is None or found.dtype.kind not in "fiu" else np.asarray(found, float)
+        content = np.frombuffer(bounded_bytes(path, PICTURE_BYTES), np.uint8)
+        found = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if found is None or found.dtype.kind not in "fiu":
+        raise UserError(f"{path}: holds no real numbers")
+    return np.asarray(found, float)
 
 
 # ---------------------------------------------------------------- judging
 
 
-@dataclass(frozen=True)
-class MapScore:
-    """The maps of one category: their limit; AU-PRO; AUROC of pixels and of boards (by the highest pixel)."""
-
-    category: str
-    limit: SetUpLimit
-    au_pro: float
-    pixel_auroc: float
-    board_auroc: float
-
-
 def _judged(
     category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
-) -> MapScore:
-    """Judge the maps of a category, at a threshold that its good boards of ``validation`` set."""
-    import numpy as np
-
+) -> tuple[SetUpLimit, dict[str, Any]]:
+    """Judge the maps of a category, at a threshold that its good boards of ``validation`` set: their limit, and a row
+    of the table of scores."""
     from harness.engine.boards import read_arrays, read_truth
     from harness.engine.setup import highest_within, pixel_areas
     from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.match import match
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
-    from harness.vocabulary.geometry import MM
-    from harness.vocabulary.seeds import digest
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Boards of a split: name, scores (NaN where not inspected), places, damage, area inspected."""
         for each in sorted(one for one in maps if one.startswith(f"{category}/{split}/")):
             inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
-            scores, places_m = np.where(inspected, np.asarray(_read(maps[each])), np.nan), places.astype(float)
+            scores, places_m = np.where(inspected, _read(maps[each]), np.nan), places.astype(float)
             yield each, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))
 
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
@@ -259,19 +238,16 @@ def _judged(
     scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T
     overlap = damaged / np.bincount(of)[of]
-    return MapScore(
-        category,
-        limit_of(record),
-        area_under(scores, overlap, 1 - damaged, PRO_LIMIT),
-        area_under(scores, damaged, 1 - damaged),
-        area_under(top, is_flawed, 1 - is_flawed),
-    )
+    return limit_of(record), {
+        "category": category,
+        "au_pro": area_under(scores, overlap, 1 - damaged, PRO_LIMIT),
+        "pixel_auroc": area_under(scores, damaged, 1 - damaged),
+        "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
+    }
 
 
 def _findings_m(places_m: np.ndarray, above: np.ndarray) -> np.ndarray:
     """Centres (m, 2) on the face of the findings that the pixels ``above`` (h, w) make."""
-    import numpy as np
-
     from detectors.clusters import euclidean_clusters
     from detectors.measure import extents
 
@@ -284,8 +260,6 @@ def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: 
     """Return the area under the share of the weights ``found`` (n,) above a threshold against that of the weights
     ``false`` (n,), up to ``limit`` of the latter and divided by it; NaN where either has no weight. Equal scores are
     one threshold."""
-    import numpy as np
-
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))

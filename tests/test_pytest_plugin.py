@@ -57,8 +57,9 @@ threshold: {calibrate: {boards: 13, false_calls_per_m2: 10.0}}
 study: {boards: 16, hole_free_boards: 6}
 """
 TEST = """\
+import tofpod
 def test_the_limit_is_kept(tofpod_gate):
-    assert tofpod_gate("limit.yaml").limits[0].a90_95.demonstrated
+    assert tofpod.limits(tofpod_gate("limit.yaml"))[0].a90_95.demonstrated
 """
 
 

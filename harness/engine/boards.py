@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,21 +17,14 @@ from typing import Any
 import numpy as np
 
 from detectors.masks import shrunk
+from detectors.recordings.arrays import load_npz
 from harness.engine.plan import RenderJob, batch_of, point_task, unit_of
 from harness.engine.setup import known_view, load_set_up
 from harness.engine.trial import Role, TrialTask, cloud_of
 from harness.exchange import depth_units, on_window, picture_bytes, run_lengths
 from harness.experiment.schema import Experiment, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import (
-    PICTURE_BYTES,
-    RECORD_BYTES,
-    TEXT_BYTES,
-    bounded_bytes,
-    strict_json,
-    write_bytes,
-    write_text,
-)
+from harness.vocabulary.files import RECORD_BYTES, TEXT_BYTES, bounded_bytes, strict_json, write_bytes, write_text
 from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.path_names import differing, names_of, value_text
 from harness.vocabulary.provenance import check_version
@@ -233,8 +225,7 @@ def _read_json(file: Path, most: int, fix: str) -> dict[str, Any]:
 def read_arrays(folder: Path, name: str, *wanted: str) -> list[np.ndarray]:
     """Read arrays of a board's ``cloud.npz``. Raises UserError."""
     file = folder / "boards" / name / CLOUD
-    try:
-        with np.load(io.BytesIO(bounded_bytes(file, PICTURE_BYTES)), allow_pickle=False) as stored:
-            return [stored[each] for each in wanted]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{file}: cannot be read ({error})", fix=AGAIN) from error
+    stored = load_npz(file)
+    if missing := set(wanted) - stored.keys():
+        raise UserError(f"{file}: lacks {', '.join(sorted(missing))}", fix=AGAIN)
+    return [stored[each] for each in wanted]

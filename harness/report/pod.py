@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
-
-    from harness.evaluation.study.limit import SetUpLimit
 
 MOST_MARKS = 2000
 """Marks of inspections that a figure draws one by one; more of them are one picture within it."""
@@ -182,21 +180,6 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
             axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
     return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
-
-
-def limits_figure(limits: Sequence[SetUpLimit]) -> Figure:
-    """Draw the curves of limits side by side; each has a ``statement``."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(max(6.4 * len(limits), 6.4), 5.2), layout="constrained")
-    for place, limit in enumerate(limits, start=1):
-        assert limit.statement is not None
-        axes = figure.add_subplot(1, len(limits), place)
-        draw_pod(axes, limit.statement, limit.a90_95, most=limit.largest_mm)
-        axes.set(title=plain(limit.record.label), ylabel="probability of detection")
-        axes.set_xlabel(axis_text(limit.record.inspected.limit_of, "mm"))
-        axes.legend(loc="upper left", bbox_to_anchor=(0, -0.14), borderaxespad=0)
-    return figure
 
 
 def draw_pod(

@@ -66,28 +66,33 @@ def curves_figure(limits: Sequence[SetUpLimit]) -> str:
 
 
 def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
+    """Draw `draw_overlay` for a page."""
+    names = [name_of(limit) for limit in limits]
+    lines = sum(-(-len(name) // (2 * LONGEST_NAME)) for name in names) / _names_across(names)
+    said = " ".join(limit_sentence(limit) for limit in limits)
+    return svg("overlay", (8.6, 4.0 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
+
+
+def _names_across(names: Sequence[str]) -> int:
+    return 2 if max(map(len, names)) <= LONGEST_NAME * 2 // 3 else 1
+
+
+def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
     """Draw the curves of all set-ups with their bands on one axis of sizes, a mark at each a90/95 within it."""
-    span, names = _span(limits), [name_of(limit) for limit in limits]
-    across = 2 if max(map(len, names)) <= LONGEST_NAME * 2 // 3 else 1
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for number, limit in enumerate(limits):
-            statement, colour = limit.statement, COLOURS[number % len(COLOURS)]
-            if statement is None:
-                continue
-            style = STYLES[number // len(COLOURS) % len(STYLES)]
-            axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
-            name, pod = plain(fill(names[number], 2 * LONGEST_NAME)), statement.curve.pod(statement.sizes)
-            axes.plot(statement.sizes, pod, style, color=colour, label=name)
-            if is_within_sizes(limit):
-                axes.plot(limit.a90_95.value, 0.9, "o", color=colour, ms=6, mec="white", zorder=5)
-        axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
-        axes.set(xlim=span, ylim=(0, 1), xlabel=_size_axis(limits[0]), ylabel="probability of detection")
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=across)
-
-    lines = sum(-(-len(name) // (2 * LONGEST_NAME)) for name in names) / across
-    return svg("overlay", (8.6, 4.0 + 0.2 * lines), " ".join(limit_sentence(limit) for limit in limits), draw)
+    axes, names = figure.subplots(), [name_of(limit) for limit in limits]
+    for number, limit in enumerate(limits):
+        statement, colour = limit.statement, COLOURS[number % len(COLOURS)]
+        if statement is None:
+            continue
+        style = STYLES[number // len(COLOURS) % len(STYLES)]
+        axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
+        name, pod = plain(fill(names[number], 2 * LONGEST_NAME)), statement.curve.pod(statement.sizes)
+        axes.plot(statement.sizes, pod, style, color=colour, label=name)
+        if is_within_sizes(limit):
+            axes.plot(limit.a90_95.value, 0.9, "o", color=colour, ms=6, mec="white", zorder=5)
+    axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
+    axes.set(xlim=_span(limits), ylim=(0, 1), xlabel=_size_axis(limits[0]), ylabel="probability of detection")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=_names_across(names))
 
 
 def signals_figure(limits: Sequence[SetUpLimit]) -> str:

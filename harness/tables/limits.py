@@ -199,10 +199,10 @@ SCORES = Table(
     "scores",
     "one row per category of a data set: anomaly maps by the measures of their own field, on the inspected pixels",
     (
-        Column("category", "category", "category", "name of the category"),
-        Column("au_pro", "AU-PRO", "au_pro", "area under the mean overlap, up to 30 % false pixels, over 0.3"),
-        Column("pixel_auroc", "AUROC of pixels", "pixel_auroc", "area under the curve of damaged and other pixels"),
-        Column("board_auroc", "AUROC of boards", "board_auroc", "likewise of boards, by their highest pixels"),
+        Column("category", "category", note="name of the category"),
+        Column("au_pro", "AU-PRO", note="area under the mean overlap, up to 30 % false pixels, over 0.3"),
+        Column("pixel_auroc", "AUROC of pixels", note="area under the curve of damaged and other pixels"),
+        Column("board_auroc", "AUROC of boards", note="likewise of boards, by their highest pixels"),
     ),
     title="anomaly maps",
 )
