@@ -87,12 +87,7 @@ def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: b
 
 
 def render(
-    target: TargetConfig,
-    camera: str = "azure_kinect_nfov",
-    *,
-    unit_seed: int = 1,
-    cache: Path | None = None,
-    **work: Any,
+    target: TargetConfig, camera: str, *, unit_seed: int = 1, cache: str | Path = "results/.cache/renders", **work: Any
 ) -> SimulatedUnit:
     """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
     ``cache``: the folder in which renders are kept; ``work``: settings of `scenes.optics.RenderConfig`, such as

@@ -109,6 +109,7 @@ def _about(experiment: Experiment, licence: str, samples: list[Sample], command:
         "licence": licence,
         "false_calls_per_m2": (calibrate and calibrate.false_calls_per_m2) or 1.0,
         "hit_radius_mm": experiment.config.matching.radius_mm,
+        "hit_overlap": experiment.config.matching.overlap,
         "categories": categories,
         "provenance": record(command),
     }

@@ -2,8 +2,8 @@
 
 A map is judged as a study judges a detector's score: the threshold is the lowest with the wanted rate of false calls on
 the good boards of ``validation``; pixels above it that chains of steps of at most `LINK_M` on the face join are a
-finding, which hits the damage whose centre lies within the hit radius; POD, a90 and a90/95 follow from hits and misses
-on ``test``, the rate of false calls from its good boards. Only the pixels that the data set calls inspected count.
+finding, which hits a damage by the experiment's rule (`harness.engine.judge.matched`); POD, a90 and a90/95 follow from
+hits and misses on ``test``, the rate of false calls from its good boards. Only pixels that are inspected count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
 it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region.
@@ -86,6 +86,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         name=index["name"],
         digest=digest([index["content"], options.name, rate]),
         hit_radius_mm=index["hit_radius_mm"],
+        hit_overlap=index["hit_overlap"],
         false_calls_per_m2=rate,
         provenance={key: origin[key] for key in ("commit", "dirty", "versions", "command")},
         set_ups=tuple(limit.record for limit in limits),
@@ -152,6 +153,7 @@ def _read(path: Path) -> np.ndarray:
 
     from detectors.recordings.arrays import load_npy
 
+    found: np.ndarray | None
     if path.suffix.lower() == ".npy":
         (found,) = load_npy(path).values()
     else:
@@ -171,9 +173,9 @@ def _judged(
     """Judge the maps of a category, at a threshold that its good boards of ``validation`` set: their limit, and a row
     of the table of scores."""
     from harness.engine.boards import read_arrays, read_truth
+    from harness.engine.judge import matched_places
     from harness.engine.setup import highest_within, pixel_areas
     from harness.evaluation.intervals import threshold_for_rate
-    from harness.evaluation.match import match
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
 
@@ -188,7 +190,7 @@ def _judged(
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
     radius_m, truths = index["hit_radius_mm"] * MM, []
-    inspected: list[dict[str, Any]] = []
+    inspected, size_of = list[dict[str, Any]](), "diameter"
     calls: dict[bool, list[tuple[int, int, float]]] = {False: [], True: []}
     pixels: list[np.ndarray] = []
     regions: list[np.ndarray] = []
@@ -197,12 +199,15 @@ def _judged(
         truth = read_truth(options.dataset, name)
         damages, board = truth["damages"], truth["board"]
         truths.append([board, damages])
-        centres_m = np.array([(one["x_board_mm"], one["y_board_mm"]) for one in damages]).reshape(-1, 2) * MM
-        findings_m = _findings_m(places_m, scores > threshold)
-        pairs = match(centres_m, findings_m, radius_m)
-        signals = highest_within(places_m, scores, centres_m, radius_m)
-        calls["/good/" not in name].append((board, len(findings_m) - len(pairs), area_m2))
+        lines = [np.array(one["line_m"]) for one in damages]
+        centres_m, found = _findings(places_m, scores > threshold)
+        outlines = [np.flatnonzero(damage == one["id"]) for one in damages]
+        rule = (radius_m, index["hit_overlap"], damage.shape)
+        pairs, parts = matched_places(lines, outlines, centres_m, found, *rule)
+        signals = highest_within(places_m, scores, lines, radius_m)
+        calls["/good/" not in name].append((board, len(found) - len(pairs) - parts, area_m2))
         for number, one in enumerate(damages):
+            size_of = one["size_of"]
             sizes = {key: one[key] for key in ("diameter_mm", "depth_mm")}
             sizes |= {"x_mm": one["x_board_mm"], "y_mm": one["y_board_mm"], "signal": float(signals[number])}
             inspected.append({"board": board, "hole": str(one["id"]), "repeat": 0, "hit": number in pairs, **sizes})
@@ -231,7 +236,7 @@ def _judged(
         failed=0,
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
-        inspected=Inspected(**columns),
+        inspected=Inspected(**columns, size_of=size_of),
         unflawed=unflawed(False),
         beside=unflawed(True),
     )
@@ -246,14 +251,17 @@ def _judged(
     }
 
 
-def _findings_m(places_m: np.ndarray, above: np.ndarray) -> np.ndarray:
-    """Centres (m, 2) on the face of the findings that the pixels ``above`` (h, w) make."""
+def _findings(places_m: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Centres (m, 2) on the face, and flat pixels, of the findings that the pixels ``above`` (h, w) make."""
     from detectors.clusters import euclidean_clusters
     from detectors.measure import extents
 
-    points = np.pad(places_m[above & np.isfinite(places_m[..., 0])], ((0, 0), (0, 1)))
+    pixels = np.flatnonzero(above & np.isfinite(places_m[..., 0]))
+    points = np.pad(places_m.reshape(-1, 2)[pixels], ((0, 0), (0, 1)))
     labels = euclidean_clusters(points, LINK_M, 1)
-    return np.array([extents(points[labels == k])[1][:2] for k in range(labels.max(initial=-1) + 1)]).reshape(-1, 2)
+    found = [labels == number for number in range(labels.max(initial=-1) + 1)]
+    centres_m = np.array([extents(points[each])[1][:2] for each in found]).reshape(-1, 2)
+    return centres_m, [pixels[each] for each in found]
 
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:

@@ -181,7 +181,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         own.ravel()[known.outlines[one.id]] = True
         rows, columns = np.nonzero(own := put(own, False))
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
-        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own)}
+        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": one.line_m.tolist()}
         damages.append({**one.to_row(), "seen_depth_mm": known.seen_depth_m[one.id] / MM, **facts})
     told = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",

@@ -104,18 +104,34 @@ def matched(
     within the radius of the damage's centre, of long damage of its centre line; with an ``overlap`` also where at least
     this share of its pixels lie on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside the
     one that counts are its parts."""
-    lines, places_m = [damage.line_m for damage in known.truth], _places_of(known, detections)
-    if not lines or not len(detections):
+    lines, outlines = [one.line_m for one in known.truth], [known.outlines[one.id] for one in known.truth]
+    places_m, pixels = _places_of(known, detections), [one.pixels for one in detections]
+    shape = known.cloud.valid.shape
+    return matched_places(lines, outlines, places_m, pixels, radius_m, overlap, shape, grid=known.cloud.organised)
+
+
+def matched_places(
+    lines_m: Sequence[np.ndarray],
+    outlines: Sequence[np.ndarray],
+    places_m: np.ndarray,
+    pixels: Sequence[np.ndarray],
+    radius_m: float,
+    overlap: float | None,
+    shape: tuple[int, ...],
+    *,
+    grid: bool = True,
+) -> tuple[dict[int, int], int]:
+    """Match as `matched` does: damages by their centre lines and flat pixels ``outlines``, findings by their places
+    (m, 2) and flat ``pixels``; ``shape`` of the cloud, which has a pixel ``grid`` or not."""
+    if not lines_m or not len(places_m):
         return {}, 0
-    apart = np.array([from_line_m(line, places_m) for line in lines])
+    apart = np.array([from_line_m(line, places_m) for line in lines_m])
     lies = np.zeros(apart.shape, bool)
-    if overlap is not None:
-        for i, damage in enumerate(known.truth):
-            on = np.zeros(known.cloud.valid.size, bool)
-            on[known.outlines[damage.id]] = True
-            if known.cloud.organised:
-                on = grown(on.reshape(known.cloud.valid.shape), SMEARED_PX).ravel()
-            lies[i] = [on[one.pixels].mean() >= overlap for one in detections]
+    for i, outline in enumerate(outlines if overlap is not None else ()):
+        on = np.zeros(shape, bool)
+        on.ravel()[outline] = True
+        on = (grown(on, SMEARED_PX) if grid else on).ravel()
+        lies[i] = [on[one].mean() >= overlap for one in pixels]
     pairs = closest_pairs(np.where(lies, np.fmin(apart, radius_m), apart), radius_m)
     return pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))
 
