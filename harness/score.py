@@ -207,7 +207,7 @@ def _judged(
         signals = highest_within(places_m, scores, lines, radius_m)
         calls["/good/" not in name].append((board, len(found) - len(pairs) - parts, area_m2))
         for number, one in enumerate(damages):
-            size_of = one["size_of"]
+            size_of = one.get("size_of", size_of)
             sizes = {key: one[key] for key in ("diameter_mm", "depth_mm")}
             sizes |= {"x_mm": one["x_board_mm"], "y_mm": one["y_board_mm"], "signal": float(signals[number])}
             inspected.append({"board": board, "hole": str(one["id"]), "repeat": 0, "hit": number in pairs, **sizes})

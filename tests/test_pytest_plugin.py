@@ -11,36 +11,25 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-DETECTOR = '''\
+DETECTOR = """\
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
-from detectors.interface import Evidence
-from detectors.masks import shrunk
-from detectors.score_map import ScoreMapConfig, ScoreMapDetector
+from detectors.thesis import ThesisDetector
 
 BLUR_PX = 1
 
 
-class AcmeDetector(ScoreMapDetector[ScoreMapConfig]):
-    """What departs from the board's plane, in robust standard deviations."""
-
+class AcmeDetector(ThesisDetector):
     name = "acme"
-    version = 1
 
     def analyse(self, cloud):
-        z = cloud.points_m[..., 2]
-        board = shrunk(np.isfinite(z) & (z < np.nanmedian(z) + 0.02), 13)
-        x, y = (cloud.points_m[..., k] for k in (0, 1))
-        design = np.stack([np.ones(board.sum()), x[board], y[board]], axis=1)
-        plane = np.linalg.lstsq(design, z[board], rcond=None)[0]
-        residual = z - (plane[0] + plane[1] * x + plane[2] * y)
-        smooth = cv2.blur(np.where(np.isfinite(residual), residual, 0.0), (BLUR_PX, BLUR_PX))
-        inside = cv2.morphologyEx(board.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((31, 31), np.uint8)) > 0
-        residual = np.where(inside & np.isfinite(residual), smooth, np.nan)
-        scale = float(np.nanmedian(np.abs(residual))) / 0.6745
-        return Evidence(np.abs(residual) / scale, residual, z - residual, scale)
-'''
+        evidence = super().analyse(cloud)
+        blurred = cv2.blur(np.nan_to_num(evidence.score), (BLUR_PX, BLUR_PX))
+        return replace(evidence, score=np.where(np.isfinite(evidence.score), blurred, np.nan))
+"""
 LIMIT = """\
 name: acme_limit
 source:
@@ -52,7 +41,7 @@ source:
   camera: {name: azure_kinect_nfov}
   render: {bounces: 0}
 capture: {frames: 1}
-detector: {name: acme}
+detector: {name: acme, settings: {crop: {kind: auto, inset_px: 4}}}
 threshold: {calibrate: {boards: 13, false_calls_per_m2: 10.0}}
 study: {boards: 16, hole_free_boards: 6}
 """
