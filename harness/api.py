@@ -130,7 +130,7 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
     return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
 
 
-def detect(cloud: Cloud, detector: str = "matched", threshold: float | None = None, **settings: Any) -> Judged:
+def detect(cloud: Cloud, detector: str = "local", threshold: float | None = None, **settings: Any) -> Judged:
     """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
     ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
     ``settings``: the detector's. Raises UserError where the cloud cannot be judged.
