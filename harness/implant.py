@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    add("--detector", default="matched", help="detector's name (default: matched)")
+    add("--detector", default="local", help="detector's name (default: local)")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
     add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}")
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
