@@ -279,8 +279,9 @@ CONDITIONS = (
 """Settings that every set-up shares, in words, where no axis varies them."""
 
 
-def conditions_of(facts: Mapping[str, Any]) -> str:
-    """Return what all set-ups of a study have in common, in one line; empty where nothing is known."""
+def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -> str:
+    """Return what all set-ups of a study have in common, in one line, and whether damage was out of view or lost with
+    failed trials; empty where nothing is known."""
     said = []
     for path, words in CONDITIONS:
         value: Any = facts
@@ -289,6 +290,11 @@ def conditions_of(facts: Mapping[str, Any]) -> str:
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
         if value is not None and not varied:
             said.append(words.format(value.replace("_", " ") if isinstance(value, str) else value))
+    drawn = facts.get("source", {}).get("target", {}).get("damage", {}).get("per_board", 0)
+    drawn *= (facts.get("study") or {}).get("boards", 0)
+    fewest = min((limit.targets for limit in limits), default=drawn)
+    if fewest < drawn:
+        said.append(f"only {fewest} of {drawn} damages drawn were in view and inspected by every set-up")
     return ", ".join(said)
 
 
@@ -339,7 +345,7 @@ def evaluate_study(
     set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, diameters_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)
     validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
-    return StudyResult(record, set_ups, limits, axis_lines(limits), validity, conditions_of(facts))
+    return StudyResult(record, set_ups, limits, axis_lines(limits), validity, conditions_of(facts, limits))
 
 
 def _set_up(
