@@ -10,7 +10,7 @@ from synthetic_tables import World, joined, provenance, tables
 
 from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
-from harness.report.page import set_ups_html
+from harness.report.page import Layout, set_ups_html
 from harness.report.sections import About
 from harness.thesis.inference import SET_UP, borne_out_if, posterior_of
 
@@ -64,6 +64,13 @@ def test_the_page_begins_with_the_sentence(found):
     page = set_ups_html(found, [], About(provenance(), "", "Inference", True))
     answer = page.split('<p class="answer">')[1]
     assert answer.startswith("The thesis&#39; outcome is borne out if") and "What would make the thesis true" in page
+
+
+def test_set_ups_that_fill_no_grid_stand_one_below_the_other(found):
+    # as many as there are distances, but not one of each
+    some = replace(found, variants=found.variants.iloc[[*range(10), 11]])
+    layout = Layout.of(some)
+    assert layout.columns == () and len(layout.rows) == 11
 
 
 def test_set_ups_are_drawn_at_random_and_alike_ones_once():

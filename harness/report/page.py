@@ -189,12 +189,12 @@ class Layout:
         set_ups = tables.variants[~tables.variants["is_variation"].astype(bool)]
         paths = [str(path) for path in tables.axes["path"]]
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
-        if not values or len(set_ups) % len(values):
-            return Layout({str(name): [str(name)] for name in set_ups["variant"]})
         rows: dict[str, list[str]] = {}
         for _, row in set_ups.iterrows():
             title = ", ".join(value_text(path, row[path]) for path in paths[:-1])
             rows.setdefault(title, []).append(str(row["variant"]))
+        if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
+            return Layout({str(name): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
         last = tables.axes.iloc[-1]
         unit = f" ({last['unit']})" if last["unit"] else ""
