@@ -48,8 +48,11 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval: at most the smallest size where everything was found."""
+    """Return a50 or a90 (``of``) with its interval: at most the smallest size where everything was found; unknown where
+    the curve is so flat that it would be below 0."""
     size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
+    if size_mm <= 0:
+        return Estimate(np.nan)
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
@@ -299,6 +302,8 @@ def notes_of(limit: SetUpLimit) -> list[str]:
                 f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.targets} "
                 "targets"
             )
+    if limit.a50_mm <= 0:
+        said.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
         said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
