@@ -279,7 +279,7 @@ def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
     (tmp_path / "tiny.yaml").write_text(custom)
     done = sweep(tmp_path / "tiny.yaml", tmp_path / "out")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
-    assert "neither holes nor dents" in done.stderr
+    assert "the target has no damage" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

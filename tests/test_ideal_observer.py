@@ -161,6 +161,8 @@ def test_a_detector_that_finds_half_at_no_damage_inspected_has_no_efficiency() -
     limit, known = judged(1.0)
     strong = known.index > 12.0
     seen = limit.record.inspected
-    few = replace(seen, **{name: column[strong] for name, column in vars(seen).items() if column is not None})
+    few = replace(
+        seen, **{name: column[strong] for name, column in vars(seen).items() if isinstance(column, np.ndarray)}
+    )
     found = efficiency_of(limit_of(replace(limit.record, inspected=few)), known)
     assert np.isnan(found.half.efficiency) and found.half.at_most and found.why
