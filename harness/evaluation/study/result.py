@@ -252,7 +252,7 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
         (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
         (True, "An inspector, who can miss findings and doubt others: the POD is that of the program alone."),
         (drawn, f"Damage of another kind, that stands in rows or clusters, or several kinds on one board{only}."),
-        (simulated, "Gloss, translucency, undeclared light, motion, dirt and wear: all surfaces are Lambertian."),
+        (simulated, "Translucency, undeclared light and gloss, motion, dirt and wear."),
         (
             one_unit,
             "Other units of the camera: fixed pattern and offset are those of one unit. What many frames leave over "
