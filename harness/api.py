@@ -38,7 +38,6 @@ from harness.engine.work import EngineOptions
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
-from harness.experiment.schema import SimulatedSource
 from harness.inspection.run import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
@@ -178,8 +177,6 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     from harness.engine.study import run_study  # imports pandas
 
     found, out = load_experiment(Path(experiment), changes), Path(out)
-    if not isinstance(found.config.source, SimulatedSource):
-        raise UserError(f"{experiment}: is of a real capture", fix="use load, average and detect")
     code = run_study(found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})")
     if code == 130:
         raise KeyboardInterrupt

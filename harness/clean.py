@@ -21,14 +21,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m harness.clean",
         description="Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
         "followed, and what a running sweep uses is left alone.",
-        epilog="examples: python -m harness.clean cache --limit 5GB; python -m harness.clean cache --older-than 30d; "
+        epilog="examples: python -m harness.clean cache --limit 5GB; "
         "python -m harness.clean results averaging/69346a82f4194e03 --journal-only --dry-run",
     )
     parts = parser.add_subparsers(required=True, metavar="cache|results")
     cache = parts.add_parser("cache", help="renders; each is rendered again when it is needed")
     cache.add_argument("--limit", metavar="SIZE", help="the longest unused go until the rest fits, such as 5GB")
-    cache.add_argument("--older-than", metavar="AGE", help="those not used for so long, such as 12h, 30d or 4w")
-    cache.add_argument("--damaged", action="store_true", help="those that cannot be read")
     cache.add_argument("--all", action="store_true", help="all of them")
     cache.set_defaults(run=_clean_cache)
     results = parts.add_parser("results", help="one folder of results, or all of an experiment")
@@ -47,14 +45,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _clean_cache(options: argparse.Namespace) -> int:
-    from harness.listing import bytes_of, cache_removal, refuse_links, seconds_of, size_text
+    from harness.listing import bytes_of, cache_removal, refuse_links
     from harness.tables.text import many
+    from harness.vocabulary.files import size_text
     from scenes.render.cache import alone, removed
 
     limit = None if options.limit is None else bytes_of(options.limit)
-    older_s = None if options.older_than is None else seconds_of(options.older_than)
-    if limit is None and older_s is None and not options.damaged and not options.all:
-        raise UserError("no renders were chosen", legal="--limit SIZE, --older-than AGE, --damaged, --all; or several")
+    if (limit is None) != options.all:
+        raise UserError("which renders are to go?", legal="--limit SIZE, or --all")
     folder = options.out / ".cache" / "renders"
     if not folder.is_dir():
         print(f"{folder}: there is no cache")
@@ -63,7 +61,7 @@ def _clean_cache(options: argparse.Namespace) -> int:
     if not options.dry_run:
         with alone(folder):  # a sweep that runs is told before anything is asked
             pass
-    wanted = cache_removal(folder, limit, older_s, damaged=options.damaged, everything=options.all)
+    wanted = cache_removal(folder, limit)
     size = size_text(sum(file.size_bytes for file in wanted))
     if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
@@ -73,8 +71,9 @@ def _clean_cache(options: argparse.Namespace) -> int:
 
 
 def _clean_results(options: argparse.Namespace) -> int:
-    from harness.listing import chosen_results, removable, remove_results, size_text
+    from harness.listing import chosen_results, removable, remove_results
     from harness.tables.text import many
+    from harness.vocabulary.files import size_text
 
     folders = chosen_results(options.out, options.name)
     if not options.dry_run:
@@ -122,8 +121,8 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
 
 
 def _concluded(gone: int, wanted: int, freed_bytes: int) -> int:
-    from harness.listing import size_text
     from harness.tables.text import many
+    from harness.vocabulary.files import size_text
 
     print(f"removed {many(gone, 'file')}, {size_text(freed_bytes)}")
     if gone < wanted:

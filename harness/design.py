@@ -28,8 +28,7 @@ LEAST_SHARE = 0.1
 """Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0."""
 REPEATED = 8
 """Targets of the repeats check: a single board of holes."""
-OWNERS = {"set_up": "study", "guessed_with": "frames", "white_mm": "frames", "fixed_mm": "frames"}
-OWNERS |= {"repeated_targets": "repeats", "board_m2": "false_calls_per_m2"}
+OWNERS = {"set_up": "study", "repeated_targets": "repeats", "board_m2": "false_calls_per_m2"}
 """Options that mean nothing without another."""
 
 
@@ -66,11 +65,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--confidence", type=float, default=0.95, help="the 95 of a90/95 (default: 0.95)")
     add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
     add("--seed", type=int, default=1, help="of the simulated studies (default: 1)")
-    put = parser.add_argument_group("how many frames to average").add_argument
-    put("--frames", type=int, nargs="+", metavar="N", help="carry the guess to these numbers of averaged frames")
-    put("--guessed-with", type=int, metavar="N", help="frames that the guess is for (default: the study's set-up's)")
-    put("--white-mm", type=float, metavar="MM", help="deviation of one frame's noise that averages out")
-    put("--fixed-mm", type=float, metavar="MM", help="deviation of the error that is the same in every frame")
     put = parser.add_argument_group("what repeats are worth").add_argument
     put("--repeats", type=int, metavar="N", help="show the limit of this many repeats, right and wrong")
     put("--repeated-targets", type=int, metavar="N", help=f"of so many targets (default: {REPEATED})")
@@ -84,12 +78,11 @@ def _parser() -> argparse.ArgumentParser:
 
 @dataclass(frozen=True)
 class GuessedCurve:
-    """A curve, where it is from, sizes to choose from; ``frames`` and face of a hole-free board, None if not known."""
+    """A curve, where it is from, sizes to choose from; face of a hole-free board, None if not known."""
 
     curve: PodCurve
     origin: str
     sizes: tuple[float, float]
-    frames: int | None = None
     board_m2: float | None = None
 
 
@@ -175,7 +168,7 @@ def _from_study(options: argparse.Namespace) -> GuessedCurve:
             high = min(max(high, curve.size_at(RISE[1])), FURTHEST * high)
         if (low, high) != inspected:
             origin += f"; sizes beyond the {inspected[0]:.4g} to {inspected[1]:.4g} mm that it inspected"
-    return GuessedCurve(curve, origin, (low, high), record.frames, float(boards.mean()) if len(boards) else None)
+    return GuessedCurve(curve, origin, (low, high), float(boards.mean()) if len(boards) else None)
 
 
 def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
@@ -192,7 +185,6 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
         (0 < options.pod < 1, f"--pod {options.pod:g}", "0 < pod < 1"),
         (0.5 < options.confidence < 1, f"--confidence {options.confidence:g}", "0.5 < confidence < 1"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
-        (min(options.frames or [1]) >= 1, f"--frames {min(options.frames or [1])}", "1 or more"),
         (fewest >= 2, "--repeats: nothing is repeated", "two repeats of two targets at least"),
     )
     for holds, said, legal in rules:
@@ -203,10 +195,6 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
         legal = f"more than {a_pod:.4g}"
         fix = "no study can be sure to demonstrate less than the truth: improve the detector, or want less"
         raise UserError(f"--goal {options.goal:g} is not above the guess's own {a_pod:.4g}", legal=legal, fix=fix)
-    needed = ["white_mm", "fixed_mm", *(["guessed_with"] if guess.frames is None else [])]
-    missing = [_flag(name) for name in needed if getattr(options, name) is None]
-    if options.frames is not None and missing:
-        raise UserError(f"--frames needs {' and '.join(missing)}", fix="python -m harness.validate measures noise")
     if options.false_calls_per_m2 is not None and options.board_m2 is None and guess.board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
 
@@ -216,25 +204,17 @@ def _designed(options: argparse.Namespace, guess: GuessedCurve) -> StudyDesign:
     from harness.report.design import StudyDesign
 
     asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
-    guessed_with = (guess.frames if options.guessed_with is None else options.guessed_with) or 0
     area = guess.board_m2 if options.board_m2 is None else options.board_m2
-    wanted, frames = options.false_calls_per_m2, []
+    wanted = options.false_calls_per_m2
     repeats: tuple[plan.RepeatedStudies, ...] = ()
-    # Mistakes in these two come before the simulation's minute; `_check` has asked for frames and area.
-    share = plan.fixed_share(options.white_mm, options.fixed_mm, guessed_with) if options.frames else 0.0
+    # Its mistakes come before the simulation's minute; `_check` has asked for the area.
     free = plan.hole_free(wanted, area or 0.0, options.confidence) if wanted is not None else None
     plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, **asked)
     recommended = plan.recommend(plans, options.goal)
-    for number in sorted(set(options.frames or ())):
-        curve = plan.guess_with_frames(guess.curve, number, guessed_with=guessed_with, fixed_share=share)
-        targets = (recommended.plan.targets,)  # with the same sizes and luck
-        (study,) = plan.design(curve, targets, guess.sizes, placements=("uniform",), **asked)
-        frames.append(plan.FramesPlan(number, curve, study))
     if options.repeats:
         holes = options.repeated_targets or REPEATED
         repeats = plan.repeated_studies(guess.curve, holes, options.repeats, guess.sizes, **asked)
-    unit, carried = "mm" if options.unit is None else options.unit, guessed_with if options.frames else None
-    found = (plans, recommended, options.goal, carried, tuple(frames), repeats, free)
+    unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, repeats, free)
     return StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
 
 

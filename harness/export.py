@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="example: python -m harness.export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
     )
     add = parser.add_argument
-    add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment with a simulated source")
+    add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
     add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag a view")
     add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
@@ -59,15 +59,12 @@ def _count(text: str) -> int:
 def _run(arguments: argparse.Namespace, given: list[str]) -> int:
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
-    from harness.experiment.schema import SimulatedSource
     from harness.vocabulary.files import atomic_folder
     from scenes.perspectives import poses_of
     from scenes.sensor.camera import camera_of
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
     source = experiment.config.source
-    if not isinstance(source, SimulatedSource):
-        raise UserError(f"{arguments.experiment}: its source is a real capture, which needs no export")
     target = source.target.declare()
     target = target.hole_free() if arguments.hole_free else target
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)

@@ -127,7 +127,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         "detector": {"name": options.detector, "settings": settings},
         "family": family.to_data(),
     }
-    origin = record(command) | {"guesses": list(found.warnings), "seed": options.seed, "failures": []}
+    origin = record(command) | {"warnings": list(found.warnings), "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
     thresholds = (
         f"Given as {options.threshold:g}."

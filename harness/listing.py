@@ -12,13 +12,12 @@ import re
 import secrets
 import stat
 import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from harness.tables.outputs import CAPTURES, EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, REPORT, is_output
+from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, REPORT, is_output
 from harness.tables.text import many
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
@@ -27,10 +26,9 @@ from harness.vocabulary.path_names import names_of, value_text
 from harness.vocabulary.plug_ins import Offer, PlugIns
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import canonical_json
-from scenes.render.cache import StoredFile, damaged_renders, leftovers, longest_unused, removed, stored_renders
+from scenes.render.cache import StoredFile, leftovers, longest_unused, removed, stored_renders
 
 BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
-SECONDS = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 
 
 def table_lines(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
@@ -42,38 +40,13 @@ def table_lines(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[s
         yield (indent + "  ".join([*cells, row[-1]])).rstrip()
 
 
-def size_text(count: float) -> str:
-    """Return a number of bytes with three digits, in powers of ten."""
-    for unit, factor in reversed(BYTES.items()):
-        if count >= 0.9995 * factor:
-            return f"{count / factor:.0f} {unit}" if count >= 99.95 * factor else f"{count / factor:.3g} {unit}"
-    return f"{count:.0f} B"
-
-
-def age_text(seconds: float) -> str:
-    """Return how long ago; what lies in the future, by a clock that was set, is now."""
-    if seconds < 60:
-        return "just now"
-    unit, length = ("min", 60) if seconds < 7200 else ("h", 3600) if seconds < 172_800 else ("days", 86_400)
-    return f"{seconds / length:.0f} {unit} ago"
-
-
 def bytes_of(text: str) -> int:
     """Read a size such as ``5GB`` or ``500 MB``. Raises UserError."""
-    return round(_quantity(text, BYTES, "a size", "such as 500MB, 5GB or 1.5TB"))
-
-
-def seconds_of(text: str) -> float:
-    """Read an age such as ``30d``. Raises UserError."""
-    return _quantity(text, SECONDS, "an age", "such as 12h, 30d (days) or 4w (weeks)")
-
-
-def _quantity(text: str, units: Mapping[str, float], what: str, legal: str) -> float:
     found = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
-    factors = {unit.lower(): factor for unit, factor in units.items()}
+    factors = {unit.lower(): factor for unit, factor in BYTES.items()}
     if found is None or found[2].lower() not in factors:
-        raise UserError(f"{text!r} is not {what}", legal=legal)
-    return float(found[1]) * factors[found[2].lower()]
+        raise UserError(f"{text!r} is not a size", legal="such as 500MB, 5GB or 1.5TB")
+    return round(float(found[1]) * factors[found[2].lower()])
 
 
 # ---------------------------------------------------------------- detectors and cameras
@@ -237,7 +210,6 @@ def reference() -> str:
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
-POINT_NAME = re.compile(r"point-[0-9]{3,6}")  # name of a folder with the findings in a real capture
 SHOWN_SETTINGS = 6
 
 
@@ -323,11 +295,7 @@ def described(run: Path) -> dict[str, Any]:
         said = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
         if not isinstance(said, dict):
             raise ValueError("is no provenance")
-    except FileNotFoundError:  # a run that is not over, or real captures, which have no trials
-        judged = len(folders_in(run, POINT_NAME))
-        if judged and not records:  # their table is written last
-            state = "complete" if (run / CAPTURES.name).is_file() else "unfinished"
-            return row | {"state": state, "note": f"{state}: {many(judged, 'real capture')} judged"}
+    except FileNotFoundError:  # a run that is not over
         if not records and not (run / EXPERIMENT.name).is_file():
             return row | {"note": "broken: it has neither an experiment nor records"}
         state = "running" if in_use(run) else "unfinished"
@@ -426,8 +394,6 @@ OURS = b"# tofpod experiment "  # first words of an experiment.yaml that a sweep
 UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")
 """A file that a killed process was writing (`harness.vocabulary.files.atomic_path`)."""
 UNFINISHED_LINK = re.compile(rf"\.{LATEST}\.[0-9a-f]{{8}}\.part")
-ENTRY_NAME = re.compile(r"[a-z_]+-[0-9]+-[0-9a-f]{16}\.jsonl?|[0-9]{6}-[0-9a-f]{8}\.jsonl")
-"""Files of a journal: segments, and those of version 5 and before, of one trial each."""
 
 
 def refuse_links(*paths: Path) -> None:
@@ -438,19 +404,12 @@ def refuse_links(*paths: Path) -> None:
             raise UserError(f"{path}: is a link to another place, where nothing is removed", fix=fix)
 
 
-def cache_removal(
-    folder: Path, limit_bytes: int | None, older_s: float | None, *, damaged: bool, everything: bool
-) -> list[StoredFile]:
-    """Return the renders that any of the conditions names, and what killed processes left: with ``everything`` all of
-    it, else what is older than a day."""
-    renders = stored_renders(folder)
-    before_s = float("-inf") if older_s is None else time.time() - older_s
-    going = [one for one in renders if everything or one.used_s < before_s]
-    if damaged:
-        going += damaged_renders(one for one in renders if one not in going)
-    if limit_bytes is not None:
-        going += longest_unused((one for one in renders if one not in going), limit_bytes, ())
-    return going + (leftovers(folder, 0.0) if everything else leftovers(folder))
+def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
+    """Return the longest unused renders, so that the rest fits into the limit, and what killed processes left a day and
+    more ago; None: all of both."""
+    if limit_bytes is None:
+        return stored_renders(folder) + leftovers(folder, 0.0)
+    return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
 
 
 def chosen_results(out: Path, name: str) -> list[Path]:
@@ -477,6 +436,8 @@ def chosen_results(out: Path, name: str) -> list[Path]:
 
 def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
     """Return the files of a folder of results that tofpod wrote, locks last; with ``journal_only`` the records."""
+    from harness.engine.journal import SEGMENT_NAME
+
     found = []
     for path in files_below(folder):
         with contextlib.suppress(OSError):
@@ -485,11 +446,9 @@ def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
             unfinished = UNFINISHED_NAME.fullmatch(name)
             name = name if unfinished is None else unfinished["stem"] + unfinished["suffix"]
             if above[:1] == [JOURNAL]:
-                ours = len(above) <= 2 and ENTRY_NAME.fullmatch(name) is not None
-            elif not above:
-                ours = is_output(name, "results") or LOCK_NAME.fullmatch(name) is not None
+                ours = len(above) == 1 and SEGMENT_NAME.fullmatch(name) is not None
             else:
-                ours = len(above) == 1 and POINT_NAME.fullmatch(above[0]) is not None and is_output(name, "capture")
+                ours = not above and (is_output(name) or LOCK_NAME.fullmatch(name) is not None)
             if ours and stat.S_ISREG(file.st_mode) and (above[:1] == [JOURNAL] or not journal_only):
                 found.append(StoredFile(path, file.st_size, file.st_mtime))
     return sorted(found, key=lambda one: (LOCK_NAME.fullmatch(one.path.name) is not None, one.path))
@@ -500,9 +459,7 @@ def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list
     that it names is gone. Returns what is gone."""
     gone = removed(files)
     for folder in folders:
-        inner = folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}"))
-        deepest = [below for each in inner for below in folders_in(each, re.compile("[0-9a-f]{2}"))]
-        _remove_empty(*deepest, *inner, folder)
+        _remove_empty(*folders_in(folder, re.compile(JOURNAL)), folder)
     for parent in {folder.parent for folder in folders}:
         for left in parent.glob(f".{LATEST}.*.part"):
             if UNFINISHED_LINK.fullmatch(left.name) and left.is_symlink():

@@ -9,6 +9,8 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError, exit_code_of
 
+DAY_S = 86_400.0
+
 
 def main(arguments: list[str] | None = None) -> int:
     """The program. Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
@@ -31,7 +33,6 @@ def _parser() -> argparse.ArgumentParser:
     add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
     add("name", nargs="?", help="show everything that can be set of this one; of results, those of this experiment")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
-    add("--fast", action="store_true", help="of the cache: do not read every render to find damaged ones")
     add("--json", action="store_true", help="as JSON, for programs")
     return parser
 
@@ -73,7 +74,8 @@ def _list_offers(options: argparse.Namespace) -> int:
 def _list_results(options: argparse.Namespace) -> int:
     """List every folder of results with its state, the limit that it found and what tells it from others. Raises
     UserError where an experiment was named that has none."""
-    from harness.listing import differs_text, limit_text, result_folders, size_text, table_lines
+    from harness.listing import differs_text, limit_text, result_folders, table_lines
+    from harness.vocabulary.files import size_text
 
     folders = result_folders(options.out, options.name)
     if options.name is not None and not folders:
@@ -112,8 +114,8 @@ def _list_keys(options: argparse.Namespace) -> int:
 def _list_cache(options: argparse.Namespace) -> int:
     import time
 
-    from harness.listing import age_text, size_text
-    from scenes.render.cache import damaged_renders, leftovers, stored_renders
+    from harness.vocabulary.files import size_text
+    from scenes.render.cache import leftovers, stored_renders
 
     if options.name is not None:
         raise UserError(f"the cache has no part called {options.name!r}", fix="python -m harness.ls cache")
@@ -121,20 +123,13 @@ def _list_cache(options: argparse.Namespace) -> int:
     renders, left = stored_renders(folder), leftovers(folder)
     ages_s = [max(time.time() - file.used_s, 0.0) for file in renders]
     size_bytes, left_bytes = (sum(file.size_bytes for file in files) for files in (renders, left))
-    damaged = None if options.fast else [file.path.name for file in damaged_renders(renders)]  # 5 ms a render
     if options.json:
         facts = {"folder": str(folder), "renders": len(renders), "size_bytes": size_bytes}
         facts |= {"longest_unused_s": max(ages_s, default=None), "latest_use_s": min(ages_s, default=None)}
-        return _print_json(facts | {"damaged": damaged, "leftovers": len(left), "leftovers_bytes": left_bytes})
+        return _print_json(facts | {"leftovers": len(left), "leftovers_bytes": left_bytes})
     print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
     if renders:
-        print(f"  used: latest {age_text(min(ages_s))}, oldest {age_text(max(ages_s))}")
-    if damaged:
-        named = ", ".join(damaged[:3]) + (", ..." if len(damaged) > 3 else "")
-        print(f"  damaged, or of another version: {len(damaged)} ({named})")
-        print("    rendered again when needed; python -m harness.clean cache --damaged removes them")
-    elif renders:
-        print("  damaged: not looked for" if damaged is None else "  damaged: none")
+        print(f"  used: latest {min(ages_s) / DAY_S:.1f}, longest ago {max(ages_s) / DAY_S:.1f} days ago")
     if left:
         print(f"  left by processes that were killed: {len(left)}, {size_text(left_bytes)}")
     return 0

@@ -42,14 +42,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace, given: list[str]) -> int:
     from harness.experiment.load import load_experiment
-    from harness.experiment.schema import SimulatedSource
 
     experiment = load_experiment(options.experiment, options.overrides, options.calibration)
     command = "python -m harness.sweep " + shlex.join(given)
-    if not isinstance(experiment.config.source, SimulatedSource):
-        from harness.engine.study import judge_captures
-
-        return judge_captures(experiment, options.out, command, dry_run=options.dry_run)
     if options.dry_run:
         from harness.engine.estimate import dry_run
 

@@ -22,7 +22,6 @@ from scenes.render.cache import (
     ARRAYS,
     alone,
     cached_view,
-    damaged_renders,
     in_use,
     leftovers,
     read_view,
@@ -241,11 +240,6 @@ def test_renders_in_use_by_a_sweep_stay(tmp_path, view):
     assert trim_cache(tmp_path, 0) == 0
 
 
-def test_no_folder_and_damaged_renders(tmp_path, view):
+def test_no_folder(tmp_path):
     assert stored_renders(tmp_path / "none") == [] and leftovers(tmp_path / "none") == []
     assert trim_cache(tmp_path / "none", 0) == 0
-    paths = shelf(tmp_path, view, {"a": 1, "b": 2})
-    paths["b"].write_bytes(paths["b"].read_bytes()[:-100])
-    before_s = paths["a"].stat().st_mtime
-    assert [one.path for one in damaged_renders(stored_renders(tmp_path))] == [paths["b"]]
-    assert paths["a"].stat().st_mtime == before_s  # to look is not to use

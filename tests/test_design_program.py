@@ -21,7 +21,6 @@ from harness.evaluation.pod.design import (
     StudyPlan,
     curve_through,
     design,
-    fixed_share,
     hole_free,
     recommend,
     repeated_studies,
@@ -66,29 +65,6 @@ def test_the_guess_goes_through_both_sizes(a50: float, more: float, link: str, l
 def test_logit_by_hand() -> None:
     """ln(0.9 / 0.1) = ln 9 widths lie between a50 and a90."""
     assert (GUESS.mu, GUESS.sigma) == pytest.approx((5.0, 2.0 / np.log(9.0)))
-
-
-def test_the_fixed_share_by_hand() -> None:
-    """0.8 mm white over 50 frames is 0.0128 mm2, beside 0.09 mm2 that stays."""
-    assert fixed_share(0.8, 0.3, 50) == pytest.approx(0.09 / 0.1028)
-    assert (fixed_share(0.8, 0.0, 50), fixed_share(0.0, 0.3, 50)) == (0.0, 1.0)
-    with pytest.raises(UserError, match="fixed noise"):
-        fixed_share(0.0, 0.0, 1)
-
-
-def test_frames_are_studied_with_the_same_targets_and_luck(capsys: pytest.CaptureFixture[str]) -> None:
-    frames = ["--frames", "10", "50", "--guessed-with", "50", "--white-mm", "0.8", "--fixed-mm", "0.3"]
-    said = answered(capsys, *TOLD, "--studies", "20", "--targets", "60", "--seed", "2", *frames)
-    one, fifty = said["frames"]
-    ratio = np.sqrt((0.64 / 10 + 0.09) / (0.64 / 50 + 0.09))
-    assert one["guess"]["a90"] == pytest.approx(7.0 * ratio)
-    assert fifty["guess"]["a90"] == pytest.approx(7.0)
-    alone = design(GUESS, (60,), (2, 12), placements=("uniform",), studies=20, seed=2)[0]
-    assert fifty["plan"]["bound"] == alone.bound and one["plan"]["sizes"] == fifty["plan"]["sizes"]
-    assert one["plan"]["bound"] > fifty["plan"]["bound"]
-
-
-# ---- what is recommended ---------------------------------------------------------------------------------------------
 
 
 def plans(*told: tuple[int, str, float]) -> list[StudyPlan]:
@@ -191,15 +167,13 @@ def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixtu
 
 
 def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    frames = ["--frames", "1", "50", "--guessed-with", "50", "--white-mm", "0.8", "--fixed-mm", "0.3"]
     others = ["--repeats", "5", "--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
-    assert main([*TOLD, *FEW, "--studies", "10", *frames, *others]) == 0
+    assert main([*TOLD, *FEW, "--studies", "10", *others]) == 0
     printed = capsys.readouterr().out
     assert "5 repeats of 8 targets are 8 targets" in printed
     assert "WRONG: a90/95 (furlong)" in printed
     assert "needs 4 hole-free boards of 0.25 m2" in printed
     assert "no false call on 2.996 m2, which is 12 other boards" in printed
-    assert "with N = 1 much of the guessed curve's rise lies outside the sizes" in printed
     assert printed.rstrip().splitlines()[-1].startswith("Make 60 targets, ")
     assert next(line for line in printed.splitlines() if line.startswith("* ")).split()[1] == "60"
 
@@ -231,13 +205,11 @@ def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.Captur
 
 def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--study", str(study), "--set-up", "50 frames", "--studies", "10", "--targets", "60"]
-    more = ["--frames", "50", "--white-mm", "0.8", "--fixed-mm", "0.3", "--false-calls-per-m2", "1"]
-    said = answered(capsys, *asked, *more)
+    said = answered(capsys, *asked, "--false-calls-per-m2", "1")
     record = study_record(Study(set_ups=(SetUp(frames=1), SetUp(frames=50, a50_mm=4.0)), boards=30)).set_ups[1]
     limit = limit_of(record)
     assert said["guess"]["a50"] == pytest.approx(limit.a50_mm, rel=1e-12)
     assert said["guess"]["a90"] == pytest.approx(limit.a90_mm, rel=1e-12)
-    assert said["frames"][0]["guess"]["a90"] == pytest.approx(limit.a90_mm), "guessed with its own 50 frames"
     assert said["range_of_sizes"] == [record.inspected.diameter_mm.min(), record.inspected.diameter_mm.max()]
     assert said["hole_free"]["board_m2"] == AREA_M2
     assert said["guess"]["origin"] == "fitted to synthetic, 50 frames"
@@ -260,12 +232,7 @@ def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str])
         ([*TOLD, "--pod", "1"], "0 < pod < 1"),
         ([*TOLD, "--confidence", "0.4"], "0.5 < confidence < 1"),
         ([*TOLD, "--goal", "6.5"], "not above the guess's own 7"),
-        ([*TOLD, "--frames", "10"], "--frames needs --white-mm and --fixed-mm and --guessed-with"),
-        ([*TOLD, "--white-mm", "1"], "--white-mm belongs to --frames"),
         ([*TOLD, "--set-up", "main"], "--set-up belongs to --study"),
-        ([*TOLD, "--frames", "0", "--guessed-with", "1", "--white-mm", "1", "--fixed-mm", "0"], "--frames 0"),
-        ([*TOLD, "--frames", "5", "--guessed-with", "0", "--white-mm", "1", "--fixed-mm", "0"], "with 0 frames"),
-        ([*TOLD, "--frames", "5", "--guessed-with", "1", "--white-mm", "-1", "--fixed-mm", "0"], "0 or more"),
         ([*TOLD, "--repeats", "1"], "nothing is repeated"),
         ([*TOLD, "--false-calls-per-m2", "1"], "needs --board-m2"),
         ([*TOLD, "--false-calls-per-m2", "-1", "--board-m2", "1"], "both above 0"),

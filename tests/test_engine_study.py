@@ -19,7 +19,7 @@ from tiny_sweep import STUDY, results
 from harness.engine import run
 from harness.engine.plan import plan_of
 from harness.engine.run import threshold_of
-from harness.engine.study import record_of
+from harness.engine.study import failures_by_point, record_of, without_limit
 from harness.engine.tables import tables_of
 from harness.engine.trial import TrialTask, run_trial
 from harness.evaluation.study.record import StudyRecord, read_record
@@ -136,6 +136,26 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
     tables = tables_of(records_of(tmp_path, outcome), experiment)
     assert set(tables.holes["frames"]) == {2}
     assert len(tables.holes) == 4 * 5
+
+
+def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_path, monkeypatch):
+    def blinded(task: TrialTask) -> object:
+        if task.set_ups[0].camera.unit_seed == 2:
+            raise UserError("the crop leaves none of the cloud's points")
+        return run_trial(task)
+
+    monkeypatch.setattr(run, "run_trial", blinded)
+    experiment = load_experiment(finished.parent / "tiny.yaml", ["sweep={source.camera.unit_seed: [1, 2]}"])
+    plan = plan_of(experiment, finished / ".cache" / "renders")
+    outcome = run_serially(plan, tmp_path)
+    failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
+    provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
+    record = record_of(experiment, plan, tables_of(records_of(tmp_path, outcome), experiment), failed, provenance)
+    (one,) = record.set_ups
+    assert one.axes == {"source.camera.unit_seed": 1} and one.failed == 0 and len(one.inspected.hit) == 20
+    (said,) = without_limit(experiment.points, failed, record.set_ups)
+    assert said.startswith("no limit for source.camera.unit_seed=2: the camera sees nothing of the board here")
+    assert "leaves none of the cloud's points" in said
 
 
 # ---- the whole study -------------------------------------------------------------------------------------------------

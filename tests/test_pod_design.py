@@ -11,7 +11,7 @@ from harness.evaluation.intervals import (
     threshold_for_rate,
 )
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import design, guess_with_frames, place_sizes, repeats_are_not_targets
+from harness.evaluation.pod.design import design, place_sizes, repeats_are_not_targets
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.vocabulary.errors import UserError
 
@@ -95,17 +95,6 @@ def test_studies_far_from_the_rise_demonstrate_nothing() -> None:
     plan = design(GUESS, (20,), (30, 60), placements=("uniform",), studies=20)[0]
     assert plan.bound == np.inf and plan.demonstrated < 0.5
     assert any("outside the range" in note for note in plan.notes)
-
-
-def test_frames_shrink_the_guess_as_they_shrink_the_noise() -> None:
-    white = guess_with_frames(GUESS, 100, guessed_with=25, fixed_share=0.0)
-    assert white.size_at(0.9) == pytest.approx(GUESS.size_at(0.9) / 2)
-    fixed = guess_with_frames(GUESS, 10**9, guessed_with=25, fixed_share=0.36)
-    assert fixed.size_at(0.9) == pytest.approx(GUESS.size_at(0.9) * 0.6, rel=1e-6)
-    log = PodCurve("probit", True, 1.0, 0.3, np.zeros((2, 2)))
-    assert guess_with_frames(log, 4, guessed_with=1, fixed_share=0.0).size_at(0.3) == pytest.approx(
-        log.size_at(0.3) / 2
-    )
 
 
 def test_fifty_repeats_of_eight_holes_are_eight_targets() -> None:

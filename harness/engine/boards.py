@@ -22,7 +22,7 @@ from harness.engine.plan import RenderJob, batch_of, point_task, unit_of
 from harness.engine.setup import known_view, load_set_up
 from harness.engine.trial import Role, TrialTask, cloud_of
 from harness.exchange import depth_units, on_window, picture_bytes, run_lengths
-from harness.experiment.schema import Experiment, Point, SimulatedSource
+from harness.experiment.schema import Experiment, Point
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, TEXT_BYTES, bounded_bytes, strict_json, write_bytes, write_text
 from harness.vocabulary.geometry import MM, Reason, Region
@@ -98,7 +98,7 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
     samples = []
     for category, point in categories_of(experiment).items():
         source, seed, study = point.config.source, point.config.seed, point.config.study
-        if not isinstance(source, SimulatedSource) or source.views or not isinstance(source.target, DrawnTargetConfig):
+        if source.views or not isinstance(source.target, DrawnTargetConfig):
             fix = "take one with `target: {name: drawn, ...}`, such as detection_limit"
             raise UserError(f"{experiment.config.name}: has no random boards, each seen in a single view", fix=fix)
         for split, role, share in SPLITS:

@@ -71,11 +71,6 @@ class Journal:
         place = self._known().get(key)
         return None if place is None else place.state
 
-    def size(self, key: str) -> int:
-        """Return the bytes of an entry on the disk; 0 where there is none."""
-        place = self._known().get(key)
-        return 0 if place is None else place.length
-
     def read(self, key: str) -> Ended | None:
         """Return the entry of a trial; None where there is none."""
         place = self._known().get(key)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -201,7 +201,7 @@ def point_task(point: Point, threshold: float | None, learned: str | None) -> Po
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All groups of an experiment with a simulated source."""
+    """All groups of an experiment."""
 
     groups: tuple[Group, ...]
 
@@ -227,7 +227,6 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     source, study = points[0].config.source, points[0].config.study
-    assert isinstance(source, SimulatedSource)
     target, seed = source.target, points[0].config.seed
     if study is not None and isinstance(target, DrawnTargetConfig):
         calibrate = points[0].config.threshold.calibrate
@@ -239,7 +238,7 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
             for board in range(count):
                 numbers = range(study.units or 0) if role == "damaged" else [board] if study.units else []
                 units = tuple(unit_of(source.camera, seed, role, number) for number in numbers)
-                made.append(batch_of(target.drawn(role, board), role, source, cache, board, units))
+                made.append(batch_of(_drawn(target, role, board), role, source, cache, board, units))
             return tuple(made)
 
         learning, first = batches("learning", LEARNING_BOARDS), batches("calibration", boards)
@@ -257,6 +256,10 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     renders = {job.path: job for batch in learning for job in batch.renders}
     set_ups = tuple(ref for batch in learning for ref in batch.before(0))
     return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
+
+
+_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)
+"""Cameras, frames and detectors look at the same boards."""
 
 
 def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:

@@ -1,4 +1,4 @@
-"""A validated experiment becomes its folder of results: one with a simulated camera, or one of real captures."""
+"""A validated experiment becomes its folder of results."""
 
 from __future__ import annotations
 
@@ -7,32 +7,26 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from detectors import load_detector
-from detectors.average import prefix_averages
-from harness.engine.estimate import learn, progress_display
+from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
 from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
 from harness.engine.run import render_missing, run_plan
 from harness.engine.tables import summaries, tables_of, write_tables
-from harness.engine.work import STATES, EngineOptions, JobEngine, Outcome, engine_of, locked
+from harness.engine.work import STATES, EngineOptions, Failure, JobEngine, Outcome, engine_of, locked
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.load import resolved_yaml
-from harness.experiment.schema import CaptureSource, Experiment, Point, SimulatedSource, detector_version, recording_of
-from harness.inspection.run import judged as judged_cloud
-from harness.inspection.told import choice_by, choice_facts, pictures, print_warnings
+from harness.experiment.schema import Experiment, Point, detector_version
 from harness.listing import point_to
-from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
-from harness.tables.schema import write_table
 from harness.tables.text import Grid, show
-from harness.tables.trials import POINTS_OF_CAPTURES, ResultTables
+from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
 from harness.vocabulary.geometry import INCH, MM
@@ -42,9 +36,6 @@ from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import DIAMETERS_IN
-
-if TYPE_CHECKING:
-    from detectors.crop import Choice
 
 MOST_FAILURES = 200  # failures that are listed; the journal has all
 MOST_VIEWS = 64  # views whose render noise is measured: evenly taken from all, 4 MB each
@@ -68,7 +59,6 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             with progress_display() as report:
                 retry = options.retry_failed
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
-            learn(plan, outcome, journal, cache.parent)
             if not options.shard.is_whole:
                 trials = outcome.trials
                 counts = f"{trials.done} trials done, {trials.found} found, {trials.failed} not ended well"
@@ -84,18 +74,18 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             provenance = _provenance(experiment, plan, outcome, tables, origin)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
             write_tables(folder, tables.stored(), provenance)
-            write_text(folder / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
             if experiment.config.study is None:
                 shown = _write_report(folder, experiment, outcome, tables, provenance)
             else:
                 shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
+            write_text(folder / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
         if options.cache_limit_gb is not None:
             trim_cache(cache, round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:
         print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
         return 130
     point_to(folder)
-    show([*(f"warning: {text}" for text in provenance["guesses"]), *shown])
+    show([*(f"warning: {text}" for text in provenance["warnings"]), *shown])
     _tell_failures(outcome)
     print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
@@ -140,13 +130,14 @@ def _write_study(
     from harness.report.study_page import study_parts, write_study_report
     from harness.tables.study import study_tables
 
-    failed = failed_by_point(plan, (failure.what for failure in outcome.failures), outcome.thresholds)
+    failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)
     if not study.set_ups:
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
+    provenance["warnings"] += without_limit(experiment.points, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
     # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
-    targets = [cast("SimulatedSource", point.config.source).target for point in experiment.points]
+    targets = [point.config.source.target for point in experiment.points]
     drilled = any(
         isinstance(target, DrawnTargetConfig) and target.damage.kind in ("through", "blind") for target in targets
     )
@@ -172,7 +163,7 @@ def _write_report(
 
     write_tables(folder, summaries(tables, outcome.examples), provenance)
     title = experiment.config.title or experiment.config.name
-    target = getattr(getattr(experiment.config.source, "target", None), "name", "")
+    target = experiment.config.source.target.name
     write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
     return final_tables(tables)
 
@@ -236,7 +227,7 @@ def _provenance(
                 noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
                 noise[name] = max(noise.get(name, 0.0), noise_mm)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
-    sources = [cast("SimulatedSource", point.config.source).camera for point in experiment.points]
+    sources = [point.config.source.camera for point in experiment.points]
     cameras = {source.name: camera_of(source) for source in sources}
     guesses = map(guessed_precision, cameras.values())
     return {
@@ -255,7 +246,7 @@ def _provenance(
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
         "indirect_noise_mm": noise,
-        "guesses": [text for text in guesses if text],
+        "warnings": [text for text in guesses if text],
         "failures": [
             {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
         ],
@@ -279,14 +270,15 @@ def record_of(
     experiment: Experiment,
     plan: SweepPlan,
     tables: ResultTables,
-    failed: Mapping[str, int],
+    failed: Mapping[str, Sequence[Failure]],
     provenance: Mapping[str, Any],
 ) -> StudyRecord:
-    """Return the record of a study. ``failed``: trials that raised, by point digest. Set-ups no trial of which ended
-    are left out, as nothing can be said of them."""
+    """Return the record of a study. ``failed``: trials that failed, by point digest. Set-ups of which no damaged
+    board was judged are left out; `without_limit` tells of them."""
     calibrate = experiment.config.threshold.calibrate
     found = {point.digest: group for group in plan.groups for point in group.points}
-    set_ups = (_set_up(point, found[point.digest], tables, failed.get(point.digest, 0)) for point in experiment.points)
+    counts = {digest: len(failures) for digest, failures in failed.items()}
+    set_ups = (_set_up(point, found[point.digest], tables, counts.get(point.digest, 0)) for point in experiment.points)
     return StudyRecord(
         name=experiment.config.name,
         digest=experiment.digest,
@@ -375,75 +367,31 @@ def judged_facts(holes: pd.DataFrame, runs: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def failed_by_point(plan: SweepPlan, whats: Iterable[str], thresholds: Mapping[str, float]) -> Counter[str]:
-    """Count the trials of each point that raised, from the journal keys of failures."""
-    keys, counts = set(whats), Counter[str]()
-    for group in plan.groups if keys else ():
+def failures_by_point(
+    plan: SweepPlan, failures: Iterable[Failure], thresholds: Mapping[str, float]
+) -> dict[str, list[Failure]]:
+    """Return the failed trials of each point, by its digest."""
+    by_key = {failure.what: failure for failure in failures}
+    found: dict[str, list[Failure]] = {}
+    for group in plan.groups if by_key else ():
         for batch in group.batches:
             for key, task in group.trials(batch, thresholds if batch in group.then else {}):
-                counts.update(asked.digest for asked in task.points if key in keys)
-    return counts
+                for asked in task.points if key in by_key else ():
+                    found.setdefault(asked.digest, []).append(by_key[key])
+    return found
 
 
-# ---------------------------------------------------------------- real captures
-
-
-def judge_captures(experiment: Experiment, out: Path, command: str, *, dry_run: bool) -> int:
-    """Judge every point's capture once and write its findings to ``<folder>/<number>/``, and a table of all points.
-
-    A capture has no repeats and no truth, so rates, sizes against the truth and claims are not given. Returns 0.
-    """
-    folder = experiment.folder(out)
-    if dry_run:
-        print(f"{experiment.config.name}: valid; {len(experiment.points)} points of a real capture; results: {folder}")
-        return 0
-    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
-    rows = []
-    for number, point in enumerate(experiment.points):
-        judged, threshold, choice = _judged(point)
-        cloud, name = judged.cloud, f"point-{number:03d}"
-        about = {
-            "target": choice_facts(choice),
-            "capture": {
-                "frames_used": cloud.n_frames,
-                "frames_left_out": [{"name": left.name, "why": left.why} for left in cloud.left_out],
-            },
-            "threshold": {"k": threshold, "from": "given"},
-            "settings": point.config.to_data(),
-            "provenance": record(command),
-        }
-        write_findings(folder / name, judged, about, point.label or name, beside=pictures(choice))
-        threshold_mm = threshold * judged.evidence.scale_m / MM
-        rows.append(
-            {
-                "point": name,
-                "variant": point.variant,
-                "what": point.label,
-                "frames_used": cloud.n_frames,
-                "frames_left_out": len(cloud.left_out),
-                "threshold_k": threshold,
-                "threshold_mm": round(threshold_mm, 4),
-                "findings": len(judged.findings),
-            }
-        )
-        warnings = (*(choice.warnings if choice else ()), *judged.evidence.warnings)
-        print_warnings(f"{name}: {warning}" for warning in warnings)
-        print(f"{name} {point.label}: {len(judged.findings)} findings beyond {threshold_mm:.2f} mm")
-        for left in cloud.left_out:
-            print(f"  left out: {left.name}: {left.why}")
-    write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
-    point_to(folder)
-    print(f"findings: {folder}")
-    return 0
-
-
-def _judged(point: Point) -> tuple[Judged, float, Choice | None]:
-    config = point.config
-    assert isinstance(config.source, CaptureSource)
-    frames = config.capture.frames
-    cloud = prefix_averages(recording_of(config.source), [frames], config.capture.average)[frames]
-    detector = load_detector(config.detector.name, dict(config.detector.settings))
-    choice = choice_by(getattr(detector, "settings", None), cloud)
-    threshold = config.threshold.k
-    assert threshold is not None  # a capture cannot be calibrated on; the experiment's checks say so
-    return judged_cloud(detector, cloud, detector.analyse(cloud), threshold), threshold, choice
+def without_limit(
+    points: Iterable[Point], failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
+) -> list[str]:
+    """Return sentences on the points that are not among the ``judged`` set-ups, with their commonest failure."""
+    known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
+    for point in points:
+        if (point.variant, point.config.capture.frames) not in known:
+            own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
+            causes = Counter(one.in_short for one in own).most_common(1)
+            why = causes[0][0] if causes else "its trials did not end, see the failures"
+            if own and all(one.state == "failed" and not one.is_bug for one in own):
+                why = f"the camera sees nothing of the board here that could be judged ({why})"
+            said.setdefault(why, []).append(point.label)
+    return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]

@@ -15,7 +15,7 @@ from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.profile import shadowed_shares
 from harness.evaluation.set_ups import compare_set_ups, effects_table, set_ups_of
 from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
-from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point, SimulatedSource
+from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point
 from harness.experiment.unfold import FRAMES
 from harness.tables import trials
 from harness.tables.schema import Table, write_table
@@ -189,7 +189,6 @@ def _walls(experiment: Experiment) -> pd.DataFrame:
     if not mappings:
         return pd.DataFrame()
     source = next(config.source for config in set_ups if config.mapping is not None)
-    assert isinstance(source, SimulatedSource)
     assert source.views is not None
     target, emitter_m = source.target.declare(), camera_of(source.camera).optics.emitter_m
     boards = [invert(pose.T_camera_board) for pose in poses_of(source.views, target.pose)]

@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
 from math import ceil, dist, expm1
-from pathlib import Path
 
 from pydantic import ValidationError
 
 from detectors import detector_names
 from harness.experiment.schema import (
     DETECTOR_NAME,
-    CaptureSource,
     ExperimentConfig,
     SimulatedSource,
-    recording_of,
     splices_of,
 )
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
+from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
-from scenes.perspectives import check_in_view, poses_of, view_count
+from scenes.optics import Optics
+from scenes.perspectives import AnyViews, check_in_view, poses_of, view_count
 from scenes.sensor.camera import CameraConfig, camera_names, camera_of, is_camera_path, load_camera
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.thesis import AnyTargetConfig
 
 CAMERA_NAME = ("source", "camera", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
+VIEWS = ("source", "views")
 
 
 def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
@@ -53,19 +52,16 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
             place = source.key_place_of(("capture", "average", "frames"))
             message = "an experiment counts its frames by `capture.frames`"
             problems.append(Problem(message, place, fix="remove this key"))
-        if isinstance(config.source, SimulatedSource):
-            problems += [*_target_problems(config, config.source, source)]
-            problems += [*_mapping_problems(config, config.source, source)]
-            problems += [*_flat_field_problems(config, config.source, source)]
-        else:
-            problems += _capture_problems(config, config.source, source)
+        problems += _target_problems(config, config.source, source)
+        problems += _mapping_problems(config, config.source, source)
+        problems += _flat_field_problems(config, config.source, source)
         problems += _study_problems(config, source)
     return config, problems
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
     """Find what does not fit between a study, a family of boards and a threshold set on boards."""
-    target = config.source.target if isinstance(config.source, SimulatedSource) else None
+    target = config.source.target
     drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
@@ -106,26 +102,13 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
 def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
     drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
     try:
-        target = simulated.target.declare()
-        _checked(target)
+        target = _declared(simulated.target)
     except UserError as error:  # that includes a family of boards that are too full for their damage
         yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
         return
-    if drawn is None:
-        yield from _pose_problems(simulated, target, source)
-    # the first pose that the camera does not see whole stands for all
-    for pose in drawn.extreme_poses() if drawn else ():
-        posed = target.model_copy(update={"pose": pose})
-        problems = [*_pose_problems(simulated.model_copy(update={"views": None}), posed, source)]
-        problems += _pose_problems(simulated, posed, source) if simulated.views else ()
-        if problems:
-            where = (
-                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
-                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
-            )
-            of_camera = problems[0].place in [source.place_of(CAMERA_NAME), source.place_of(CAMERA_NUMBERS)]
-            yield problems[0] if of_camera else replace(problems[0], message=f"{where}: {problems[0].message}")
-            break
+    if found := _unseen(simulated.camera, simulated.views, simulated.target):
+        path, mistake = found
+        yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
@@ -137,10 +120,47 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
         )
 
 
-def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Source) -> Iterator[Problem]:
-    """Find the first pose (of several views the first view) from which the camera does not see the whole face within
-    its range, or finds no albedo at its wavelength; or that the camera cannot be made."""
-    views, place = simulated.views, source.place_of(("source", "views"))
+@lru_cache(maxsize=10_000)
+def _declared(config: AnyTargetConfig) -> TargetConfig:
+    """Return the target, or a family's first board. Raises UserError where it cannot be."""
+    target = config.declare()
+    check_target(target)
+    return target
+
+
+@lru_cache(maxsize=10_000)
+def _unseen(
+    camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
+) -> tuple[KeyPath, UserError] | None:
+    """Return why the camera does not see the target, and the key that this concerns: the camera cannot be made, finds
+    no albedo at its wavelength, or `_unseen_pose`; of a family of boards in the extreme poses that can be drawn, first
+    in a single view."""
+    target = _declared(declared)
+    path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
+    try:
+        optics = camera_of(camera).optics
+        path = TARGET
+        target.at_wavelength(optics.wavelength_nm)
+    except UserError as mistake:
+        return path, mistake
+    if not isinstance(declared, DrawnTargetConfig):
+        return _unseen_pose(optics, views, target)
+    for pose in declared.extreme_poses():
+        posed = target.model_copy(update={"pose": pose})
+        found = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
+        if found:
+            path, mistake = found
+            where = (
+                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
+                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
+            )
+            return path, UserError(f"{where}: {mistake.message}", legal=mistake.legal, fix=mistake.fix)
+    return None
+
+
+def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
+    """Return the mistake of the first pose (of several views the first view) from which the camera sees nothing of the
+    face, or none of it within its range; and the key that it concerns."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
@@ -148,18 +168,17 @@ def _pose_problems(simulated: SimulatedSource, target: TargetConfig, source: Sou
         key, value = str(first["loc"][-1]), first["input"]
         legal = shape.legal_at(shape.Declared(type(target.pose), {}, {}).at((key,)))
         message = f"a view's pose is not legal: {key} would be {value:g}"
-        yield Problem(message, place, legal, fix="lower the spread or the sway")
-        return
+        return VIEWS, UserError(message, legal=legal, fix="lower the spread or the sway")
     for number, pose in enumerate(poses):
-        found = _camera_mistake(simulated.camera, target.model_copy(update={"pose": pose}))
-        if found:
-            path, mistake = found
-            message, at = mistake.message, source.place_of(path)
-            if views is not None and path == TARGET:
-                tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
-                message, at = f"view {number} of {len(poses)} ({tilts}): {message}", place
-            yield Problem(message, at, legal=mistake.legal, fix=mistake.fix)
-            return
+        try:
+            check_in_view(target.model_copy(update={"pose": pose}), optics)
+        except UserError as mistake:
+            if views is None:
+                return TARGET, mistake
+            tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            message = f"view {number} of {len(poses)} ({tilts}): {mistake.message}"
+            return VIEWS, UserError(message, legal=mistake.legal, fix=mistake.fix)
+    return None
 
 
 def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
@@ -187,49 +206,3 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
         yield Problem(f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal)
-
-
-@lru_cache(maxsize=10_000)
-def _camera_mistake(config: CameraConfig, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
-    path: KeyPath = CAMERA_NUMBERS if config.numbers else CAMERA_NAME
-    try:
-        optics = camera_of(config).optics
-        path = TARGET
-        target.at_wavelength(optics.wavelength_nm)
-        check_in_view(target, optics)
-    except UserError as error:
-        return path, error
-    return None
-
-
-_checked = lru_cache(maxsize=10_000)(check_target)
-
-
-def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> list[Problem]:
-    problems = []
-    for index, name in enumerate(capture.paths):
-        if not Path(name).exists():
-            near = nearest(Path(name).name, [file.name for file in Path(name).parent.glob("*")])
-            place = source.place_of(("source", "paths", index))
-            problems.append(Problem(f"{name}: there is no such file or folder", place, nearest=near))
-    lens = capture.intrinsics
-    if lens and lens not in camera_names() and not Path(lens).is_file():
-        legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
-        problems.append(Problem(f"{lens}: neither a file nor a camera", place, legal))
-    if not problems:
-        try:
-            recording_of(capture)
-        except UserError as error:
-            place = source.place_of(("source", "paths"))
-            problems.append(Problem(error.message, place, legal=error.legal, fix=error.fix))
-    if config.capture.flat_field is not None:
-        place, fix = source.place_of(("capture", "flat_field")), "use harness.flatfield and harness.detect --flat-field"
-        problems.append(Problem("a flat field needs a simulated unit", place, fix=fix))
-    if config.mapping is not None:
-        place, fix = source.place_of(("mapping",)), "use harness.detect --register"
-        problems.append(Problem("a mapping needs the views of a simulated source", place, fix=fix))
-    if config.threshold.calibrate is not None:
-        message = "a threshold can be calibrated only on hole-free repeats, which a capture does not have"
-        place = source.place_of(("threshold", "calibrate"))
-        problems.append(Problem(message, place, legal="a given threshold, such as `k: 3.5`"))
-    return problems

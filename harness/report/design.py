@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -35,7 +35,7 @@ LOOKS = {"uniform": (blocks.BLUE, "o"), "concentrated": (blocks.ORANGE, "s")}
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
     """All that was found out about a study to be made. Sizes are in ``unit``; ``origin``: of the guess; ``goal``: the
-    bound that was wanted, if any; ``guessed_with``: frames of the guess, where carried."""
+    bound that was wanted, if any."""
 
     guess: PodCurve
     origin: str
@@ -44,8 +44,6 @@ class StudyDesign:
     plans: tuple[planned.StudyPlan, ...]
     recommended: planned.Recommendation
     goal: float | None
-    guessed_with: int | None
-    frames: tuple[planned.FramesPlan, ...]
     repeats: tuple[planned.RepeatedStudies, ...]
     hole_free: planned.HoleFree | None
 
@@ -70,7 +68,7 @@ class StudyDesign:
 
 
 def design_html(design: StudyDesign, command: str) -> str:
-    """The page as text: answer, figure, plans and sizes, frames, repeats, hole-free area; it needs no network."""
+    """The page as text: answer, figure, plans and sizes, repeats, hole-free area; it needs no network."""
     caption = (
         f"Left: the {design.limit_name} that simulated studies demonstrate, with the guess's own size, below which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended number of targets."
@@ -88,8 +86,9 @@ def design_html(design: StudyDesign, command: str) -> str:
         body.append(
             blocks.fold(name, blocks.tag("pre", " ".join(f"{size:.4g}" for size in plan.sizes)), is_open=chosen)
         )
-    for title, grid, said in _further(design):
-        body += [blocks.heading(title), grid.html(), blocks.note(said)]
+    if design.repeats:
+        grid, said = _repeats(design)
+        body += [blocks.heading("Repeats are not targets"), grid.html(), blocks.note(said)]
     body += [
         blocks.heading("Where nothing is"),
         blocks.bullets(hole_free_lines(design)),
@@ -107,7 +106,8 @@ def design_parts(design: StudyDesign) -> list[str | Grid]:
     sizes = wrap(" ".join(f"{size:.4g}" for size in design.recommended.plan.sizes), WIDE)
     parts: list[str | Grid] = [f"guess: {guess_text(design)}", "", plans_grid(design), *wrap(MEDIANS, WIDE), ""]
     parts += [f"sizes of the recommended plan (*){design.in_unit}:", *sizes]
-    for _, grid, said in _further(design):
+    if design.repeats:
+        grid, said = _repeats(design)
         parts += ["", grid, *wrap(said, WIDE)]
     parts += ["", *(f"where nothing is: {line}" for line in hole_free_lines(design))]
     return [*parts, "", *(f"note: {line}" for line in notes(design)), "", answer(design)]
@@ -136,47 +136,33 @@ def guess_text(design: StudyDesign) -> str:
 
 
 class Planned(NamedTuple):
-    """A row of the tables of plans: for so many frames, or recommended among others."""
+    """A row of the table of plans."""
 
     plan: planned.StudyPlan
-    chosen: bool = False
-    frames: int = 0
-    curve: PodCurve | None = None
+    chosen: bool
 
 
 def _size(value: float) -> str:
     return f"{value:#.4g}".rstrip(".") if np.isfinite(value) else "none"
 
 
-def _size_at(pod: float) -> Callable[[Planned], str]:
-    return lambda row: _size(row.curve.size_at(pod) if row.curve else np.nan)
-
-
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-EXPECTED = (
-    Column("", "limit", "plan.bound", text=_size, tone=lambda row: "key" if row.chosen else ""),
-    Column("", "10 %", "plan.low", text=_size),
-    Column("", "90 %", "plan.high", text=_size),
-    Column("", "demonstrated", "plan.demonstrated", text=_percent),
-)
-PLACED_OF = Column("", "targets", lambda row: f"{'* ' if row.chosen else ''}{row.plan.targets}")
 PLANS = Table(
     "plans",
     "one row per number of targets and placement",
-    (PLACED_OF, Column("", "sizes", lambda row: PLACED[row.plan.placement]), *EXPECTED),
+    (
+        Column("", "targets", lambda row: f"{'* ' if row.chosen else ''}{row.plan.targets}"),
+        Column("", "sizes", lambda row: PLACED[row.plan.placement]),
+        Column("", "limit", "plan.bound", text=_size, tone=lambda row: "key" if row.chosen else ""),
+        Column("", "10 %", "plan.low", text=_size),
+        Column("", "90 %", "plan.high", text=_size),
+        Column("", "demonstrated", "plan.demonstrated", text=_percent),
+    ),
     formats=(),
     left=2,
-)
-CURVE = (("frames", lambda row: row.frames), ("a50", _size_at(0.5)), ("a90", _size_at(0.9)))
-FRAMES = Table(
-    "plans_by_frames",
-    "one row per number of averaged frames",
-    (*(Column("", label, value) for label, value in CURVE), *EXPECTED),
-    formats=(),
-    left=0,
 )
 REPEATS = Table(
     "repeats",
@@ -198,28 +184,16 @@ def plans_grid(design: StudyDesign) -> Grid:
     return PLANS.grid(rows, heads={"limit": f"{design.limit_name}{design.in_unit}"})
 
 
-def _further(design: StudyDesign) -> Iterator[tuple[str, Grid, str]]:
-    """Yield title, table and note of each further question: averaged frames, repeats."""
-    unit, limit = design.in_unit, f"{design.limit_name}{design.in_unit}"
-    if design.frames:
-        rows = [Planned(each.plan, frames=each.frames, curve=each.curve) for each in design.frames]
-        heads = {"limit": limit, "a50": f"a50{unit}", "a90": f"a90{unit}"}
-        said = (
-            f"The guess is for {design.guessed_with} averaged frames. The others take sizes of equal chance to shrink "
-            "with the noise's standard deviation: so for depth, about so for diameters larger than the camera's blur. "
-            "Each row is a study of the recommended number of targets, evenly spread, with the same luck."
-        )
-        yield "Averaged frames", FRAMES.grid(rows, heads=heads), said
-    if design.repeats:
-        row, plan = design.repeats[0], design.plans[0]
-        said = (
-            f"{row.repeats} repeats of {row.targets} targets are {row.targets} targets. {row.studies} simulated "
-            f"studies; medians, and the share of limits below the guess's {design.size_name} of "
-            f"{design.text(row.true_size)}, which may be {100 * (1 - plan.confidence):.3g} %. The right limit counts "
-            "targets, the wrong one inspections, which is safe only where no target has luck of its own."
-        )
-        grid = REPEATS.grid(design.repeats, heads={"right": f"right: {limit}", "WRONG": f"WRONG: {limit}"})
-        yield "Repeats are not targets", grid, said
+def _repeats(design: StudyDesign) -> tuple[Grid, str]:
+    """Return the table of repeats and its note."""
+    limit, row, plan = f"{design.limit_name}{design.in_unit}", design.repeats[0], design.plans[0]
+    said = (
+        f"{row.repeats} repeats of {row.targets} targets are {row.targets} targets. {row.studies} simulated "
+        f"studies; medians, and the share of limits below the guess's {design.size_name} of "
+        f"{design.text(row.true_size)}, which may be {100 * (1 - plan.confidence):.3g} %. The right limit counts "
+        "targets, the wrong one inspections, which is safe only where no target has luck of its own."
+    )
+    return REPEATS.grid(design.repeats, heads={"right": f"right: {limit}", "WRONG": f"WRONG: {limit}"}), said
 
 
 def hole_free_lines(design: StudyDesign) -> list[str]:
@@ -244,7 +218,7 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
 
 def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, Monte Carlo error, and what the plan rests on."""
-    plan, (low, high) = design.recommended.plan, design.range_of_sizes
+    plan, high = design.recommended.plan, design.range_of_sizes[1]
     found = [f"the recommended plan: {line}" for line in plan.notes if str(planned.LEAST_TARGETS) not in line]
     if design.goal is not None and not design.recommended.reaches and np.isfinite(plan.high):
         # The bound's distance from the truth is a multiple of a standard error.
@@ -258,9 +232,6 @@ def notes(design: StudyDesign) -> list[str]:
             f"the {design.limit_name} to expect lies beyond the largest target of {design.text(high)}: it rests on the "
             "curve's shape there; make larger ones"
         )
-    for each in design.frames:
-        if not low <= each.plan.true_size <= high or each.curve.size_at(0.5) < low:
-            found.append(f"with N = {each.frames} much of the guessed curve's rise lies outside the sizes")
     if not design.recommended.enough:
         found.append(f"no plan listed has the {planned.LEAST_TARGETS} targets that MIL-HDBK-1823A asks for")
     return [
@@ -285,10 +256,6 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
         "reaches_goal": chosen.reaches,
         "enough_targets": chosen.enough,
         "plans": [{**vars(plan), "recommended": plan is chosen.plan} for plan in design.plans],
-        "guessed_with_frames": design.guessed_with,
-        "frames": [
-            {"frames": each.frames, "guess": _curve_data(each.curve), "plan": vars(each.plan)} for each in design.frames
-        ],
         "repeats": [vars(row) for row in design.repeats],
         "unflawed_sites": SITES_PER_TARGET * chosen.plan.targets,
         "hole_free": None,

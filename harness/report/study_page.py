@@ -404,7 +404,7 @@ def study_html(
         chance=table(study.CHANCE),
         thresholds=table(study.THRESHOLDS),
         threshold_note=study.threshold_note(result.record),
-        warnings=[*provenance.get("guesses", ()), *map(unbroken, study.threshold_warnings(limits))],
+        warnings=[*provenance.get("warnings", ()), *map(unbroken, study.threshold_warnings(limits))],
         set_by=table(study.SET_BY),
         signals=table(study.SIGNALS),
         signal_notes=study.signal_notes(limits),

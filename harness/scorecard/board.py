@@ -24,7 +24,7 @@ from detectors import load_detector
 from detectors.average import AverageConfig, average
 from harness.evaluation.match import match
 from harness.experiment.load import load_experiment
-from harness.experiment.schema import ExperimentConfig, Point, SimulatedSource
+from harness.experiment.schema import ExperimentConfig, Point
 from harness.report.blocks import COLOURS, svg
 from harness.scorecard.bench import Reading, jackknifed, mean_of, temporal_sigma_m
 from harness.scorecard.capture import write_comparison
@@ -179,13 +179,12 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {point.config.detector.name: point.config.detector.settings for point in experiment.points}
     config, source = points[0].config, points[0].config.source
-    target = source.target if isinstance(source, SimulatedSource) else None
+    target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
         raise UserError(
             f"{options.board}: declares no drilled board before a simulated camera, or no threshold k",
             legal="source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}",
         )
-    assert isinstance(source, SimulatedSource)
     camera, frames, told, rows = camera_of(source.camera), config.capture.frames, [], []
     image, judged = image_of(target, camera, recording.lens if recording else None), {}
     if recording is not None:
@@ -213,7 +212,6 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
 def _simulated(point: Point, image: Image, frames: int, options: argparse.Namespace) -> np.ndarray:
     """Return frames (n, h, w) of a set-up on the image's pixels."""
     source = point.config.source
-    assert isinstance(source, SimulatedSource)
     camera = camera_of(source.camera)
     target = source.target.declare().at_wavelength(camera.optics.wavelength_nm)
     view, _ = cached_view(target, camera.optics, source.render, options.out / ".cache" / "renders")

@@ -50,13 +50,9 @@ class PlugIns:
 
     def offers(self) -> tuple[Offer, ...]:
         """Return every offer, by name; a name that two packages claim stands there twice."""
-        from harness import __version__
-
         # the folders in which packages are looked for, with the times of their last changes: installing changes them
         places = tuple((place, _changed_ns(place or os.curdir)) for place in sys.path)
-        own = (Offer(name, target, OWN, __version__) for name, target in self.built_in().items())
-        once = dict.fromkeys((*own, *_installed(self.group, places)))
-        return tuple(sorted(once, key=lambda offer: (offer.name, not offer.built_in, offer.package)))
+        return _offers(self.group, tuple(self.built_in().items()), places)
 
     def names(self) -> tuple[str, ...]:
         """Every known name, sorted; a name that is taken twice is one of them."""
@@ -110,9 +106,15 @@ def _changed_ns(folder: str) -> int:
 
 
 @lru_cache(maxsize=8)
-def _installed(group: str, _places: tuple[tuple[str, int], ...]) -> tuple[Offer, ...]:
-    """Return the group's offers. Remembered, because finding them reads every installed package: 7 ms each time."""
-    return tuple(
+def _offers(
+    group: str, built_in: tuple[tuple[str, str], ...], _places: tuple[tuple[str, int], ...]
+) -> tuple[Offer, ...]:
+    """Return tofpod's own offers and the group's. Remembered: reading every installed package takes 7 ms."""
+    from harness import __version__
+
+    found = [Offer(name, target, OWN, __version__) for name, target in built_in]
+    found += [
         Offer(entry.name, entry.value, *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")))
         for entry in entry_points(group=group)
-    )
+    ]
+    return tuple(sorted(dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)))

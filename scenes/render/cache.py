@@ -139,11 +139,6 @@ def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[Stor
     return sorted((f for f in _files(folder, LEFTOVER_NAME) if f.used_s < before_s), key=lambda f: f.path)
 
 
-def damaged_renders(renders: Iterable[StoredFile]) -> list[StoredFile]:
-    """Return those that cannot be read: truncated, altered, or of another version. Reads them whole, 5 ms each."""
-    return [file for file in renders if stored_view(file.path) is None]
-
-
 def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
     """Remove files; returns those that are gone. One that cannot be removed, or is gone already, is passed over."""
     gone = []

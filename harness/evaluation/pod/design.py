@@ -4,7 +4,7 @@ Studies are simulated from a guess of the POD curve and analysed as real ones wo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -157,35 +157,6 @@ def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> Recommen
     if close.high < (1 - WORTH) * plan.high:
         plan = close
     return Recommendation(plan, bool(enough), None if goal is None else bool(reaching))
-
-
-def guess_with_frames(guess: PodCurve, frames: int, *, guessed_with: int, fixed_share: float) -> PodCurve:
-    """Carry the guess to another number of averaged frames: variance(N) / variance(``guessed_with``) = (1 - s)
-    guessed_with / N + s with ``fixed_share`` s. Sizes of equal POD scale with the noise (depth at a fixed diameter;
-    about so for the diameter). Not modelled: pixels that become valid, motion."""
-    ratio = float(np.sqrt((1 - fixed_share) * guessed_with / frames + fixed_share))
-    if guess.log_size:
-        return replace(guess, mu=guess.mu + float(np.log(ratio)))
-    return replace(guess, mu=guess.mu * ratio, sigma=guess.sigma * ratio, covariance=guess.covariance * ratio**2)
-
-
-def fixed_share(white: float, fixed: float, frames: int) -> float:
-    """Share of the variance of the average of ``frames`` that more frames do not lessen. ``white``, ``fixed``: standard
-    deviations, in one unit, of one frame's noise that averages out and of the error that is in every frame."""
-    if not (np.isfinite([white, fixed]).all() and min(white, fixed) >= 0 and max(white, fixed) > 0):
-        raise UserError(f"white noise {white:g}, fixed noise {fixed:g}", legal="0 or more, not both 0")
-    if frames < 1:
-        raise UserError(f"guessed with {frames} frames", legal="one frame at least")
-    return float(fixed**2 / (white**2 / frames + fixed**2))
-
-
-@dataclass(frozen=True, eq=False)
-class FramesPlan:
-    """The guess for another number of averaged ``frames``, and what one study would demonstrate with them."""
-
-    frames: int
-    curve: PodCurve
-    plan: StudyPlan
 
 
 @dataclass(frozen=True)
