@@ -40,11 +40,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     name, *rest = given or [""]
     if name in programs():
-        program = importlib.import_module(f"harness.{name}")
-        if arguments is not None:
-            return int(program.main(rest))
         sys.argv[1:] = rest
-        return int(program.main())
+        return int(importlib.import_module(f"harness.{name}").main(rest if arguments is not None else None))
     return exit_code_of(lambda: _told(name, rest))
 
 
@@ -93,7 +90,7 @@ def _completion() -> str:
     """Return a script that completes programs and their options; everything else is a file's name."""
     cases = []
     for program in programs():
-        parser = importlib.import_module(f"harness.{program}")._parser()
+        parser = importlib.import_module(f"harness.{program}").main.parser()
         options = " ".join(option for action in parser._actions for option in action.option_strings)
         cases.append(f'    {program}) COMPREPLY=($(compgen -W "{options}" -- "$word"));;')
     return COMPLETION.format(programs=" ".join(programs()), options="\n".join(cases))

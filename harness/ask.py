@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.tables.outputs import ATLAS_PAGE, ATLAS_PICTURE
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.atlas import LimitSurface
@@ -24,21 +25,7 @@ KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind"}
 BEST = "matched"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 whatever the answer, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.ask " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.ask",
-        description="Say which cameras find damage of a size nine times in ten at a distance, with how many frames, "
-        "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
-        "extrapolated.",
-        epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--damage", default="through", metavar="KIND", help="hole (through; the default), blind, dent, ...")
     add("--size", metavar="LENGTH", help="the damage's size with its unit, as 5mm or 0.25in; its diameter for holes")
@@ -50,10 +37,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
     add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
     add("--out", type=Path, metavar="DIR", help=f"write the whole atlas there: {ATLAS_PAGE.name}, a picture, atlas.csv")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Say which cameras find damage of a size nine times in ten at a distance, with how many frames, "
+    "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
+    "extrapolated.",
+    epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 whatever the answer, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from detectors.recordings import Recording
@@ -19,23 +19,7 @@ if TYPE_CHECKING:
 CAMERA_FILE = "my_camera.yaml"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.characterise " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.characterise",
-        description="Measure a depth camera on static captures, best of a matte wall that fills the view: noise "
-        "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
-        "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
-        "Each PATH is one capture of 50 frames or more, in any format that harness.detect reads, in the order of time; "
-        "captures at several distances, moved by 30 mm or more, tell most.",
-        epilog="example: python -m harness.characterise near far --like azure_kinect_nfov --out my_camera",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures of one camera in one mode")
     add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
@@ -54,10 +38,19 @@ def _parser() -> argparse.ArgumentParser:
     add("--study", type=Path, metavar="DIR", help=study)
     about = "what the certificate says of the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; repeat it"
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Measure a depth camera on static captures, best of a matte wall that fills the view: noise "
+    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
+    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
+    "Each PATH is one capture of 50 frames or more, in any format that harness.detect reads, in the order of time; "
+    "captures at several distances, moved by 30 mm or more, tell most.",
+    epilog="example: python -m harness.characterise near far --like azure_kinect_nfov --out my_camera",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings

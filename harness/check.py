@@ -17,14 +17,14 @@ With the same seed and code nothing fails that is the same.
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
@@ -33,21 +33,7 @@ BASELINES = shipped("baselines")
 """Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.check " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.check",
-        description="Run a study of detection limits and compare it with its baseline. Fails (exit code 1) where a "
-        "limit, or the rate of false calls, has grown by more than 10 % and a paired test says that it is not by "
-        "chance, where a set-up has no limit any more, or where more trials fail.",
-        epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file with a `study`, such as experiments/regression.yaml")
     change = "change one value of the file, such as seed=7 for another draw of the noise; may be repeated"
@@ -56,10 +42,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--update", action="store_true", help="write the baseline anew, and print what changes")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
     add_engine_options(parser)
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Run a study of detection limits and compare it with its baseline. Fails (exit code 1) where a "
+    "limit, or the rate of false calls, has grown by more than 10 % and a paired test says that it is not by "
+    "chance, where a set-up has no limit any more, or where more trials fail.",
+    epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.compare import FILES, print_comparison, write_comparison
     from harness.engine.study import run_study
     from harness.evaluation.study.record import read_record, record_text

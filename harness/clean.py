@@ -7,23 +7,11 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake."""
-    options = _parser().parse_args(arguments)
-    return exit_code_of(lambda: int(options.run(options)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.clean",
-        description="Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
-        "followed, and what a running sweep uses is left alone.",
-        epilog="examples: python -m harness.clean cache --limit 5GB; "
-        "python -m harness.clean results averaging/69346a82f4194e03 --journal-only --dry-run",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     parts = parser.add_subparsers(required=True, metavar="cache|results")
     cache = parts.add_parser("cache", help="renders; each is rendered again when it is needed")
     cache.add_argument("--limit", metavar="SIZE", help="the longest unused go until the rest fits, such as 5GB")
@@ -41,7 +29,18 @@ def _parser() -> argparse.ArgumentParser:
         )
         part.add_argument("--dry-run", action="store_true", help="say what would be removed; remove nothing")
         part.add_argument("--yes", action="store_true", help="do not ask")
-    return parser
+
+
+@program(
+    _options,
+    "Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
+    "followed, and what a running sweep uses is left alone.",
+    epilog="examples: python -m harness.clean cache --limit 5GB; "
+    "python -m harness.clean results averaging/69346a82f4194e03 --journal-only --dry-run",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake of the user."""
+    return int(options.run(options))
 
 
 def _clean_cache(options: argparse.Namespace) -> int:

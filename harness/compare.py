@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.tables.outputs import COMPARISON, COMPARISON_PAGE
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.study.verdict import Comparison
@@ -18,22 +18,7 @@ if TYPE_CHECKING:
 FILES = (COMPARISON.name, COMPARISON_PAGE.name)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.compare " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.compare",
-        description="Compare the detection limits of two studies: a90 and its change with an interval over boards, "
-        "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
-        "failing, x not comparable.",
-        epilog="Set-ups are paired by name and frames; where each study has one only, by that. Tests are paired where "
-        "both studies have the same boards. To make a change of a detection limit fail: python -m harness.check.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
     add("second", type=Path, metavar="B", help="likewise; what is asked is whether B is worse or better than A")
@@ -41,10 +26,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--alpha", type=float, default=0.05, metavar="P", help=level)
     add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Compare the detection limits of two studies: a90 and its change with an interval over boards, "
+    "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
+    "failing, x not comparable.",
+    epilog="Set-ups are paired by name and frames; where each study has one only, by that. Tests are paired where "
+    "both studies have the same boards. To make a change of a detection limit fail: python -m harness.check.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
 

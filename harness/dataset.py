@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.engine.boards import Sample
@@ -20,21 +20,7 @@ if TYPE_CHECKING:
 MOST = 10_000
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.dataset " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.dataset",
-        description="Write a data set of simulated boards: organised clouds, depth, intensity, validity, masks and "
-        "truth, as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
-        epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
-        "python -m harness.score states the detection limit of anybody's anomaly maps on it.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, with random boards")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
@@ -46,10 +32,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Write a data set of simulated boards: organised clouds, depth, intensity, validity, masks and "
+    "truth, as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+    epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
+    "python -m harness.score states the detection limit of anybody's anomaly maps on it.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.engine.boards import FEWEST, INDEX, read_index, samples_of
     from harness.engine.work import EngineOptions, engine_of, locked
     from harness.experiment.load import load_experiment, resolved_yaml

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
@@ -32,22 +32,7 @@ OWNERS = {"set_up": "study", "repeated_targets": "repeats", "board_m2": "false_c
 """Options that mean nothing without another."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.design " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.design",
-        description="Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
-        "analyse them as real ones would be, and say which a90/95 to expect, how many targets it takes, and which "
-        "sizes to make.",
-        epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
-        "simulated study; there are two placements for each number of targets.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     put = parser.add_argument_group("the guess, told or read from a study").add_argument
     put("--a50", type=float, metavar="SIZE", help="size that is found half the time")
@@ -73,7 +58,6 @@ def _parser() -> argparse.ArgumentParser:
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
     add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
-    return parser
 
 
 @dataclass(frozen=True)
@@ -86,7 +70,16 @@ class GuessedCurve:
     board_m2: float | None = None
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
+    "analyse them as real ones would be, and say which a90/95 to expect, how many targets it takes, and which "
+    "sizes to make.",
+    epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
+    "simulated study; there are two placements for each number of targets.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
     import json
 
     from harness.report.design import design_data, design_html, design_parts, save_design_png

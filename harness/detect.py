@@ -7,29 +7,10 @@ import sys
 from pathlib import Path
 
 from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP, MARKS, MERGES, METHODS
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.program import program, whole_number
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the program; returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
-    arguments = _parser().parse_args(argv)
-
-    def run() -> int:
-        from harness.inspection.run import inspect
-
-        return inspect(arguments)
-
-    return exit_code_of(run)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.detect",
-        description="Find damage in a real capture: average its frames, fit the surface, list what departs from it."
-        " With --register, each PATH is one view of the same target, and all of them become one cloud.",
-        epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
-        "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     formats = (
         "folder or list of depth .png, .ply, .pcd, .xyz; .npy .npz .mat .mkv .r3d .bin; a ROS bag (folder, .mcap,"
@@ -53,13 +34,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--crop", default="auto", metavar="KIND", help=crop)
     target = "with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows"
-    add("--target", type=_number, metavar="N", help=target)
+    add("--target", type=whole_number(10**9), metavar="N", help=target)
     add("--detector", default="local", help="detector's name (default: local)")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
-    add("--max-frames", type=_number, metavar="N", help="use the first N frames only")
+    add("--max-frames", type=whole_number(10**9), metavar="N", help="use the first N frames only")
     calls = (
         "set the threshold so that N false calls are expected in this capture, by the noise that it shows towards"
         f" the camera (default: {DEFAULT_FALSE_CALLS:g})"
@@ -96,13 +77,20 @@ def _parser() -> argparse.ArgumentParser:
         " lines of TUM's groundtruth.txt, one a view; only a start for the registration"
     )
     add("--poses", type=Path, metavar="FILE", help=poses)
-    return parser
 
 
-def _number(text: str) -> int:
-    if not (text.isascii() and text.isdigit()) or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of 1 or more")
-    return int(text)
+@program(
+    _options,
+    "Find damage in a real capture: average its frames, fit the surface, list what departs from it."
+    " With --register, each PATH is one view of the same target, and all of them become one cloud.",
+    epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
+    "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
+)
+def main(arguments: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    from harness.inspection.run import inspect
+
+    return inspect(arguments)
 
 
 if __name__ == "__main__":

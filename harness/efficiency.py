@@ -3,43 +3,36 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
 from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
     from harness.experiment.schema import Experiment
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.efficiency " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.efficiency",
-        description="Set the detectors of a simulated study beside the ideal observer, which knows each damage's exact "
-        "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
-        f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
-        "the study's folder.",
-        epilog="Takes some seconds a damaged board. Views that are not in the store of renders are rendered again.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     help = "a result folder of a sweep with a `study`, such as results/detection_limit/latest"
     parser.add_argument("results", type=Path, metavar="RESULTS", help=help)
     add_engine_options(parser)
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Set the detectors of a simulated study beside the ideal observer, which knows each damage's exact "
+    "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
+    f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
+    "the study's folder.",
+    epilog="Takes some seconds a damaged board. Views that are not in the store of renders are rendered again.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.engine.ideal import ideal_of_set_ups
     from harness.engine.plan import plan_of
     from harness.engine.tables import write_tables
@@ -95,9 +88,7 @@ def _experiment(folder: Path) -> Experiment:
 
 def _rate(study: StudyRecord, experiment: Experiment) -> float:
     """The wanted false calls per square metre. Raises UserError for studies that the ideal observer cannot judge."""
-    if any(
-        point.config.mapping is not None or getattr(point.config.source, "views", None) for point in experiment.points
-    ):
+    if any(point.config.mapping is not None or point.config.simulated.views for point in experiment.points):
         fix = "name a study of single views"
         raise UserError(f"{study.name}: judges maps of several views, for which there is no ideal observer", fix=fix)
     if study.false_calls_per_m2 is None:
@@ -108,9 +99,9 @@ def _rate(study: StudyRecord, experiment: Experiment) -> float:
 
 def _held_for(experiment: Experiment, rate: float, units: int) -> str:
     """The first line: for what the ideal observer's figures hold, and what is not in them."""
-    cameras = [getattr(point.config.source, "camera", None) for point in experiment.points]
-    names = ", ".join(dict.fromkeys(one.name for one in cameras if one is not None))
-    seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras if one is not None))
+    cameras = [point.config.simulated.camera for point in experiment.points]
+    names = ", ".join(dict.fromkeys(one.name for one in cameras))
+    seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras))
     return (
         f"The ideal observer is for a new unit of {names}, by the noise of {units} units, at {rate:g} false call"
         f"{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on unit {seeds}. Not in it: "

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
     from harness.exchange import ExportedView
@@ -22,41 +22,33 @@ REPEAT = 0
 """The trial whose noise is exported: the same frames as an experiment's first repeat."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the program; returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
-    given = sys.argv[1:] if argv is None else argv
-    arguments = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(arguments, given))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.export",
-        description="Render and simulate the views of an experiment, and write them with their true poses and damages"
-        " as a TUM RGB-D sequence, or as ROS 2 bags with PointCloud2, CameraInfo and tf_static, one a view.",
-        epilog="example: python -m harness.export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
     add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag a view")
     add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
-    add("--views", type=_count, metavar="N", help="the first N views only (default: all)")
-    add("--frames", type=_count, metavar="N", help="frames of each view (default: the experiment's capture.frames)")
+    add("--views", type=whole_number(10_000), metavar="N", help="the first N views only (default: all)")
+    add(
+        "--frames",
+        type=whole_number(10_000),
+        metavar="N",
+        help="frames of each view (default: the experiment's capture.frames)",
+    )
     add("--hole-free", action="store_true", help="the same target without its damage")
     results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
-    return parser
 
 
-def _count(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 10_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 10000")
-    return int(text)
-
-
-def _run(arguments: argparse.Namespace, given: list[str]) -> int:
+@program(
+    _options,
+    "Render and simulate the views of an experiment, and write them with their true poses and damages"
+    " as a TUM RGB-D sequence, or as ROS 2 bags with PointCloud2, CameraInfo and tf_static, one a view.",
+    epilog="example: python -m harness.export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
+)
+def main(arguments: argparse.Namespace, command: str) -> int:
+    """Returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
     from harness.vocabulary.files import atomic_folder
@@ -64,7 +56,7 @@ def _run(arguments: argparse.Namespace, given: list[str]) -> int:
     from scenes.sensor.camera import camera_of
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
-    source = experiment.config.source
+    source = experiment.config.simulated
     target = source.target.declare()
     target = target.hole_free() if arguments.hole_free else target
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
@@ -81,7 +73,7 @@ def _run(arguments: argparse.Namespace, given: list[str]) -> int:
             write_tum(folder, views)
         for view in () if arguments.format == "tum" else views:
             write_bag(folder / view.name, view, arguments.format == "mcap")
-        _write_beside(folder, arguments, experiment, source, targets, views, given)
+        _write_beside(folder, arguments, experiment, source, targets, views, command)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
         print(f"note: {', '.join(swept)} as the file's source states it, not as swept; --set chooses another value")
@@ -117,7 +109,7 @@ def _write_beside(
     source: SimulatedSource,
     targets: list[TargetConfig],
     views: tuple[ExportedView, ...],
-    given: list[str],
+    command: str,
 ) -> None:
     """Write the truth, the nominal poses that a registration may start from, the declaration, and the provenance."""
     import numpy as np
@@ -144,7 +136,7 @@ def _write_beside(
         },
         "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},
         "provenance.json": {
-            **record("python -m harness.export " + shlex.join(given)),
+            **record(command),
             "experiment": experiment.config.name,
             "seed": experiment.config.seed,
             "hole_free": arguments.hole_free,

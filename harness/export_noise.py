@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import argparse
 import io
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
@@ -33,26 +32,19 @@ LONGEST_LAG = 12
 """Pixels to which the correlation of neighbours is followed."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.export_noise " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.export_noise",
-        description="Write a simulated camera's depth noise as a small table (NAME.npz) and as code for NumPy and "
-        "torch that turns ideal depth and intensity into noisy depth, for use in other simulators.",
-        epilog="example: python -m harness.export_noise azure_kinect_nfov --out noise",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("camera", help="a camera's name (see python -m harness.ls), or the path of its .yaml file")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the three files")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Write a simulated camera's depth noise as a small table (NAME.npz) and as code for NumPy and "
+    "torch that turns ideal depth and intensity into noisy depth, for use in other simulators.",
+    epilog="example: python -m harness.export_noise azure_kinect_nfov --out noise",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.vocabulary.files import write_bytes, write_text
     from scenes.sensor import tabled, tabled_torch
     from scenes.sensor.camera import load_camera

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from detectors.flat_captures import FlatCapture, Separated
@@ -18,23 +18,7 @@ if TYPE_CHECKING:
     from harness.vocabulary.geometry import Lens
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.flatfield " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.flatfield",
-        description="Measure the fixed pattern of one unit of a camera: what its range is off at each pixel, in every "
-        "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
-        "camera, moved by 30 mm or more between captures, at two distances, some captures at each. The captures' "
-        "order is that of time.",
-        epilog="example: python -m harness.flatfield near1 near2 far1 far2 --out unit.npz, then "
-        "python -m harness.detect captures/board --flat-field unit.npz",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     written = "the flat field; a .json and a .csv of its figures and a .png of the map are written beside it"
@@ -47,10 +31,19 @@ def _parser() -> argparse.ArgumentParser:
         " by least squares; without, it counts as noise"
     )
     add("--poses", type=Path, metavar="FILE", help=poses)
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Measure the fixed pattern of one unit of a camera: what its range is off at each pixel, in every "
+    "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
+    "camera, moved by 30 mm or more between captures, at two distances, some captures at each. The captures' "
+    "order is that of time.",
+    epilog="example: python -m harness.flatfield near1 near2 far1 far2 --out unit.npz, then "
+    "python -m harness.detect captures/board --flat-field unit.npz",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
     from harness.inspection.told import print_warnings

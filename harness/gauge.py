@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,22 +26,7 @@ HIT_SHARE = 0.4
 """Hit radius as a share of the distance between holes, so that no finding can count for two."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.gauge " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.gauge",
-        description="Design gauge boards: how many holes of which sizes, as harness.design plans them, on boards with "
-        "coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each board, and gauge.json, "
-        "the truth that harness.detect --gauge reads.",
-        epilog="example: python -m harness.gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
-        "gauge, then drill, record, and python -m harness.detect captures/gauge --gauge gauge/gauge.json --out found",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     from harness.implant import span
 
     add = parser.add_argument
@@ -56,10 +41,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")
     add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
     add("--out", type=Path, required=True, metavar="DIR", help="template.pdf, board-N.svg and gauge.json")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Design gauge boards: how many holes of which sizes, as harness.design plans them, on boards with "
+    "coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each board, and gauge.json, "
+    "the truth that harness.detect --gauge reads.",
+    epilog="example: python -m harness.gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
+    "gauge, then drill, record, and python -m harness.detect captures/gauge --gauge gauge/gauge.json --out found",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.pod import design as plan
     from harness.inspection.gauge import GAUGE_VERSION
     from harness.report.gauge import template_pdf, template_svg, tiles_of

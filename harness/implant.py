@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.engine.implants import Scan
@@ -20,23 +20,7 @@ MOST_AT_ONCE, FILLED = 8, 0.25
 """Damages of one placement at most, and the share of the scan that discs as wide as they are apart may cover."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.implant " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.implant",
-        description="Put virtual damage at random places of recorded frames of an undamaged part, as the camera would "
-        "have measured it, and state which size is found: a50, a90, a90/95 and false calls per square metre. Each PATH "
-        "is one static capture. The frames keep their own noise, fixed pattern and surface; only the damage is "
-        "simulated.",
-        epilog="example: python -m harness.implant captures/wall --camera azure_kinect_nfov --damage through "
-        "--diameters 2:10 --out implanted",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
@@ -63,7 +47,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
-    return parser
 
 
 def span(text: str) -> tuple[float, float]:
@@ -75,7 +58,17 @@ def span(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Put virtual damage at random places of recorded frames of an undamaged part, as the camera would "
+    "have measured it, and state which size is found: a50, a90, a90/95 and false calls per square metre. Each PATH "
+    "is one static capture. The frames keep their own noise, fixed pattern and surface; only the damage is "
+    "simulated.",
+    epilog="example: python -m harness.implant captures/wall --camera azure_kinect_nfov --damage through "
+    "--diameters 2:10 --out implanted",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.engine.implants import Judging, Scan, judge_scans, placements
     from harness.engine.tables import write_tables
     from harness.evaluation.study.record import StudyRecord, record_text

@@ -210,6 +210,7 @@ def reference() -> str:
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
+POINT_NAME = re.compile(r"point-[0-9]{3,6}")  # name of a folder with the findings in a real capture
 SHOWN_SETTINGS = 6
 
 
@@ -447,8 +448,10 @@ def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
             name = name if unfinished is None else unfinished["stem"] + unfinished["suffix"]
             if above[:1] == [JOURNAL]:
                 ours = len(above) == 1 and SEGMENT_NAME.fullmatch(name) is not None
+            elif not above:
+                ours = is_output(name, "results") or LOCK_NAME.fullmatch(name) is not None
             else:
-                ours = not above and (is_output(name) or LOCK_NAME.fullmatch(name) is not None)
+                ours = len(above) == 1 and POINT_NAME.fullmatch(above[0]) is not None and is_output(name, "capture")
             if ours and stat.S_ISREG(file.st_mode) and (above[:1] == [JOURNAL] or not journal_only):
                 found.append(StoredFile(path, file.st_size, file.st_mtime))
     return sorted(found, key=lambda one: (LOCK_NAME.fullmatch(one.path.name) is not None, one.path))
@@ -459,7 +462,7 @@ def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list
     that it names is gone. Returns what is gone."""
     gone = removed(files)
     for folder in folders:
-        _remove_empty(*folders_in(folder, re.compile(JOURNAL)), folder)
+        _remove_empty(*folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}")), folder)
     for parent in {folder.parent for folder in folders}:
         for left in parent.glob(f".{LATEST}.*.part"):
             if UNFINISHED_LINK.fullmatch(left.name) and left.is_symlink():

@@ -7,34 +7,33 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 DAY_S = 86_400.0
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
-    options = _parser().parse_args(arguments)
-    lists = {"results": _list_results, "cache": _list_cache, "keys": _list_keys}
-    return exit_code_of(lambda: lists.get(options.what, _list_offers)(options))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.ls",
-        description="List detectors and cameras: tofpod's own and those that installed packages offer through the "
-        "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, the cache of renders, or every "
-        "key of an experiment.",
-        epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
-        "python -m harness.ls --json; python -m harness.ls results; python -m harness.ls results averaging; "
-        "python -m harness.ls cache",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
     add("name", nargs="?", help="show everything that can be set of this one; of results, those of this experiment")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
     add("--json", action="store_true", help="as JSON, for programs")
-    return parser
+
+
+@program(
+    _options,
+    "List detectors and cameras: tofpod's own and those that installed packages offer through the "
+    "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, the cache of renders, or every "
+    "key of an experiment.",
+    epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
+    "python -m harness.ls --json; python -m harness.ls results; python -m harness.ls results averaging; "
+    "python -m harness.ls cache",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
+    lists = {"results": _list_results, "cache": _list_cache, "keys": _list_keys}
+    return lists.get(options.what, _list_offers)(options)
 
 
 def _list_offers(options: argparse.Namespace) -> int:

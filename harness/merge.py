@@ -9,36 +9,32 @@ from math import isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.engine.journal import Journal
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
-    options = _parser().parse_args(arguments)
-    return exit_code_of(lambda: _run(options.folders, options.into))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.merge",
-        description="Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
-        "another. Nothing is run; where a trial is in several, one that is done counts.",
-        epilog="example: python -m harness.merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
-        "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder with a journal")
     parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
-    return parser
 
 
-def _run(folders: list[Path], into: Path) -> int:
+@program(
+    _options,
+    "Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
+    "another. Nothing is run; where a trial is in several, one that is done counts.",
+    epilog="example: python -m harness.merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
+    "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
     from harness.engine.journal import Journal
     from harness.engine.work import locked
     from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, write_bytes
 
+    folders, into = options.folders, options.into
     _refuse_others(folders, into)
     declared = next((path for folder in folders if (path := folder / "experiment.yaml").is_file()), None)
     if declared is None:

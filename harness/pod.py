@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.statement import PodStatement
@@ -20,20 +20,7 @@ FILES = ("pod.json", "pod.png", "pod.html")
 MAPOD_FILES = ("mapod.json", "mapod.png", "mapod.html")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.pod " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.pod",
-        description="Fit a probability of detection curve to inspections, one a row of a CSV file, and state the size "
-        "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
-        epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add, switch = parser.add_argument, argparse.BooleanOptionalAction
     add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row an inspection")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
@@ -69,10 +56,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
     put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Fit a probability of detection curve to inspections, one a row of a CSV file, and state the size "
+    "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
+    epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
     import json
 
     if options.prior is not None:

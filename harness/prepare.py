@@ -7,17 +7,13 @@ import sys
 import time
 from contextlib import suppress
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 
-def main() -> int:
-    """Run the program, which takes no options but --help; returns its exit code."""
-    argparse.ArgumentParser(prog="python -m harness.prepare", description="Compile the inner loops once.").parse_args()
-    return exit_code_of(_prepare)
-
-
-def _prepare() -> int:
-    """Drive every compiled loop through small captures, and print each step as it begins."""
+@program(lambda parser: None, "Compile the inner loops once.")
+def main(options: argparse.Namespace, command: str) -> int:
+    """Drive every compiled loop through small captures, and print each step as it begins. Returns 0."""
     import numpy as np
 
     from detectors import load_detector

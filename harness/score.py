@@ -12,7 +12,6 @@ it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038),
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, write_text
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.program import program
 from harness.vocabulary.provenance import record
 from harness.vocabulary.seeds import digest
 
@@ -39,22 +39,7 @@ MOST_NAMED = 3
 JUDGED_BY = ("inspected", "board_xy_m", "damage")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.score " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.score",
-        description="State the detection limit (a90, a90/95) of anomaly maps on a data set of harness.dataset, with "
-        "AU-PRO and AUROC. PREDICTIONS holds one map for each board of validation and test: "
-        "<category>/<split>/<label>/<number>.npy or .tiff, of the pictures' size, higher where damage is likelier.",
-        epilog="example: python -m harness.score maps --dataset boards --out scores; harness.compare compares two such "
-        "folders of results.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("predictions", type=Path, metavar="PREDICTIONS", help="a folder with the anomaly maps")
     add("--dataset", type=Path, required=True, metavar="DIR", help="a folder that harness.dataset wrote")
@@ -62,10 +47,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--false-calls", type=float, metavar="RATE", help=rate)
     add("--name", default="maps", help="of the method, for tables and comparisons (default: maps)")
     add("--out", type=Path, default=Path("results/score"), metavar="DIR", help="default: results/score")
-    return parser
 
 
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "State the detection limit (a90, a90/95) of anomaly maps on a data set of harness.dataset, with "
+    "AU-PRO and AUROC. PREDICTIONS holds one map for each board of validation and test: "
+    "<category>/<split>/<label>/<number>.npy or .tiff, of the pictures' size, higher where damage is likelier.",
+    epilog="example: python -m harness.score maps --dataset boards --out scores; harness.compare compares two such "
+    "folders of results.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user."""
     from harness.engine.boards import read_index
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.report.pod import pod_html

@@ -3,31 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import shlex
-import signal
 import sys
 from pathlib import Path
 
 from harness.engine.work import add_engine_options, engine_options
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.program import program
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    if arguments is None:
-        # what batch systems and containers send first is to end as Ctrl-C does
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_code_of(lambda: _run(options, given))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.sweep",
-        description="Run an experiment: render its targets, simulate the camera, detect, measure, report.",
-        epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, such as averaging")
     help = "change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
@@ -37,14 +20,23 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
     add("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
     add_engine_options(parser)
-    return parser
 
 
-def _run(options: argparse.Namespace, given: list[str]) -> int:
+@program(
+    _options,
+    "Run an experiment: render its targets, simulate the camera, detect, measure, report.",
+    epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.experiment.load import load_experiment
+    from harness.experiment.schema import CaptureSource
 
     experiment = load_experiment(options.experiment, options.overrides, options.calibration)
-    command = "python -m harness.sweep " + shlex.join(given)
+    if isinstance(experiment.config.source, CaptureSource) and not options.dry_run:
+        from harness.engine.captures import judge_captures
+
+        return judge_captures(experiment, options.out, command)
     if options.dry_run:
         from harness.engine.estimate import dry_run
 

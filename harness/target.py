@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
@@ -15,28 +16,22 @@ if TYPE_CHECKING:
 NAMED_TARGETS = ("thesis",)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the program; returns its exit code (0, or 2 for the user's mistake)."""
-    arguments = _parser().parse_args(argv)
-    return exit_code_of(lambda: _run(arguments))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.target",
-        description="Build a damage target from its declaration; print its truth, write its mesh.",
-        epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("target", help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one")
     add("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
     add("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
     add("--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)")
     add("--hole-free", action="store_true", help="leave out all damage")
-    return parser
 
 
-def _run(arguments: argparse.Namespace) -> int:
+@program(
+    _options,
+    "Build a damage target from its declaration; print its truth, write its mesh.",
+    epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
+)
+def main(arguments: argparse.Namespace, command: str) -> int:
+    """Returns 0, 2 on a mistake of the user."""
     config = declared(arguments.target, arguments.board)
 
     from scenes.target.mesh import build_target, write_mesh, write_truth

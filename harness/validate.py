@@ -3,33 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 
-from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program, whole_number
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The program. Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
-    Ctrl-C."""
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(given)
-    return exit_code_of(lambda: _run(options, "python -m harness.validate " + shlex.join(given)))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m harness.validate",
-        description="Measure the simulated cameras as one measures real ones, and set each published figure beside "
-        "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
-        "planes and edges in it.",
-        epilog="Exit code 1: a figure that passes in the committed baseline fails now.",
-    )
+def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--camera", action="append", default=[], metavar="NAME", help="this camera only; may be repeated")
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
-    add("--jobs", type=_positive, default=2, metavar="N", help="worker processes (default: 2)")
+    add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
     add("--quick", action="store_true", help="fewer conditions and frames: a look, no judgement to keep")
     add("--figures", type=Path, metavar="FILE", help="other published figures")
     add("--baseline", type=Path, metavar="FILE", help="another baseline; --quick is judged by one that is named only")
@@ -39,20 +24,22 @@ def _parser() -> argparse.ArgumentParser:
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
     put("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     put("--intrinsics", metavar="FILE|CAMERA", help="the lens of the depth pixels: a file, or a camera's nominal lens")
-    put("--frames", type=_positive, metavar="N", help="use the first N frames only")
+    put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
     put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
     put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
     put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default 0.8, a light wall)")
-    return parser
 
 
-def _positive(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 4096:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
-    return int(text)
-
-
-def _run(options: argparse.Namespace, command: str) -> int:
+@program(
+    _options,
+    "Measure the simulated cameras as one measures real ones, and set each published figure beside "
+    "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
+    "planes and edges in it.",
+    epilog="Exit code 1: a figure that passes in the committed baseline fails now.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
+    Ctrl-C."""
     if options.capture or options.board:
         for name in ("quick", "update_baseline", "figures", "baseline"):
             if getattr(options, name):

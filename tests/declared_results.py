@@ -15,7 +15,7 @@ from harness.tables.trials import STORED, SUMMARISED
 def assert_declared(folder: Path) -> None:
     """Every file of a folder of results, and every column of its tables that is no axis."""
     for path in folder.iterdir():
-        known = path.name == JOURNAL or LOCK_NAME.fullmatch(path.name) or is_output(path.name)
+        known = path.name == JOURNAL or LOCK_NAME.fullmatch(path.name) or is_output(path.name, "results")
         assert known, f"{path.name} is not declared, so harness.clean would leave it"
     for table in (*STORED, *SUMMARISED, *STUDY_TABLES):
         declared = {name for column in table.stored for name in column.names}

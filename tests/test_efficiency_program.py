@@ -46,7 +46,9 @@ def test_detectors_stand_beside_the_ideal_observer(
     assert (known["ideal_a50_mm"] < known["a50_mm"]).all() and (known["efficiency_50_share_low"] < 1).all()
     assert EFFICIENCY_PAGE.name in told and "d' of the ideal observer" not in told
     assert "Efficiency: tiny" in (results / EFFICIENCY_PAGE.name).read_text()
-    assert all(is_output(name) for table in EFFICIENCY_TABLES for name in (*table.files, EFFICIENCY_PAGE.name))
+    assert all(
+        is_output(name, "results") for table in EFFICIENCY_TABLES for name in (*table.files, EFFICIENCY_PAGE.name)
+    )
 
 
 def without_experiment(results: Path) -> None:

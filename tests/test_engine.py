@@ -27,6 +27,7 @@ from harness.engine.tables import tables_of
 from harness.engine.trial import run_trial
 from harness.engine.work import Ended, EngineOptions
 from harness.experiment.load import load_experiment
+from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of
 
@@ -245,6 +246,32 @@ def test_journal_holds_nan_as_none(tmp_path):
     entry = journal.read("key")
     assert entry is not None and entry.record == {"rows": [{"a": None, "b": 1.5}]}
     assert journal.read("other") is None
+
+
+CAPTURE = """\
+name: capture
+source:
+  kind: capture
+  paths: [{path}]
+capture: {{frames: 12}}
+detector:
+  name: thesis
+  settings: {{crop: {{kind: auto, inset_px: 8}}}}
+threshold: {{k: 5.0}}
+sweep:
+  capture.frames: [1, 12]
+"""
+
+
+def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
+    (tmp_path / "capture.yaml").write_text(CAPTURE.format(path=shared_data / "azure_drilled_board"))
+    done = sweep(tmp_path / "capture.yaml", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "left out: " in done.stdout
+    assert "00003.png" in done.stdout
+    table = pd.read_csv(next((tmp_path / "out").glob("capture/[0-9a-f]*/summary.csv")))
+    assert list(table.frames_used) == [1, 11] and list(table.results_version) == [RESULTS_VERSION] * 2
+    assert len(list((tmp_path / "out").glob("capture/[0-9a-f]*/point-*/findings.csv"))) == 2
 
 
 def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):

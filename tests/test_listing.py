@@ -410,8 +410,8 @@ def test_the_reference_has_every_key_of_experiments_and_the_site_every_page(caps
     told = capsys.readouterr().out
     for place, keys in (
         ("## Experiments\n", ("name", "source", "study", "sweep")),
-        ("### `source.target[name=drawn].damage[kind=blind]`\n", ("diameter_mm", "depth_mm")),
-        ("### `source.camera.effects`\n", tuple(EffectsConfig.model_fields)),
+        ("### `source[kind=simulated].target[name=drawn].damage[kind=blind]`\n", ("diameter_mm", "depth_mm")),
+        ("### `source[kind=simulated].camera.effects`\n", tuple(EffectsConfig.model_fields)),
         ("## Settings of the detector `matched`\n", tuple(detector_type("matched").settings_type.model_fields)),
     ):
         section = told.partition(place)[2].partition("\n#")[0]

@@ -28,7 +28,7 @@ def test_every_command_of_the_documents_is_understood(path, capsys):
     for command in COMMANDS.findall(text):
         name, *given = shlex.split(command)
         if name in programs() and given and "..." not in command:
-            assert importlib.import_module(f"harness.{name}")._parser().parse_args(given), command
+            assert importlib.import_module(f"harness.{name}").main.parser().parse_args(given), command
 
 
 def test_every_program_is_in_the_documents(capsys):
@@ -39,7 +39,7 @@ def test_every_program_is_in_the_documents(capsys):
     assert all(command in shown for _, command in TASKS) and all(name in shown for name in programs())
     for _, command in TASKS:
         _, name, *rest = command.split()
-        importlib.import_module(f"harness.{name}")._parser().parse_args(rest)
+        importlib.import_module(f"harness.{name}").main.parser().parse_args(rest)
 
 
 def test_a_program_runs_with_its_own_arguments_and_exit_code(tmp_path, capsys):

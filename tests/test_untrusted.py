@@ -258,3 +258,13 @@ def test_an_experiments_name_is_plain(tmp_path, name):
     lines = [f"name: {json.dumps(name)}" if line.startswith("name:") else line for line in text.splitlines()]
     (tmp_path / "a.yaml").write_text("\n".join(lines))
     assert "`name`" in refusal(lambda: load_experiment(tmp_path / "a.yaml"))
+
+
+@pytest.mark.parametrize("path", ["a\0b", "/proc/self/mem", "/dev/zero", "x" * 5000])
+def test_odd_paths_of_a_capture(tmp_path, path):
+    text = (
+        "name: a\nsource:\n  kind: capture\n  paths: [" + json.dumps(path) + "]\n"
+        "capture: {frames: 1}\nthreshold: {k: 5.0}\n"
+    )
+    (tmp_path / "a.yaml").write_text(text)
+    assert "a.yaml" in refusal(lambda: load_experiment(tmp_path / "a.yaml"))

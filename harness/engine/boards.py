@@ -97,7 +97,7 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
     """Plan the boards of every category. Raises UserError where the experiment has no random boards."""
     samples = []
     for category, point in categories_of(experiment).items():
-        source, seed, study = point.config.source, point.config.seed, point.config.study
+        source, seed, study = point.config.simulated, point.config.seed, point.config.study
         if source.views or not isinstance(source.target, DrawnTargetConfig):
             fix = "take one with `target: {name: drawn, ...}`, such as detection_limit"
             raise UserError(f"{experiment.config.name}: has no random boards, each seen in a single view", fix=fix)

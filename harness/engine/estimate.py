@@ -13,7 +13,7 @@ from harness.engine.journal import Journal
 from harness.engine.plan import Group, PlanPart, SweepPlan, parts_of, plan_of
 from harness.engine.run import Calibration
 from harness.engine.work import EngineOptions, Outcome
-from harness.experiment.schema import Experiment
+from harness.experiment.schema import CaptureSource, Experiment
 from harness.tables.text import many
 
 PLAIN_EVERY_S = 10.0
@@ -123,6 +123,9 @@ class SweepEstimate(NamedTuple):
 def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     """Say what a sweep would run; nothing is written."""
     folder = experiment.folder(out)
+    if isinstance(experiment.config.source, CaptureSource):
+        print(f"{experiment.config.name}: valid; {len(experiment.points)} points of a real capture; results: {folder}")
+        return 0
     plan = plan_of(experiment, Path(out) / ".cache" / "renders")
     print(f"{experiment.config.name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {many(len(experiment.points), 'point')}, {many(len(plan.groups), 'set')} of frames")

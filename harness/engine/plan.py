@@ -226,7 +226,7 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
-    source, study = points[0].config.source, points[0].config.study
+    source, study = points[0].config.simulated, points[0].config.study
     target, seed = source.target, points[0].config.seed
     if study is not None and isinstance(target, DrawnTargetConfig):
         calibrate = points[0].config.threshold.calibrate

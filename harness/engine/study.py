@@ -137,7 +137,7 @@ def _write_study(
     provenance["warnings"] += without_limit(experiment.points, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
     # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
-    targets = [point.config.source.target for point in experiment.points]
+    targets = [point.config.simulated.target for point in experiment.points]
     drilled = any(
         isinstance(target, DrawnTargetConfig) and target.damage.kind in ("through", "blind") for target in targets
     )
@@ -163,7 +163,7 @@ def _write_report(
 
     write_tables(folder, summaries(tables, outcome.examples), provenance)
     title = experiment.config.title or experiment.config.name
-    target = experiment.config.source.target.name
+    target = experiment.config.simulated.target.name
     write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
     return final_tables(tables)
 
@@ -227,7 +227,7 @@ def _provenance(
                 noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
                 noise[name] = max(noise.get(name, 0.0), noise_mm)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
-    sources = [point.config.source.camera for point in experiment.points]
+    sources = [point.config.simulated.camera for point in experiment.points]
     cameras = {source.name: camera_of(source) for source in sources}
     guesses = map(guessed_precision, cameras.values())
     return {

@@ -188,7 +188,7 @@ def _walls(experiment: Experiment) -> pd.DataFrame:
     mappings = [config.mapping for config in set_ups if config.mapping is not None]
     if not mappings:
         return pd.DataFrame()
-    source = next(config.source for config in set_ups if config.mapping is not None)
+    source = next(config.simulated for config in set_ups if config.mapping is not None)
     assert source.views is not None
     target, emitter_m = source.target.declare(), camera_of(source.camera).optics.emitter_m
     boards = [invert(pose.T_camera_board) for pose in poses_of(source.views, target.pose)]

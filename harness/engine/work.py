@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, get_args
 
 from harness.vocabulary.errors import DiskFull, UserError
 from harness.vocabulary.files import lock, opened_lock
+from harness.vocabulary.program import whole_number
 
 if TYPE_CHECKING:
     from harness.report.clouds import ExampleCloud, MappedExample
@@ -298,7 +299,13 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add them, in a group of their own."""
     add = parser.add_argument_group("how it is run").add_argument
-    add("--jobs", type=_whole_number, default=2, metavar="N", help="processes, or workers of a cluster (default: 2)")
+    add(
+        "--jobs",
+        type=whole_number(4096),
+        default=2,
+        metavar="N",
+        help="processes, or workers of a cluster (default: 2)",
+    )
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
     add("--scheduler", metavar="ADDRESS", help=help)
@@ -330,12 +337,6 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         retry_failed=options.retry_failed,
         cache_limit_gb=options.cache_limit,
     )
-
-
-def _whole_number(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 4096:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 4096")
-    return int(text)
 
 
 def _positive(text: str) -> float:

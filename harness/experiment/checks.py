@@ -6,18 +6,21 @@ from collections.abc import Iterator
 from functools import lru_cache
 from itertools import combinations
 from math import ceil, dist, expm1
+from pathlib import Path
 
 from pydantic import ValidationError
 
 from detectors import detector_names
 from harness.experiment.schema import (
     DETECTOR_NAME,
+    CaptureSource,
     ExperimentConfig,
     SimulatedSource,
+    recording_of,
     splices_of,
 )
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import validated, wrong_choice
+from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
@@ -52,16 +55,19 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
             place = source.key_place_of(("capture", "average", "frames"))
             message = "an experiment counts its frames by `capture.frames`"
             problems.append(Problem(message, place, fix="remove this key"))
-        problems += _target_problems(config, config.source, source)
-        problems += _mapping_problems(config, config.source, source)
-        problems += _flat_field_problems(config, config.source, source)
+        if isinstance(config.source, SimulatedSource):
+            problems += _target_problems(config, config.source, source)
+            problems += _mapping_problems(config, config.source, source)
+            problems += _flat_field_problems(config, config.source, source)
+        else:
+            problems += _capture_problems(config, config.source, source)
         problems += _study_problems(config, source)
     return config, problems
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
     """Find what does not fit between a study, a family of boards and a threshold set on boards."""
-    target = config.source.target
+    target = config.source.target if isinstance(config.source, SimulatedSource) else None
     drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
@@ -206,3 +212,30 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
         yield Problem(f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal)
+
+
+def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
+    """Find files that are not there or cannot be read, and what only a simulated source can have."""
+    missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
+    for number in missing:
+        path = Path(capture.paths[number])
+        near = nearest(path.name, [file.name for file in path.parent.glob("*")])
+        place = source.place_of(("source", "paths", number))
+        yield Problem(f"{path}: there is no such file or folder", place, nearest=near)
+    lens = capture.intrinsics
+    if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
+        legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
+        yield Problem(f"{lens}: neither a file nor a camera", place, legal)
+    try:
+        if not missing and not unknown:
+            recording_of(capture)
+    except UserError as error:
+        yield Problem(error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix)
+    apart, hole_free = "a flat field needs a simulated unit", "only on hole-free repeats, which a capture does not have"
+    for key, value, message, fix in (
+        ("capture.flat_field", config.capture.flat_field, apart, "use harness.flatfield, harness.detect --flat-field"),
+        ("mapping", config.mapping, "a mapping needs the views of a simulated source", "use harness.detect --register"),
+        ("threshold.calibrate", config.threshold.calibrate, f"a threshold can be calibrated {hole_free}", "give `k`"),
+    ):
+        if value is not None:
+            yield Problem(message, source.place_of(tuple(key.split("."))), fix=fix)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of
+from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of, recording_of
 from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted
@@ -29,6 +29,7 @@ LENS_NUMBERS = {"lens.fx_px": "fx", "lens.fy_px": "fy", "lens.cx_px": "cx", "len
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
     """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
     ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`)."""
+    recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
     # a file that a result folder holds states its version; a file that is written by hand states none
@@ -83,10 +84,13 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     listed = shape.get(data, swept)
     named: list[KeyPath] = [checks.CAMERA_NAME]
     named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
-    named += [(*checks.TARGET, "file"), (*checks.TARGET, "board", "shape", "file")]
-    for at in named:
+    files: list[KeyPath] = [(*checks.TARGET, "file"), (*checks.TARGET, "board", "shape", "file")]
+    if shape.get(data, ("source", "kind")) == "capture":
+        files += [("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))]
+        files += [] if shape.get(data, ("source", "intrinsics")) in camera_names() else [("source", "intrinsics")]
+    for at in (*named, *files):
         name = shape.get(data, at)
-        if isinstance(name, str) and name and (is_camera_path(name) or at[-1] == "file"):
+        if isinstance(name, str) and name and (at in files or is_camera_path(name)):
             start = Path.cwd() if source.place_of(at).origin == OPTION else folder
             data = set_path(data, at, str(start / Path(name).expanduser()))
     return replace(source, data=data)
@@ -94,6 +98,8 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 
 def _with_calibration(source: Source, recording: Path) -> Source:
     """Put the recording's lens among the camera's replaced numbers; it counts before what the file says of the lens."""
+    if shape.get(source.data, ("source", "kind")) != "simulated":
+        raise UserError("a real capture brings its own lens", fix="leave out --calibration, or use source.intrinsics")
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
     single = shape.get(source.data, checks.CAMERA_NAME)
     names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -20,13 +21,17 @@ from detectors.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
-from harness.vocabulary.files import inside
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import file_digest, inside
 from harness.vocabulary.seeds import digest
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
-from scenes.sensor.camera import CameraConfig, camera_digest, camera_of
+from scenes.sensor.camera import CameraConfig, camera_digest, camera_of, lens_named, lens_names, load_camera
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
+
+if TYPE_CHECKING:
+    from detectors.recordings import Recording
 
 MAX_FRAMES = 10_000
 MAX_REPEATS = 100_000
@@ -43,6 +48,7 @@ AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), Li
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
 Reason = Annotated[str, Field(min_length=1, max_length=1000)]
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100), ListAsTuple]
 
 
@@ -54,6 +60,17 @@ class SimulatedSource(Config):
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
     views: AnyViews | None = Field(None, discriminator="kind", description="none: the target's own pose only")
+
+
+class CaptureSource(Config):
+    """Frames come from a real capture; see `detectors.recordings.open_capture`. Paths count from the YAML's folder."""
+
+    kind: Literal["capture"]
+    paths: tuple[FileName, ...] = Field(
+        min_length=1, max_length=100_000, description="files or a folder of depth frames"
+    )
+    unit: str | None = Field(None, description="of stored depth, where the files do not say")
+    intrinsics: FileName | None = Field(None, description="a file with the lens, or a camera's name")
 
 
 class CaptureConfig(Config):
@@ -177,7 +194,7 @@ class ExperimentConfig(Config):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="it names a folder of results")
     title: Annotated[str, Field(max_length=300)] = ""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
-    source: SimulatedSource
+    source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
     mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
     detector: DetectorConfig = DetectorConfig()
@@ -193,6 +210,13 @@ class ExperimentConfig(Config):
         None, description="a mapping of switches: a set-up with none on, with each alone, with all but each, with all"
     )
     sensitivity: SensitivityConfig | None = None
+
+    @property
+    def simulated(self) -> SimulatedSource:
+        """The source of an experiment with a simulated camera. Raises UserError for a real capture."""
+        if isinstance(self.source, CaptureSource):
+            raise UserError(f"{self.name}: its source is a real capture, and this needs a simulated camera")
+        return self.source
 
 
 DETECTOR_NAME = ("detector", "name")
@@ -261,15 +285,21 @@ class Experiment:
 
 def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
     """Return a point from its resolved declaration."""
-    # the full target (of a family of boards what they are drawn from) and the camera's numbers
     source = config.source
-    drawn = isinstance(source.target, DrawnTargetConfig)
-    target = source.target.to_data() if drawn else source.target.declare().to_data()
-    camera, work = camera_of(source.camera), source.render.to_data()
-    render = {"target": target, "optics": camera.optics.content(), "render": work}
-    frames = {"kind": source.kind, "target": target, "render": work}
-    frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
-    frames |= {} if source.views is None else {"views": source.views.to_data()}
+    if isinstance(source, CaptureSource):
+        files = [[file.name, file_digest(file)] for file in recording_of(source).files]
+        camera_name = lens_names().get(source.intrinsics or "")
+        named = load_camera(camera_name).lens.to_data() if camera_name else None
+        render = frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
+    else:
+        # the full target (of a family of boards what they are drawn from) and the camera's numbers
+        drawn = isinstance(source.target, DrawnTargetConfig)
+        target = source.target.to_data() if drawn else source.target.declare().to_data()
+        camera, work = camera_of(source.camera), source.render.to_data()
+        render = {"target": target, "optics": camera.optics.content(), "render": work}
+        frames = {"kind": source.kind, "target": target, "render": work}
+        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
+        frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
@@ -282,3 +312,15 @@ def detector_version(config: ExperimentConfig) -> int:
     """Return the version of the experiment's detector."""
     kind = detector_type(config.detector.name)
     return int(kind(kind.settings_type.from_data(config.detector.settings)).version)
+
+
+@lru_cache(maxsize=1000)
+def recording_of(source: CaptureSource) -> Recording:
+    """Open the recording behind a source, its first frame read and checked. Raises UserError for faults of its files.
+    ``intrinsics`` may name a camera, whose nominal lens then counts."""
+    from detectors.recordings import open_capture  # brings the readers of every format
+
+    name = source.intrinsics
+    lens = lens_named(name) if name and name in lens_names() else None
+    file = Path(name) if name and lens is None else None
+    return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)

@@ -178,7 +178,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     experiment = load_experiment(options.board)
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {point.config.detector.name: point.config.detector.settings for point in experiment.points}
-    config, source = points[0].config, points[0].config.source
+    config, source = points[0].config, points[0].config.simulated
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
         raise UserError(
@@ -211,7 +211,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
 
 def _simulated(point: Point, image: Image, frames: int, options: argparse.Namespace) -> np.ndarray:
     """Return frames (n, h, w) of a set-up on the image's pixels."""
-    source = point.config.source
+    source = point.config.simulated
     camera = camera_of(source.camera)
     target = source.target.declare().at_wavelength(camera.optics.wavelength_nm)
     view, _ = cached_view(target, camera.optics, source.render, options.out / ".cache" / "renders")

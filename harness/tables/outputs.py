@@ -7,15 +7,19 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Literal
+
+Place = Literal["results", "capture"]
 
 
 @dataclass(frozen=True)
 class Output:
-    """A file, or with * and ? in its ``name`` several; ``note``: what it is; ``of``: which experiments write
-    it, empty for all; "capture": `harness.detect`, elsewhere."""
+    """A file, or with * and ? in its ``name`` several; ``note``: what it is; ``place``: a folder of results, or that of
+    a real capture inside; ``of``: which experiments write it, empty for all."""
 
     name: str
     note: str
+    place: Place = "results"
     of: str = ""
 
 
@@ -25,20 +29,23 @@ PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine
 STUDY = Output("study.json", "every inspection of every set-up: what `harness.compare` reads", of="study")
 LEARNED = Output("learning-*.npz", "what a detector has learned from hole-free boards of their own: arrays by name")
 MAPS = Output("map-*.html", "a map that turns in the browser", of="views")
+CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
 COMPARISON_PAGE = Output("compare.html", "the same as a page", of="check")
 EFFICIENCY_PAGE = Output("efficiency.html", "detectors beside the ideal observer", of="efficiency")
 ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
 ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
-FINDINGS = Output("findings.csv", "one row per finding", "capture")
-FINDINGS_DATA = Output("findings.json", "the same with both measures, target, settings, provenance", "capture")
-ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture")
-TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture")
-BLIND = Output("blind.png", "where nothing came back", "capture")
-GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture")
-CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture")
+FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
+FINDINGS_DATA = Output(
+    "findings.json", "the same with both measures, target, settings, provenance", "capture", "capture"
+)
+ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
+TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture", "capture")
+BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
+GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
+CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
 FILES = (
-    REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
+    REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
     ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"
@@ -66,6 +73,6 @@ def outputs() -> Iterator[Output]:
                 yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)
 
 
-def is_output(name: str) -> bool:
-    """Return whether a file of this name is what a program writes into a folder of results."""
-    return any(one.of != "capture" and fnmatchcase(name, one.name) for one in outputs())
+def is_output(name: str, place: Place) -> bool:
+    """Return whether a file of this name is what a program writes at this place."""
+    return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

@@ -9,7 +9,7 @@ from harness.tables.limits import SCORES
 from harness.tables.outputs import FILES, JOURNAL, LATEST
 from harness.tables.schema import Table
 from harness.tables.study import STUDY_TABLES
-from harness.tables.trials import FINDINGS_OF_CAPTURE, STORED, STUDY_ONLY, SUMMARISED
+from harness.tables.trials import FINDINGS_OF_CAPTURE, POINTS_OF_CAPTURES, STORED, STUDY_ONLY, SUMMARISED
 
 HEAD = f"""# Results
 
@@ -32,7 +32,7 @@ GROUPS = {
     "": "Every sweep",
     "study": "A study of detection limits, too",
     "views": "An experiment with several views, too",
-    "capture": "`harness.detect`, into its `--out`",
+    "capture": "An experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
     "check": "`harness.check`, too",
     "efficiency": "`harness.efficiency`, too",
 }
@@ -56,7 +56,7 @@ def _lines() -> Iterator[str]:
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
     yield from _tables("Anomaly maps on a data set (`harness.score`)", (SCORES,))
-    yield from _tables("Real captures", (FINDINGS_OF_CAPTURE,))
+    yield from _tables("Real captures", (POINTS_OF_CAPTURES, FINDINGS_OF_CAPTURE))
     yield ""
 
 

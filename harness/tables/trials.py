@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from harness.tables import outputs, text
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Tone
+from harness.vocabulary.provenance import RESULTS_VERSION
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -551,4 +552,21 @@ FINDINGS_OF_CAPTURE = Table(
     formats=("csv",),
     always=True,
     digits="%.4f",
+)
+POINTS_OF_CAPTURES = Table(
+    outputs.CAPTURES.name.removesuffix(".csv"),
+    outputs.CAPTURES.note,
+    (
+        Column("point", note="folder of its findings"),
+        Column("variant", note="name of the set-up"),
+        Column("what", note="the set-up with its frames"),
+        Column("frames_used", note="frames in the average"),
+        Column("frames_left_out", note="frames left out as disturbed"),
+        Column("threshold_k", note="threshold in the detector's units"),
+        Column("threshold_mm", note="the same in mm"),
+        Column("findings", note="findings"),
+        Column("results_version", "", lambda row: RESULTS_VERSION, "version of the results"),
+    ),
+    formats=("csv",),
+    always=True,
 )

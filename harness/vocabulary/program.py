@@ -1,0 +1,61 @@
+"""The frame of every program: its parser, one message for a mistake, an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.vocabulary.errors import exit_code_of
+
+Options = Callable[[argparse.ArgumentParser], None]
+Run = Callable[[argparse.Namespace, str], int]
+
+
+@dataclass(frozen=True)
+class Program:
+    """``python -m <name>``: called, it parses arguments (None: the command line's) and runs. ``options`` adds its
+    arguments to a parser; ``run`` takes what was parsed, and the command as it was given."""
+
+    name: str
+    options: Options
+    run: Run
+    description: str
+    epilog: str | None
+
+    def parser(self) -> argparse.ArgumentParser:
+        """Return a parser of its arguments."""
+        about = {"description": self.description, "epilog": self.epilog}
+        parser = argparse.ArgumentParser(prog=f"python -m {self.name}", **about)
+        self.options(parser)
+        return parser
+
+    def __call__(self, arguments: list[str] | None = None) -> int:
+        """Run the program; returns its exit code: what ``run`` returns, 2 on a mistake of the user, 130 after
+        Ctrl-C."""
+        given = sys.argv[1:] if arguments is None else arguments
+        parsed = self.parser().parse_args(given)
+        if arguments is None:
+            # what batch systems and containers send first is to end as Ctrl-C does
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+        return exit_code_of(lambda: self.run(parsed, f"python -m {self.name} {shlex.join(given)}".rstrip()))
+
+
+def program(options: Options, description: str, epilog: str | None = None) -> Callable[[Run], Program]:
+    """Return a decorator that makes a program of what one runs; the module's name is the program's."""
+    return lambda run: Program(f"harness.{Path(run.__code__.co_filename).stem}", options, run, description, epilog)
+
+
+def whole_number(most: int) -> Callable[[str], int]:
+    """Return what parses an argument from 1 to ``most``."""
+
+    def parsed(text: str) -> int:
+        if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return parsed
