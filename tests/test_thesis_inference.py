@@ -12,7 +12,7 @@ from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
 from harness.report.page import Layout, set_ups_html
 from harness.report.sections import About
-from harness.thesis.inference import SET_UP, borne_out_if, posterior_of
+from harness.thesis.inference import KIND, SET_UP, borne_out_if, posterior_of
 
 AXES = {
     "source.target.blind_depth_mm": (2.0, 4.0),
@@ -52,6 +52,27 @@ def test_the_posterior_by_hand(found):
     assert "probability of 0.098" in sentence
     alike = table.assign(posterior_share=table["prior_share"])
     assert "nothing in particular holds" in borne_out_if(alike)
+
+
+def test_a_depth_of_blind_holes_says_nothing_of_through_holes(found):
+    """Only set-ups 2 mm deep agree. If they are the through-holes, whose depth is no depth, nothing is said of it."""
+    summary = summarise_holes(found.holes, PATHS)
+    shallow = summary[PATHS[0]] == 2.0
+    for agree, others in (("blind", "through"), ("through", "blind")):
+        kinds = shallow.map({True: agree, False: others})
+        table = posterior_of(summary.assign(**{KIND: kinds}), [*PATHS, KIND])
+        depths = table[table["axis"] == "blind depth of blind holes"]
+        assert depths["value"].tolist() == ["2 mm" if agree == "blind" else "4 mm"]
+        assert (depths[["prior_share", "posterior_share"]] == 1).all(axis=None)
+    near = summary.assign(**{KIND: (summary[PATHS[1]] < 0.555).map({True: "blind", False: "through"})})
+    table = posterior_of(near, [*PATHS, KIND])
+    depths = table[table["axis"] == "blind depth of blind holes"]
+    right, wrong = 0.9**22, 0.9**19 * 0.1**3
+    assert depths["prior_share"].tolist() == [0.5, 0.5]
+    assert depths["posterior_share"].tolist() == pytest.approx([right / (right + wrong), wrong / (right + wrong)])
+    assert "blind depth of blind holes is 2 mm (of 22 set-ups" in borne_out_if(table)
+    without = table.assign(posterior_share=table["posterior_share"].mask(table["value"] == "blind", 0.0))
+    assert "hole kind is through (of 22" in borne_out_if(without)
 
 
 def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(found):

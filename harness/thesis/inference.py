@@ -24,11 +24,15 @@ FEWEST_SET_UPS = 20
 DOUBTED = 0.5
 """A value is left out where the outcome makes it less probable than this share of what it was beforehand."""
 SET_UP = "set-up"
+KIND = "source.target.hole_kind"
+SPEAKS_OF = {"source.target.blind_depth_mm": "blind", "source.target.backing_distance_mm": "through"}
+"""Facts that only one kind of hole has: where both kinds are tried, shares are those among set-ups of that kind."""
 
 
 def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
     """Return rows of `harness.tables.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
-    None where another target, too few set-ups, several cameras, or not both numbers of frames were tried."""
+    None where another target, too few set-ups, several cameras, or not both numbers of frames were tried. Shares of a
+    fact that only one kind of hole has are those among set-ups of this kind."""
     import pandas as pd
 
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
@@ -47,21 +51,31 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     ]
     of_set_up = rows.drop_duplicates("variant").set_index("variant")
     for path, name in names_of(list(axes)).items():
-        for value, there in of_set_up.groupby(path, dropna=False):
-            own = {"axis": name, "value": value_text(path, value), "prior_share": prior * len(there)}
+        among, kind = of_set_up, SPEAKS_OF.get(path)
+        if kind and KIND in axes:
+            among, name = of_set_up[of_set_up[KIND] == kind], f"{name}{_of_kind(kind)}"
+        for value, there in among.groupby(path, dropna=False):
+            own = {"axis": name, "value": value_text(path, value), "prior_share": len(there) / len(among)}
             mean = float(np.exp(logs[there.index]).mean())
-            told.append({**own, "likelihood": mean, "posterior_share": float(share[there.index].sum())})
+            part = float(share[there.index].sum() / share[among.index].sum())
+            told.append({**own, "likelihood": mean, "posterior_share": part})
     return pd.DataFrame(told)
+
+
+def _of_kind(kind: str) -> str:
+    return f" of {kind} holes"
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
     """Say in one sentence what the thesis' outcome asks for: of each axis the values that are not `DOUBTED`, where one
-    is; and how probable the outcome is in the likeliest set-up."""
-    best = posterior.iloc[0]
+    is; and how probable the outcome is in the likeliest set-up. A fact of a kind of hole that is doubted is left
+    out."""
+    best, doubted = posterior.iloc[0], posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
     asked = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
-        kept = rows[rows["posterior_share"] >= DOUBTED * rows["prior_share"]]
-        asked += [f"{name} is {' or '.join(kept['value'])}"] if len(kept) < len(rows) else []
+        kept = rows["value"][~doubted[rows.index]]
+        without = any(name.endswith(_of_kind(kind)) for kind in posterior["value"][doubted])
+        asked += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
     said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
     return (
         f"The thesis' outcome is borne out if {said} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
