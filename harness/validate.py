@@ -15,9 +15,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--camera", action="append", default=[], metavar="NAME", help="this camera only; may be repeated")
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
-    add("--quick", action="store_true", help="fewer conditions and frames: a look, no judgement to keep")
     add("--figures", type=Path, metavar="FILE", help="other published figures")
-    add("--baseline", type=Path, metavar="FILE", help="another baseline; --quick is judged by one that is named only")
+    add("--baseline", type=Path, metavar="FILE", help="another baseline")
     add("--update-baseline", action="store_true", help="write down which figures pass now")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
@@ -41,7 +40,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
     Ctrl-C."""
     if options.capture or options.board:
-        for name in ("quick", "update_baseline", "figures", "baseline"):
+        for name in ("update_baseline", "figures", "baseline"):
             if getattr(options, name):
                 raise UserError(f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture")
         from harness.scorecard.capture import run_capture

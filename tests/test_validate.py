@@ -16,23 +16,19 @@ from pydantic import ValidationError
 
 from harness.evaluation.intervals import Interval
 from harness.scorecard import program
-from harness.scorecard.bench import NOTHING, QUICK, Reading
+from harness.scorecard.bench import NOTHING, Effort, Reading
 from harness.scorecard.figures import (
     BASELINE_FILE,
     DRAWN,
     FIGURES_FILE,
-    FULL_GRIDS,
-    QUICK_GRIDS,
     SCORES,
     Figure,
     Published,
-    curve_points,
     judged,
     measured,
     number,
     read_baseline,
     read_figures,
-    requests_of,
     write_baseline,
 )
 from harness.scorecard.quantities import QUANTITIES, in_words
@@ -43,6 +39,8 @@ from scenes.sensor.camera import camera_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
+AZURE = "azure_kinect_nfov"
+QUICK = Effort(noise_frames=20, few_frames=4, whole_frames=80, units=4)
 BASELINE = '{"scorecard_version": 1, "figures": {%s}}'
 GOOD = """
 figures:
@@ -261,7 +259,7 @@ def test_numbers_have_three_digits(value, text):
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_drawn_or_on_file():
-    used = {point.quantity for point in curve_points(FULL_GRIDS)}
+    used = {point.quantity.name for point in program.curves_of([AZURE])}
     used |= {figure.quantity.name for figure in read_figures()}
     assert used == set(QUANTITIES)
     for name, quantity in QUANTITIES.items():
@@ -270,29 +268,30 @@ def test_every_quantity_has_a_unit_in_its_name_and_is_drawn_or_on_file():
 
 
 def test_full_curves_span_what_a_scorecard_must():
-    points = list(curve_points(FULL_GRIDS))
+    panels = {(panel.quantity, panel.key): panel for each in program.pictures().values() for panel in each.panels}
 
-    def span(curve: str, key: str) -> list[float]:
-        return sorted({point.conditions.to_data()[key] for point in points if point.curve == curve})
+    def span(quantity: str, key: str) -> list[list[float]]:
+        panel = panels[quantity, key]
+        return [[point.to_data()[key] for point in panel.points(line)] for line in panel.lines]
 
-    assert (span("distance", "distance_m")[0], span("distance", "distance_m")[-1]) == (0.5, 4.0)
-    assert (span("albedo", "albedo")[0], span("albedo", "albedo")[-1]) == (0.05, 0.95)
-    assert (span("angle", "angle_deg")[0], span("angle", "angle_deg")[-1]) == (0, 70)
-    assert span("edge_lit", "step_mm") == [5, 10, 20, 50, 100, 200, 500]
-    assert set(span("room", "multipath")) == {False, True}
-
-
-def test_what_figures_and_curves_share_is_measured_once(tmp_path):
-    figures = read_figures(written(tmp_path))
-    points = tuple(curve_points(FULL_GRIDS))
-    requests = requests_of(("azure_kinect_nfov",), figures, points)
-    assert len(requests) == len(set(requests)) < len(figures) + len(points)
+    (distances,), (albedos,), (angles,) = (
+        span("temporal_sigma_mm", key) for key in ("distance_m", "albedo", "angle_deg")
+    )
+    assert (distances[0], distances[-1]) == (0.5, 4.0)
+    assert (albedos[0], albedos[-1]) == (0.05, 0.95)
+    assert (angles[0], angles[-1]) == (0, 70)
+    assert span("edge_gap_px", "step_mm") == [[5, 10, 20, 50, 100, 200, 500]] * 2
+    room = panels["board_bias_mm", "distance_m"]
+    assert {line: room.points(line)[0].to_data()["multipath"] for line in room.lines} == {
+        **{"multipath on": True, "multipath off": False}
+    }
 
 
 def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     figures = read_figures(written(tmp_path))
-    points = [p for p in curve_points(QUICK_GRIDS) if p.curve == "albedo"]
-    requests = requests_of(("azure_kinect_nfov",), figures, points)
+    panel = program.pictures()["noise"].panels[1]
+    requests = [(AZURE, panel.quantity, point) for point in panel.points("")[1::5]]
+    requests += [(AZURE, figure.quantity.name, figure.conditions) for figure in figures]
     one = measured(requests, QUICK, tmp_path, jobs=1)
     two = measured(tuple(reversed(requests)), QUICK, tmp_path, jobs=2)
     assert set(one) == set(two) == set(requests)
@@ -304,9 +303,7 @@ def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
 def test_the_room_bends_the_board_only_with_multipath(tmp_path):
     """Light from the table reaches the board late: a bias of millimetres; without it only rounding is left."""
     quantity = QUANTITIES["board_bias_mm"]
-    requests = [
-        ("azure_kinect_nfov", quantity.name, quantity.conditions(distance_m=0.7, multipath=on)) for on in (False, True)
-    ]
+    requests = [(AZURE, quantity.name, quantity.conditions(distance_m=0.7, multipath=on)) for on in (False, True)]
     off, on = measured(requests, QUICK, tmp_path, jobs=1).values()
     assert abs(off.value) < 0.05
     assert on.value > 2.0 and on.interval.above(1.0)
@@ -316,32 +313,39 @@ def test_the_room_bends_the_board_only_with_multipath(tmp_path):
 
 
 def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
-    """Two figures, quick: files written, exit 0; a baseline that the simulation falls behind: exit 1, naming it."""
-    grids = {key: values[:1] if key in ("lag_px", "step_mm") else () for key, values in QUICK_GRIDS.items()}
-    monkeypatch.setattr(program.scoring, "QUICK_GRIDS", grids)
-    monkeypatch.setattr(program.scoring, "measured", lru_cache(lambda wanted, *more: measured(wanted, *more)))
-    monkeypatch.setattr(program.scoring, "requests_of", lambda *of: tuple(requests_of(*of)))
+    """Two figures, few frames: files and exit 0; a baseline that the simulation falls behind: exit 1, naming it."""
+    few = {
+        name: picture.model_copy(
+            update={"panels": tuple(p.model_copy(update={"values": p.values[1:2]}) for p in picture.panels)}
+        )
+        for name, picture in program.pictures().items()
+        if name in ("correlation", "edges")
+    }
+    monkeypatch.setattr(program, "pictures", lambda: few)
+    monkeypatch.setattr(program, "FULL", QUICK)
+    known = lru_cache(lambda wanted, *more: measured(wanted, *more))
+    monkeypatch.setattr(program.scoring, "measured", lambda wanted, *more: known(tuple(wanted), *more))
     figures, baseline, out = written(tmp_path), tmp_path / "baseline.json", tmp_path / "out"
-    options = ["--quick", "--jobs", "1", "--camera", "azure_kinect_nfov"]
+    options = ["--jobs", "1", "--camera", AZURE]
     options += ["--figures", str(figures), "--out", str(out)]
     assert main(options) == 0
     told = capsys.readouterr()
-    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out and "A quick look" in told.out
+    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out
     # on a slow machine progress is told meanwhile
     assert all(line.startswith("measured ") for line in told.err.splitlines())
     page = (out / "scorecard.html").read_text()
     assert f'<meta name="generator" content="{GENERATOR}">' in page
-    assert page.count("<svg") == 6 and "http" not in page.replace("http://www.w3.org", "")
+    assert page.count("<svg") == 2 and "http" not in page.replace("http://www.w3.org", "")
     scores = list(csv.DictReader((out / "scorecard.csv").open()))
     assert [row["name"] for row in scores] == ["wall", "neighbours"]
     assert float(scores[0]["low"]) < float(scores[0]["simulated"]) < float(scores[0]["high"])
     curves = list(csv.DictReader((out / "curves.csv").open()))
-    assert len(curves) == len(list(curve_points(grids)))
+    assert len(curves) == len(program.curves_of([AZURE])) == 8
     assert {row["results_version"] for row in scores + curves} == {str(RESULTS_VERSION)}
     assert {row["lag_x_px"] for row in curves} == {"", "0", "2"}
-    assert {row["multipath"] for row in curves} == {""} and {row["shadow"] for row in curves} == {"", "True", "False"}
+    assert {row["shadow"] for row in curves} == {"", "True", "False"}
     provenance = json.loads((out / "provenance.json").read_text())
-    assert provenance["command"].startswith("python -m harness.validate --quick")
+    assert provenance["command"].startswith("python -m harness.validate --jobs 1")
     assert provenance["results_version"] == RESULTS_VERSION
 
     baseline.write_text(BASELINE % '"wall": {"passes": true}, "neighbours": {"passes": true}')
@@ -361,10 +365,9 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
     ("options", "says"),
     [
         (["--camera", "azure"], "there is no camera 'azure'"),
-        (["--quick", "--update-baseline"], "a baseline needs the whole effort"),
         (["--figures", "absent.yaml"], "absent.yaml"),
         (["--mask", "m.png"], "--mask belongs to a capture"),
-        (["--capture", "x", "--quick"], "--quick belongs to the scorecard"),
+        (["--capture", "x", "--update-baseline"], "--update-baseline belongs to the scorecard"),
         (["--baseline", "absent.json"], "--baseline absent.json: no such file"),
         (["--figures", "own.yaml", "--update-baseline"], "name a --baseline of their own"),
         (["--capture", "absent"], "absent: no such file or folder"),

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from harness.scorecard.bench import (
-    QUICK,
     Bench,
+    Effort,
     correlation_at,
     edge_widths,
     find_planes,
@@ -23,13 +23,14 @@ from harness.scorecard.bench import (
     share_of,
     temporal_sigma_m,
 )
-from harness.scorecard.quantities import QUANTITIES, PlateauConditions, SurvivalConditions
+from harness.scorecard.quantities import QUANTITIES, PlateauConditions
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import BEAM_REACH_FWHM, Plane, layered_view, plane_view, sub_rays
 from scenes.optics import Optics
 from scenes.sensor.camera import CameraConfig, camera_of
 
 AZURE = "azure_kinect_nfov"
+QUICK = Effort(noise_frames=20, few_frames=4, whole_frames=80, units=4)
 PINHOLE = camera_of(CameraConfig(name=AZURE, numbers={"lens.distortion": [0.0] * 8, "lens.cx_px": 320.0}))
 """An Azure Kinect whose pixels are evenly spaced, so that widths can be worked out by hand."""
 
@@ -110,7 +111,7 @@ def test_widths_by_hand():
     z[:, :, 19] = 1.05
     z[:, :5, 18] = np.nan
     widths = edge_widths(z, front, back, from_edge, 0.01, 15, across=2)
-    wanted = {"gap": 2.5, "flying": 1.0, "front_erosion": 1.5, "back_erosion": 2.0, "with_flying": 1.0}
+    wanted = {"gap": 2.5, "flying": 1.0, "front_erosion": 1.5, "with_flying": 1.0}
     assert {name: width.tolist() for name, width in widths.items()} == {name: [v] * 3 for name, v in wanted.items()}
 
 
@@ -119,7 +120,7 @@ def test_a_front_pixel_that_shows_the_back_is_eroded_and_does_not_fly():
     z[:, :, 19] = 1.1
     widths = edge_widths(z, front, back, from_edge, 0.01, 15, across=2)
     assert {name: width[0] for name, width in widths.items()} == {
-        **{"gap": 0, "flying": 0, "front_erosion": 1, "back_erosion": 0, "with_flying": 0}
+        **{"gap": 0, "flying": 0, "front_erosion": 1, "with_flying": 0}
     }
 
 
@@ -279,8 +280,6 @@ def test_small_plateaus_sink_in_the_filter_and_large_ones_do_not(bench):
     )
     assert small == pytest.approx(0.283, abs=0.06)
     assert large == pytest.approx(1.0, abs=0.03)
-    steps = [QUANTITIES["smallest_step_mm"].measure(bench, SurvivalConditions(diameter_px=d)).value for d in (3.0, 6.0)]
-    assert steps[0] > steps[1] == 2.0
 
 
 def test_a_shadow_is_a_gap_of_its_width(bench):

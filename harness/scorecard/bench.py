@@ -44,7 +44,6 @@ class Effort:
 
 
 FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
-QUICK = Effort(noise_frames=20, few_frames=4, whole_frames=80, units=4)
 
 
 @dataclass(frozen=True)
@@ -221,8 +220,6 @@ def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.n
 
 LAGS = 5
 SURFACE_DEGREE = 5
-WINDOW_PX = 5
-"""Up to this lag the part that is white before the Azure Kinect's filter window shows as a triangle."""
 
 
 def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
@@ -272,12 +269,10 @@ def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y:
 @dataclass(frozen=True)
 class FixedPattern:
     """The part of a wall's average that stays after a smooth surface and the temporal noise are taken off. ``std_m``;
-    ``length_px`` of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12; ``pixel_m``: the part that is white
-    before the engine's window of 5, told by its triangle up to lag 5; ``covariance_m2`` (lags 0..20)."""
+    ``length_px`` of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12; ``covariance_m2`` (lags 0..20)."""
 
     std_m: float
     length_px: float
-    pixel_m: float
     covariance_m2: np.ndarray
 
 
@@ -310,12 +305,7 @@ def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: 
         lag, relative = np.arange(13), left[:13] / left[0]
         found = optimize.least_squares(lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0])
         length = float(abs(found.x[1]))
-    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest
-    k = np.arange(1.0, WINDOW_PX + 1)
-    rows = np.column_stack([k / WINDOW_PX, k**2, k**4])
-    white, *_ = np.linalg.lstsq(rows, left[0] - left[1 : WINDOW_PX + 1], rcond=None)[0]
-    pixel = float(np.sign(white) * np.sqrt(abs(white)))
-    return FixedPattern(float(np.sqrt(max(left[0], 0))), length, pixel, left)
+    return FixedPattern(float(np.sqrt(max(left[0], 0))), length, left)
 
 
 TOLERANCE_SIGMAS = 4.0
@@ -325,7 +315,7 @@ LEAST_TOLERANCE_M = 0.5 * MM
 MOST_OF_STEP = 0.45
 FLAT_PX = 8.0
 """Distance from an edge beyond which the camera's filter sees a single surface."""
-WIDTHS = ("gap", "flying", "front_erosion", "back_erosion")
+WIDTHS = ("gap", "flying", "front_erosion")
 
 
 def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
@@ -347,14 +337,14 @@ def edge_widths(
 ) -> dict[str, np.ndarray]:
     """The `WIDTHS` (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that lines of pixels
     along the axis ``across`` cross: pixels without a range; with a range off both surfaces; whose central ray meets the
-    front (the back) and that do not show it, shadow included; and the share of lines ``with_flying`` pixels. All but
-    the gap are NaN where noise hides the step. ``front_z_m``, ``back_z_m`` (h, w): z along each pixel's ray.
+    front and that do not show it; and the share of lines ``with_flying`` pixels. All but the gap are NaN where noise
+    hides the step. ``front_z_m``, ``back_z_m`` (h, w): z along each pixel's ray.
     ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do not count."""
     near = np.abs(from_edge_px) <= reach_px
     z, side = z_m[:, near], from_edge_px[near]
     shows_front, shows_back = (np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m))
     valid = np.isfinite(z)
-    missing = (~valid, valid & ~shows_front & ~shows_back, ~shows_front[:, side < 0], ~shows_back[:, side >= 0])
+    missing = (~valid, valid & ~shows_front & ~shows_back, ~shows_front[:, side < 0])
     lines = np.asarray(near.any(axis=across - 1))
     found = {name: pixels.sum(axis=1) / lines.sum() for name, pixels in zip(WIDTHS, missing, strict=True)}
     flying = np.zeros(z_m.shape, bool)

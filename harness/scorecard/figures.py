@@ -10,30 +10,19 @@ import json
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from harness.evaluation.intervals import Interval
 from harness.scorecard.bench import Bench, Effort, Reading
-from harness.scorecard.quantities import (
-    QUANTITIES,
-    LagConditions,
-    PlaneConditions,
-    Quantity,
-    RoomConditions,
-    StepConditions,
-    SurvivalConditions,
-    in_words,
-    scene_of,
-)
+from harness.scorecard.quantities import QUANTITIES, Quantity, RoomConditions, in_words, scene_of
 from harness.tables.schema import Column, Table
 from harness.tables.text import Tone
 from harness.vocabulary.config import Config
@@ -53,6 +42,8 @@ NEAR = 0.25
 """A figure of reality passes within this share of a published value; a bound must hold."""
 DRAWN = ("azure_kinect_nfov", "kinect_v2", "realsense_l515")
 """Cameras whose curves the page draws unless others are asked for: those of the thesis."""
+Request = tuple[str, str, Config]
+"""A camera, a quantity, and its conditions."""
 
 
 class Published(Config):
@@ -249,58 +240,6 @@ def _known(path: Path) -> dict[str, dict[str, Any]]:
 
 
 SAID_EVERY_S = 10.0
-EDGES = ("edge_gap_px", "flying_pixels_px", "front_erosion_px", "back_erosion_px")
-FULL_GRIDS: dict[str, tuple[float, ...]] = {
-    "distance_m": tuple(0.5 + 0.25 * k for k in range(15)),
-    "albedo": (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 0.95),
-    "angle_deg": (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0),
-    "lag_px": tuple(range(1, 9)),
-    "map_distance_m": (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0),
-    "map_albedo": (0.05, 0.1, 0.15, 0.2, 0.4, 0.6, 0.8, 0.95),
-    "step_mm": (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0),
-    "diameter_px": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0),
-    "bias_distance_m": tuple(0.5 + 0.25 * k for k in range(15)),
-    "room_distance_m": (0.5, 0.7, 1.0, 1.5),
-}
-QUICK_GRIDS = {key: values[1 :: len(values) // 2] for key, values in FULL_GRIDS.items()} | {"room_distance_m": ()}
-
-Request = tuple[str, str, Config]
-
-
-class CurvePoint(NamedTuple):
-    """One point of one curve: ``curve`` names the picture that it belongs to."""
-
-    curve: str
-    quantity: str
-    conditions: Config
-
-
-def curve_points(grids: Mapping[str, tuple[float, ...]]) -> Iterator[CurvePoint]:
-    """All points of all curves."""
-    for curve, key in (("distance", "distance_m"), ("albedo", "albedo"), ("angle", "angle_deg")):
-        yield from (CurvePoint(curve, "temporal_sigma_mm", PlaneConditions(**{key: value})) for value in grids[key])
-    for lag in map(int, grids["lag_px"]):
-        yield CurvePoint("correlation_x", "noise_correlation", LagConditions(lag_x_px=lag, lag_y_px=0))
-        yield CurvePoint("correlation_y", "noise_correlation", LagConditions(lag_x_px=0, lag_y_px=lag))
-    for d, a in product(grids["map_distance_m"], grids["map_albedo"]):
-        yield CurvePoint("valid", "valid_fraction", PlaneConditions(distance_m=d, albedo=a))
-    for step, quantity in product(grids["step_mm"], EDGES):
-        yield CurvePoint("edge_lit", quantity, StepConditions(step_mm=step))
-        yield CurvePoint("edge_shadowed", quantity, StepConditions(step_mm=step, shadow=True))
-        yield CurvePoint("edge_across_y", quantity, StepConditions(step_mm=step, across="y"))
-    for size in grids["diameter_px"]:
-        yield CurvePoint("survival", "smallest_step_mm", SurvivalConditions(diameter_px=size))
-    for d in grids["bias_distance_m"]:
-        yield CurvePoint("bias", "bias_mm", PlaneConditions(distance_m=d))
-    for d, on, quantity in product(grids["room_distance_m"], (False, True), ("board_bias_mm", "board_bend_mm")):
-        yield CurvePoint("room", quantity, RoomConditions(distance_m=d, multipath=on))
-
-
-def requests_of(cameras: Sequence[str], figures: Sequence[Figure], points: Sequence[CurvePoint]) -> list[Request]:
-    """The numbers that curves and figures need, each once."""
-    wanted: list[Request] = [(each.entry.camera, each.quantity.name, each.conditions) for each in figures]
-    wanted += [(camera, point.quantity, point.conditions) for camera in cameras for point in points]
-    return list(dict.fromkeys(wanted))
 
 
 def measured(requests: Iterable[Request], effort: Effort, renders: Path, jobs: int) -> dict[Request, Reading]:
@@ -309,7 +248,7 @@ def measured(requests: Iterable[Request], effort: Effort, renders: Path, jobs: i
     for request in requests:
         scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
     # scenes that take seconds are begun first, so that no process ends on one alone
-    groups = sorted(scenes.values(), key=lambda group: not isinstance(group[0][2], RoomConditions | SurvivalConditions))
+    groups = sorted(scenes.values(), key=lambda group: not isinstance(group[0][2], RoomConditions))
     results: dict[Request, Reading] = {}
     said = time.monotonic()
     # processes that start anew: a forked one would share the locks of this one's libraries
@@ -335,11 +274,13 @@ SCORE_FILE: dict[str, Any] = {"formats": ("csv",), "digits": "%.9g"}
 
 
 @dataclass(frozen=True)
-class MeasuredPoint:
-    """One point of one curve of one camera."""
+class CurvePoint:
+    """One point of a curve of one camera; ``curve``: the picture that it belongs to."""
 
+    curve: str
     camera: str
-    point: CurvePoint
+    quantity: Quantity
+    conditions: Config
     simulated: Reading
 
 
@@ -363,8 +304,8 @@ class Beside:
 
 def number(value: float) -> str:
     """Three significant digits; ``none`` where there is no value."""
-    if not np.isfinite(value):
-        return "none" if np.isnan(value) else "none survives"
+    if np.isnan(value):
+        return "none"
     if 0.0995 <= abs(value) < 99.95:
         return f"{value:#.3g}"
     return f"{value:.3g}" if abs(value) >= 99.95 or value == 0 else f"{value:.2g}"
@@ -450,11 +391,11 @@ CURVES = Table(
     "curves",
     "one row per point of a curve",
     (
-        Column("curve", "", "point.curve", "picture that it belongs to"),
+        Column("curve", "", "curve", "picture that it belongs to"),
         Column("camera", "", "camera", "simulated camera"),
-        Column("quantity", "", "point.quantity", "quantity that is measured"),
-        Column("unit", "", lambda row: QUANTITIES[row.point.quantity].unit, "unit of the value"),
-        Column("conditions", "", lambda row: _conditions(row.point.conditions), "conditions", spread=True),
+        Column("quantity", "", "quantity.name", "quantity that is measured"),
+        Column("unit", "", "quantity.unit", "unit of the value"),
+        Column("conditions", "", lambda row: _conditions(row.conditions), "conditions", spread=True),
         *SIMULATED[:3],
         VERSION,
     ),

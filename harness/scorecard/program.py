@@ -6,7 +6,8 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import cycle
 from pathlib import Path
@@ -17,13 +18,12 @@ from pydantic import Field
 
 from harness.report.blocks import COLOURS, MARKERS, plain, plain_decades, svg, template
 from harness.scorecard import figures as scoring
-from harness.scorecard.bench import FULL, QUICK
+from harness.scorecard.bench import FULL, NOTHING, Reading
 from harness.scorecard.quantities import QUANTITIES
 from harness.tables.schema import write_table
 from harness.tables.text import show
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import read_yaml
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from scenes.sensor.camera import camera_digest, load_camera
@@ -34,22 +34,22 @@ if TYPE_CHECKING:
 DASHES = ("-", "--", ":")
 
 
-class Line(Config):
-    """A curve in a panel, of the points with ``fixed`` conditions."""
-
-    curve: str
-    fixed: dict[str, Any] = Field(default_factory=dict)
-
-
 class Panel(Config):
-    """A quantity against the condition ``key``. ``lines``: curves by their meaning; ``scales`` of x and y."""
+    """A quantity against the condition ``key`` at some ``values``. ``lines``: by their meaning, the other conditions of
+    each that differ from the defaults; ``scales`` of x and y."""
 
     title: str
     quantity: str
     key: str
     label: str
-    lines: dict[str, Line]
+    values: tuple[int | float, ...]
+    lines: dict[str, dict[str, Any]] = Field(default_factory=lambda: {"": {}})
     scales: tuple[str, str] = ("linear", "linear")
+
+    def points(self, line: str) -> list[Config]:
+        """The conditions of a line's points."""
+        kind = QUANTITIES[self.quantity].conditions
+        return [kind.from_data({**self.lines[line], self.key: value}) for value in self.values]
 
 
 class Picture(Config):
@@ -68,37 +68,30 @@ def pictures() -> dict[str, Picture]:
     return {name: Picture.from_data(data) for name, data in source.data.items()}
 
 
+def curves_of(cameras: Iterable[str]) -> list[scoring.CurvePoint]:
+    """All points of all curves, not yet measured."""
+    return [
+        scoring.CurvePoint(name, camera, QUANTITIES[panel.quantity], conditions, NOTHING)
+        for camera in cameras
+        for name, picture in pictures().items()
+        for panel in picture.panels
+        for line in panel.lines
+        for conditions in panel.points(line)
+    ]
+
+
 def all_figures(
-    cameras: Mapping[str, str], points: Sequence[scoring.MeasuredPoint], scores: Sequence[scoring.Score]
+    cameras: Mapping[str, str], found: Mapping[scoring.Request, Reading], scores: Sequence[scoring.Score]
 ) -> dict[str, str]:
     """Every figure as SVG text by name. ``cameras``: titles by name, in the order of colours."""
-
-    shown = ("curve", "quantity", "camera", "simulated", "low", "high", *scoring.CONDITIONS)
-    table = scoring.CURVES.frame(points).reindex(columns=shown)
-    looks = zip(cycle(COLOURS), cycle(MARKERS), strict=False)
-    styles = {one: {"color": c, "marker": m, "markersize": 4} for one, (c, m) in zip(cameras, looks, strict=False)}
+    looks = zip(cameras, cycle(COLOURS), cycle(MARKERS), strict=False)
+    styles = {one: {"color": colour, "marker": marker, "markersize": 4} for one, colour, marker in looks}
 
     def drawn(name: str, picture: Picture) -> str:
-        panels = picture.panels
-
         def draw(figure: Canvas) -> None:
-            rows = 1 if len(panels) < 4 else 2
-            axes = figure.subplots(rows, len(panels) // rows, squeeze=False).ravel()
-            for axis, panel in zip(axes, panels, strict=True):
-                of_panel = table[table["quantity"] == panel.quantity]
-                for camera in cameras:
-                    for dash, (meaning, line) in zip(DASHES, panel.lines.items(), strict=False):
-                        part = of_panel[(of_panel["camera"] == camera) & (of_panel["curve"] == line.curve)]
-                        part = part[np.isfinite(part["simulated"])]
-                        for key, value in line.fixed.items():
-                            part = part[part[key] == value]
-                        part = part.sort_values(panel.key)
-                        errors = np.nan_to_num(
-                            np.abs(part[["low", "high"]].to_numpy().T - part["simulated"].to_numpy())
-                        )
-                        named = f"{cameras[camera]}{', ' if meaning else ''}{meaning}"
-                        drawn_as = {"linestyle": dash, "elinewidth": 1, "label": named, **styles[camera]}
-                        axis.errorbar(part[panel.key].to_numpy(), part["simulated"].to_numpy(), yerr=errors, **drawn_as)
+            axes = figure.subplots(1, len(picture.panels), squeeze=False)[0]
+            for axis, panel in zip(axes, picture.panels, strict=True):
+                _draw_panel(axis, panel, cameras, styles, found)
                 for score in scores:
                     _draw_published(axis, panel, score, styles)
                 axis.set(title=panel.title, xlabel=panel.label, ylabel=picture.label)
@@ -106,24 +99,49 @@ def all_figures(
                 for scale, ticks in zip(panel.scales, (axis.xaxis, axis.yaxis), strict=True):
                     if scale == "log":
                         plain_decades(ticks)
-                if not (of_panel["curve"].isin([curve for curve, _ in panel.lines.values()])).any():
-                    axis.text(0.5, 0.5, "not measured", transform=axis.transAxes, ha="center")
-            handles, labels = axes[-1].get_legend_handles_labels()
+            handles, labels = axes[0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside upper left", ncols=3, columnspacing=1.2, fontsize=8)
 
-        return svg(name, (10.5, 4.2 if len(panels) < 4 else 7.6), picture.title, draw)
+        return svg(name, (10.5, 4.2), picture.title, draw)
 
     return {name: drawn(name, picture) for name, picture in pictures().items()}
 
 
+def _draw_panel(
+    axis: Any,
+    panel: Panel,
+    cameras: Mapping[str, str],
+    styles: Mapping[str, Any],
+    found: Mapping[scoring.Request, Reading],
+) -> None:
+    """Draw the measured points of a panel's lines, with their intervals."""
+    there = False
+    for camera, title in cameras.items():
+        for dash, line in zip(DASHES, panel.lines, strict=False):
+            known = [
+                (getattr(c, panel.key), found.get((camera, panel.quantity, c), NOTHING)) for c in panel.points(line)
+            ]
+            known = [(x, reading) for x, reading in known if np.isfinite(reading.value)]
+            there |= bool(known)
+            y = [reading.value for _, reading in known]
+            ends = [(one.value - one.interval.low, one.interval.high - one.value) for _, one in known]
+            errors = np.nan_to_num(np.array(ends, float).reshape(-1, 2).T, posinf=0.0)
+            named = f"{title}{', ' if line else ''}{line}"
+            drawn_as = {"linestyle": dash, "elinewidth": 1, "label": named, **styles[camera]}
+            axis.errorbar([x for x, _ in known], y, yerr=errors, **drawn_as)
+    if not there:
+        axis.text(0.5, 0.5, "not measured", transform=axis.transAxes, ha="center")
+
+
 def _draw_published(axis: Any, panel: Panel, score: scoring.Score, styles: Mapping[str, Any]) -> None:
-    """Mark a published value hollow if it is of the panel's quantity, under the conditions of the panel's curve."""
-    entry, conditions = score.figure.entry, score.figure.conditions.to_data()
-    usual = {**type(score.figure.conditions)().to_data(), "lag_x_px": 0, "lag_y_px": 0}
-    differs = {key for key, value in conditions.items() if value != usual[key]}
-    if entry.quantity == panel.quantity and entry.published.value is not None and differs <= {panel.key}:
+    """Mark a published value hollow if it is of the panel's quantity, under the conditions of one of its lines."""
+    entry, conditions = score.figure.entry, score.figure.conditions
+    if entry.quantity != panel.quantity or entry.published.value is None or entry.camera not in styles:
+        return
+    x = getattr(conditions, panel.key)
+    if any(type(conditions).from_data({**fixed, panel.key: x}) == conditions for fixed in panel.lines.values()):
         hollow = {"markersize": 11, "markerfacecolor": "none", "linestyle": "none", "markeredgewidth": 1.6}
-        axis.plot(conditions[panel.key], entry.published.value, **{**styles[entry.camera], **hollow})
+        axis.plot(x, entry.published.value, **{**styles[entry.camera], **hollow})
 
 
 def run_scorecard(options: argparse.Namespace, command: str) -> int:
@@ -131,25 +149,22 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     Raises UserError for an unknown camera, a faulty figures file or baseline, and a folder that cannot be written."""
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.quick and options.update_baseline:
-        raise UserError("--quick and --update-baseline: a baseline needs the whole effort", fix="leave one of them out")
-    # a quick look is judged by a baseline that is named only
-    baseline_file = options.baseline or (None if options.quick else scoring.BASELINE_FILE)
+    # figures of one's own are no figures of the committed baseline
+    baseline_file = options.baseline or (None if options.figures else scoring.BASELINE_FILE)
     every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
     published = dict.fromkeys(figure.entry.camera for figure in every)
     titles = {name: load_camera(name).title for name in (dict.fromkeys(options.camera) or published)}
     figures = tuple(figure for figure in every if figure.entry.camera in titles)
     drawn = {name: title for name, title in titles.items() if options.camera or name in scoring.DRAWN}
     baseline = scoring.read_baseline(baseline_file) if baseline_file else {}
-    points = tuple(scoring.curve_points(scoring.QUICK_GRIDS if options.quick else scoring.FULL_GRIDS))
-    wanted = scoring.requests_of(tuple(drawn), figures, points)
-    found = scoring.measured(wanted, QUICK if options.quick else FULL, options.out / ".cache" / "renders", options.jobs)
-    simulated = {each.name: found[each.entry.camera, each.quantity.name, each.conditions] for each in figures}
+    points = curves_of(drawn)
+    wanted = [(each.entry.camera, each.quantity.name, each.conditions) for each in figures]
+    wanted += [(point.camera, point.quantity.name, point.conditions) for point in points]
+    found = scoring.measured(dict.fromkeys(wanted), FULL, options.out / ".cache" / "renders", options.jobs)
+    simulated = {each.name: found[request] for each, request in zip(figures, wanted, strict=False)}
     scores = scoring.judged(figures, simulated, baseline)
     curves = [
-        scoring.MeasuredPoint(camera, point, found[camera, point.quantity, point.conditions])
-        for camera in drawn
-        for point in points
+        replace(point, simulated=found[request]) for point, request in zip(points, wanted[len(figures) :], strict=True)
     ]
     provenance = {
         "results_version": RESULTS_VERSION,
@@ -157,10 +172,9 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         "cameras": {name: camera_digest(load_camera(name)) for name in titles},
         "figures": str(options.figures or scoring.FIGURES_FILE),
         "baseline": str(baseline_file or "none"),
-        "effort": "quick" if options.quick else "full",
         "seconds": round(time.perf_counter() - began, 1),
     }
-    answer = _answer(scores, options.quick)
+    answer = _answer(scores)
     real = [score for score in scores if score.figure.entry.kind == "reality"]
     code = [score for score in scores if score.figure.entry.kind == "code"]
     groups = [
@@ -168,7 +182,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         for camera, title in titles.items()
         for own in [[score for score in real if score.figure.entry.camera == camera]]
     ]
-    images = all_figures(drawn, curves, scores)
+    images = all_figures(drawn, found, scores)
     page = template("scorecard.html", Path(__file__).parent).render(
         answer=answer,
         groups=groups,
@@ -214,7 +228,7 @@ FAMILIES = {"azure": "Azure Kinect", "femto": "Femto", "kinect": "Kinect v2", "r
 """Families of cameras by the first word of their names; all others are counted together."""
 
 
-def _answer(scores: Sequence[scoring.Score], quick: bool) -> str:
+def _answer(scores: Sequence[scoring.Score]) -> str:
     """Tell how many blind figures hold, in all and by family, and how many of the others."""
 
     def share(chosen: Sequence[scoring.Score]) -> str:
@@ -227,8 +241,7 @@ def _answer(scores: Sequence[scoring.Score], quick: bool) -> str:
         first = score.figure.entry.camera.partition("_")[0]
         families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
     each = ", ".join(f"{name} {share(own)}" for name, own in families.items())
-    text = "A quick look, with too few frames for a judgement: " if quick else ""
-    text += f"{share(blind)} blind figures are within 25 %{f' ({each})' if len(families) > 1 else ''}; "
+    text = f"{share(blind)} blind figures are within 25 %{f' ({each})' if len(families) > 1 else ''}; "
     text += f"of figures that calibrated a camera {share(fitted)}; "
     text += f"of checks of the code {share([score for score in scores if score.figure.entry.kind == 'code'])}."
     regressed = [score.figure.name for score in scores if score.regressed]

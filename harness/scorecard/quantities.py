@@ -60,9 +60,6 @@ PITCH_PX, COPIES = 22, 4
 """Distance of plateaus (the largest diameter, and twice the reach of a filter of 11 pixels), and number an axis."""
 R2 = (0.7548776662466927, 0.5698402909980532)
 """Roberts' low-discrepancy sequence: the plateaus' positions within a pixel."""
-SURVIVES = 0.5
-"""A step survives where at least this share of its height is seen, in most plateaus."""
-LADDER_MM = (2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 MONTE_CARLO_SIGMAS = 2.0
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
@@ -71,7 +68,6 @@ ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
 Albedo = Annotated[float, Field(gt=0.0, le=1.0, description="diffuse reflectance, above 0 and up to 1")]
 Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
-DiameterPx = Annotated[float, Field(ge=0.5, le=12.0, description="in pixels, 0.5 to 12")]
 StepMm = Annotated[float, Field(ge=0.5, le=5e3, description="from front to back, 0.5 to 5000 mm")]
 
 
@@ -111,17 +107,12 @@ class StepConditions(Config):
     shadow: bool = False
 
 
-class SurvivalConditions(Config):
-    """Round plateaus before a plane, at all positions relative to the pixel grid."""
+class PlateauConditions(Config):
+    """Round plateaus of one height before a plane, at all positions relative to the pixel grid."""
 
     distance_m: Distance = 0.75
-    diameter_px: DiameterPx = 3.0
+    diameter_px: Annotated[float, Field(ge=0.5, le=12.0, description="in pixels, 0.5 to 12")] = 3.0
     albedo: Albedo = 0.6
-
-
-class PlateauConditions(SurvivalConditions):
-    """Round plateaus of one height before a plane."""
-
     step_mm: StepMm = 18.0
 
 
@@ -410,15 +401,11 @@ def front_erosion_px(bench: Bench, c: StepConditions) -> Reading:
     return mean_of(_widths(bench, c)["front_erosion"])
 
 
-@_quantity("erosion of the back", StepConditions)
-def back_erosion_px(bench: Bench, c: StepConditions) -> Reading:
-    """Width of pixels that look at the back and do not show it, shadow included."""
-    return mean_of(_widths(bench, c)["back_erosion"])
-
-
-def _seen_shares(bench: Bench, c: PlateauConditions) -> np.ndarray:
-    """Seen share of the height at the pixel nearest to each plateau's centre; NaN where most frames have no range.
-    Plateaus stand on a grid about the principal point, each at another place within its pixel."""
+@_quantity("seen share of a step", PlateauConditions)
+def seen_share(bench: Bench, c: PlateauConditions) -> Reading:
+    """Height seen in the middle of a round plateau by its true height."""
+    # plateaus on a grid about the principal point, each at another place within its pixel; the pixel nearest to the
+    # centre of each, where most frames have a range
     camera, focal_px = bench.camera, [bench.camera.nominal_lens.fx, bench.camera.nominal_lens.fy]
     v, u = np.mgrid[:COPIES, :COPIES]
     number, middle = (u + COPIES * v + 1)[..., None], (COPIES - 1) / 2
@@ -441,49 +428,12 @@ def _seen_shares(bench: Bench, c: PlateauConditions) -> np.ndarray:
     often = np.isfinite(z).mean(axis=0) > 0.5
     height = np.full(len(rays), np.nan)
     height[often] = back.z_along_m(stack.slopes)[at][often] - np.nanmean(z[:, often], axis=0)
-    return height / step_m
-
-
-@_quantity("seen share of a step", PlateauConditions)
-def seen_share(bench: Bench, c: PlateauConditions) -> Reading:
-    """Height seen in the middle of a round plateau by its true height."""
-    return mean_of(_seen_shares(bench, c))
-
-
-@_quantity("smallest surviving step", SurvivalConditions)
-def smallest_step_mm(bench: Bench, c: SurvivalConditions) -> Reading:
-    """Lowest step of a round plateau of which at least half is seen in its middle, in most of 16 places."""
-    below = 0.0
-    for step_mm in LADDER_MM:
-        shares = _seen_shares(bench, PlateauConditions(**c.to_data(), step_mm=step_mm))
-        if np.mean(np.nan_to_num(shares, nan=0.0) >= SURVIVES) > 0.5:
-            return Reading(step_mm, Interval(below, step_mm))
-        below = step_mm
-    return Reading(float("inf"), Interval(below, float("inf")))
+    return mean_of(height / step_m)
 
 
 @_quantity("bias of a board in a room", RoomConditions)
 def board_bias_mm(bench: Bench, c: RoomConditions) -> Reading:
     """Mean error of z over a board of 400 x 300 mm before a floor and a wall, without noise and traits of a unit."""
-    # the interval: two deviations of what the render's Monte Carlo leaves in a pixel, as if all pixels shared it
-    errors_mm, monte_carlo_mm = _room_errors_mm(bench, c)
-    if errors_mm.size == 0:
-        return NOTHING
-    left_mm = MONTE_CARLO_SIGMAS * float(np.sqrt((monte_carlo_mm**2).mean())) if c.multipath else 0.0
-    value = float(errors_mm.mean())
-    return Reading(value, Interval(value - left_mm, value + left_mm))
-
-
-@_quantity("bend of a board in a room", RoomConditions)
-def board_bend_mm(bench: Bench, c: RoomConditions) -> Reading:
-    """Deviation over the board's pixels of the same error; contains the rounding of the output."""
-    errors_mm, _ = _room_errors_mm(bench, c)
-    return Reading(float(errors_mm.std())) if errors_mm.size else NOTHING
-
-
-@lru_cache(maxsize=4)
-def _room_errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) errors of z at the valid pixels of the board's inside, and what the render leaves of noise there; in mm."""
     # the board's tilt lets rounding of the output meet every phase of its step
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
@@ -501,4 +451,10 @@ def _room_errors_mm(bench: Bench, c: RoomConditions) -> tuple[np.ndarray, np.nda
     rim = 2 * (2 * bench.camera.optics.margin_px + 1)
     board = ndimage.binary_erosion(view.surface == view.surface_names.index("board"), iterations=rim)
     inside = board[cut] & np.isfinite(stack.z_m[0])
-    return (stack.z_m[0] - stack.true_z_m)[inside] / MM, view.indirect_noise_m[cut][inside] / MM
+    if not inside.any():
+        return NOTHING
+    value = float((stack.z_m[0] - stack.true_z_m)[inside].mean()) / MM
+    # the interval: two deviations of what the render's Monte Carlo leaves in a pixel, as if all pixels shared it
+    left_m = float(np.sqrt((view.indirect_noise_m[cut][inside] ** 2).mean())) if c.multipath else 0.0
+    left_mm = MONTE_CARLO_SIGMAS * left_m / MM
+    return Reading(value, Interval(value - left_mm, value + left_mm))

@@ -7,6 +7,7 @@ parameter of the experiment, and none is chosen to make a claim come out.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -42,9 +43,6 @@ class Verdict:
     rule: str
 
 
-Rules = dict[str, Callable[[Any], Verdict]]
-
-
 @lru_cache
 def declared() -> dict[str, dict[str, str]]:
     """Claims and their criteria by name, as claims.yaml declares them."""
@@ -59,15 +57,6 @@ def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
     limits |= {"UNCHANGED": UNCHANGED, "FEWEST_RANKED": FEWEST_RANKED}
     limits |= {"FEWEST_UNITS": FEWEST_UNITS, "FEWEST_PAIRS": FEWEST_PAIRS}
     return Verdict(claim, said["says"], answer, evidence, said["criterion"].format_map(limits))
-
-
-def rule_of(rules: Rules, claim: str) -> Callable[[Callable[[Any], tuple[Answer, str]]], None]:
-    """Enter a function from a case to (answer, evidence) among ``rules``, as one from a case to a verdict."""
-
-    def enter(judge: Callable[[Any], tuple[Answer, str]]) -> None:
-        rules[claim] = lambda case: verdict_of(claim, *judge(case))
-
-    return enter
 
 
 def decide(parts: Iterable[bool | None]) -> Answer:
@@ -117,20 +106,6 @@ class Case:
         return self.summary[(self.summary["frames"] == MANY) & (self.summary["status"] == "found")]
 
 
-RULES: Rules = {}
-
-
-@rule_of(RULES, "C1")
-def _c1(case: Case) -> tuple[Answer, str]:
-    return _found(case, MANY, FOUND_WITH_MANY, frozenset())
-
-
-@rule_of(RULES, "C1b")
-def _c1b(case: Case) -> tuple[Answer, str]:
-    return _found(case, MANY, frozenset(), frozenset(THESIS_HOLES) - FOUND_WITH_MANY)
-
-
-@rule_of(RULES, "C2")
 def _c2(case: Case) -> tuple[Answer, str]:
     answer, evidence = _found(case, FEW, FOUND_WITH_FEW, frozenset(THESIS_HOLES) - FOUND_WITH_FEW)
     set_agrees = {"borne out": True, "not borne out": False, "undecided": None}[answer]
@@ -144,7 +119,6 @@ def _c2(case: Case) -> tuple[Answer, str]:
     return decide([set_agrees, is_above_zero(interval)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
 
 
-@rule_of(RULES, "C3")
 def _c3(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     if rows.empty:
@@ -177,7 +151,6 @@ def _between_units(case: Case, rows: pd.DataFrame) -> str:
     return f"Between {len(means)} units: {', '.join(f'hole {hole} {off[hole]:+.1f}' for hole in holes)}."
 
 
-@rule_of(RULES, "C4")
 def _c4(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[rows["extent_bias_mm"].notna()]
@@ -197,7 +170,6 @@ def _c4(case: Case) -> tuple[Answer, str]:
     return ("borne out" if p < 0.05 else "not borne out" if p_rises < 0.05 else "undecided"), evidence
 
 
-@rule_of(RULES, "C5")
 def _c5(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
@@ -218,7 +190,6 @@ def _c5(case: Case) -> tuple[Answer, str]:
     return decide([bool(agrees.all()), larger]), evidence
 
 
-@rule_of(RULES, "C6")
 def _c6(case: Case) -> tuple[Answer, str]:
     clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
     shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
@@ -245,7 +216,6 @@ def _c6(case: Case) -> tuple[Answer, str]:
     return answer, evidence
 
 
-@rule_of(RULES, "C9")
 def _c9(case: Case) -> tuple[Answer, str]:
     law = noise_law(case.probes, case.variant)
     if law is None:
@@ -260,6 +230,13 @@ def _c9(case: Case) -> tuple[Answer, str]:
         f"{law.pixels} pixels."
     )
     return decide([falls, stays]), evidence
+
+
+RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
+    "C1": lambda case: _found(case, MANY, FOUND_WITH_MANY, frozenset()),
+    "C1b": lambda case: _found(case, MANY, frozenset(), frozenset(THESIS_HOLES) - FOUND_WITH_MANY),
+    **{"C2": _c2, "C3": _c3, "C4": _c4, "C5": _c5, "C6": _c6, "C9": _c9},
+}
 
 
 def score_claims(
@@ -282,7 +259,7 @@ def score_claims(
         units=holes[holes["variant"].isin(units) & (holes["frames"] == MANY)],
         examples=[example for example in examples if example.variant == variant],
     )
-    return [rule(case) for rule in RULES.values()]
+    return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
@@ -314,17 +291,10 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
     top, bottom = (holes.pivot(index="repeat", columns="hole", values=c).to_numpy(float) for c in (first, second))
     both = np.isfinite(top) & np.isfinite(bottom)
 
-    def variance(values: np.ndarray) -> np.ndarray:
-        """(resamples, holes) of (resamples, n, holes), NaN left out; NaN below two values."""
-        there = np.isfinite(values)
-        count = there.sum(axis=1)
-        mean = np.where(there, values, 0).sum(axis=1) / count
-        squares = np.where(there, (values - mean[:, None]) ** 2, 0).sum(axis=1)
-        return np.where(count >= 2, squares / (count - 1), np.nan)
-
     def ratio(chosen: np.ndarray) -> np.ndarray:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratios = variance(np.where(both, top, np.nan)[chosen]) / variance(np.where(both, bottom, np.nan)[chosen])
+        with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings(action="ignore"):
+            over, under = (np.nanvar(np.where(both, of, np.nan)[chosen], axis=1, ddof=1) for of in (top, bottom))
+            ratios = over / under
         return np.nanmedian(np.where(np.isnan(ratios).all(axis=1, keepdims=True), np.inf, ratios), axis=1)
 
     return float(ratio(np.arange(len(top))[None])[0]), bootstrap(ratio, len(top))

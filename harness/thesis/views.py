@@ -6,7 +6,7 @@ C7 is judged over pairs of views, and C8 and C10, which have one pair, over unit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 from harness.evaluation import intervals, maps
 from harness.evaluation.summary import hole_list
 from harness.tables.text import many
-from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Rules, Verdict, decide, is_above_zero, rule_of
+from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Verdict, decide, is_above_zero, verdict_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,36 +28,8 @@ NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
 RESPECTS = ("holes", "size", "noise")
 OVER_UNITS = ("C8", "C10")
-VIEW_CLAIMS: Rules = {}
 
 
-def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
-    """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
-    verdicts: list[Verdict] = []
-    for claim, rule in VIEW_CLAIMS.items():
-        judged = [(case, rule(case)) for case in cases]
-        if len(cases) > 1:
-            judged = [(case, replace(one, evidence=f"{case.place}: {one.evidence}")) for case, one in judged]
-        if claim in OVER_UNITS:
-            places = dict.fromkeys(case.without_unit for case in cases)
-            verdicts += [_over_units([one for case, one in judged if case.without_unit == at]) for at in places]
-        else:
-            verdicts += [one for _, one in judged]
-    return verdicts
-
-
-def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
-    """One verdict from those on units of the camera: that of all of them where they agree and are enough."""
-    evidence = " ".join(one.evidence for one in verdicts)
-    answers = [one.verdict for one in verdicts]
-    if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
-        on = f"{many(len(verdicts), 'unit')} of the camera"
-        evidence = f"Judged on {on} only, which says nothing of others; there: {', '.join(answers)}. {evidence}"
-    agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
-    return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)
-
-
-@rule_of(VIEW_CLAIMS, "C7")
 def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     alone = case.single()
     if alone is None:
@@ -98,7 +70,6 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     return False if interval.above(noise_mm) else None
 
 
-@rule_of(VIEW_CLAIMS, "C8")
 def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     found = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if found is None:
@@ -115,7 +86,6 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     return decide([found.large.is_below, small, found.threshold.is_above]), " ".join(parts)
 
 
-@rule_of(VIEW_CLAIMS, "C10")
 def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
     chosen.sort(key=lambda one: (not one.is_variation, -one.views))
@@ -188,7 +158,6 @@ def _rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(errors**2)))
 
 
-@rule_of(VIEW_CLAIMS, "H1")
 def _h1(case: maps.MapCase) -> tuple[Answer, str]:
     duels = duels_of(case)
     if not duels:
@@ -256,3 +225,32 @@ def _found_text(case: maps.MapCase, mapped: maps.Map) -> str:
     low, high = _bounds(case, mapped)
     total = len(case.status(mapped))
     return f"{low} of {total}" if low == high else f"{low} to {high} of {total}"
+
+
+VIEW_CLAIMS: dict[str, Callable[[maps.MapCase], tuple[Answer, str]]] = {"C7": _c7, "C8": _c8, "C10": _c10, "H1": _h1}
+
+
+def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
+    """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
+    verdicts: list[Verdict] = []
+    for claim, rule in VIEW_CLAIMS.items():
+        judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
+        if len(cases) > 1:
+            judged = [(case, replace(one, evidence=f"{case.place}: {one.evidence}")) for case, one in judged]
+        if claim in OVER_UNITS:
+            places = dict.fromkeys(case.without_unit for case in cases)
+            verdicts += [_over_units([one for case, one in judged if case.without_unit == at]) for at in places]
+        else:
+            verdicts += [one for _, one in judged]
+    return verdicts
+
+
+def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
+    """One verdict from those on units of the camera: that of all of them where they agree and are enough."""
+    evidence = " ".join(one.evidence for one in verdicts)
+    answers = [one.verdict for one in verdicts]
+    if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
+        on = f"{many(len(verdicts), 'unit')} of the camera"
+        evidence = f"Judged on {on} only, which says nothing of others; there: {', '.join(answers)}. {evidence}"
+    agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
+    return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)

@@ -21,6 +21,18 @@ if TYPE_CHECKING:
 FIGURE = "azure_walls.svg"
 COLOURS = {"measured": INK, "simulated": ORANGE}
 WALL_COLOURS = (BLUE, ORANGE)
+WINDOW_PX = 5
+
+
+def white_before_m(pattern: FixedPattern) -> float:
+    """The part of a pattern that is white before the engine's window of 5, told by its triangle up to lag 5; below 0
+    where the estimate of its variance is."""
+    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest
+    k = np.arange(1.0, WINDOW_PX + 1)
+    rows = np.column_stack([k / WINDOW_PX, k**2, k**4])
+    falls = pattern.covariance_m2[0] - pattern.covariance_m2[1 : WINDOW_PX + 1]
+    white = float(np.linalg.lstsq(rows, falls, rcond=None)[0][0])
+    return float(np.sign(white) * np.sqrt(abs(white)))
 
 
 def _mm(value_m: float, digits: int = 2) -> str:
@@ -79,7 +91,7 @@ def _pattern_rows(check: WallCheck) -> list[list[str]]:
     kinds: list[tuple[str, Callable[[FixedPattern], float], float]] = [
         ("standard deviation / mm", lambda p: p.std_m, MM),
         ("correlation length / px", lambda p: p.length_px, 1.0),
-        ("white before the window / mm", lambda p: p.pixel_m, MM),
+        ("white before the window / mm", white_before_m, MM),
     ]
     rows = []
     for name, value, unit in kinds:
@@ -283,7 +295,7 @@ def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     real = _listed(f"{_mm(c.pattern.std_m)} mm" for c in checks)
     ours = _listed(f"{_mm(_simulated(c, lambda p: p.std_m))} mm" for c in checks)
     length = _listed(f"{c.pattern.length_px:.1f} px" for c in checks)
-    white = _listed(f"{_mm(c.pattern.pixel_m)} mm" for c in checks)
+    white = _listed(f"{_mm(white_before_m(c.pattern))} mm" for c in checks)
     planted = facts.pixel_mm.value / camera.engine.window_px.value
     return f"""## Fixed pattern
 
