@@ -82,16 +82,16 @@ def refusal(folder: Path, old: str, new: str) -> str:
 def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
     figures = read_figures()
     assert len({figure.name for figure in figures}) == len(figures)
-    blind = {figure.entry.camera for figure in figures if figure.entry.blind}
-    assert blind == {figure.entry.camera for figure in figures}
+    blind = {figure.camera for figure in figures if figure.use == "blind"}
+    assert blind == {figure.camera for figure in figures}
     # a variant whose edge filters alone differ has no figures of its own
     assert set(camera_names()) - blind == {"kinect_v2_libfreenect2"}
-    assert {figure.entry.camera for figure in figures if figure.entry.calibration} >= set(DRAWN)
+    assert {figure.camera for figure in figures if figure.calibration} >= set(DRAWN)
 
 
 def test_defaults_fill_what_an_entry_leaves_out(tmp_path):
     _, neighbours = read_figures(written(tmp_path))
-    assert neighbours.conditions.to_data() == {
+    assert neighbours.request[2].to_data() == {
         "distance_m": 1.5,
         "albedo": 0.8,
         "angle_deg": 0.0,
@@ -187,11 +187,11 @@ def test_verdicts(tmp_path):
 def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apart(tmp_path):
     path = written(tmp_path, GOOD.replace("calibration: true", "calibration: false\n    kind: code", 1))
     check, reality = read_figures(path)
-    assert check.entry.limits == pytest.approx((0.83, 0.95)) and not check.entry.blind
+    assert check.limits == pytest.approx((0.83, 0.95)) and check.use == "code"
     value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
     _, wide = read_figures(written(tmp_path, value))
-    assert wide.entry.limits == pytest.approx((0.3, 0.7)) and wide.entry.blind
-    assert reality.entry.limits == (0.5, float("inf")) and reality.entry.published.ratio(0.4) == pytest.approx(0.8)
+    assert wide.limits == pytest.approx((0.3, 0.7)) and wide.use == "blind"
+    assert reality.limits == (0.5, float("inf")) and reality.published.ratio(0.4) == pytest.approx(0.8)
     answer = program._answer(judged((check, reality), {"wall": Reading(0.9), "neighbours": Reading(0.4)}, {}), False)
     assert answer.startswith("0 of 1 blind figures are within 25 %;") and answer.endswith("checks of the code 1 of 1.")
 
@@ -260,7 +260,7 @@ def test_numbers_have_three_digits(value, text):
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_drawn_or_on_file():
     used = {point.quantity.name for point in program.curves_of([AZURE])}
-    used |= {figure.quantity.name for figure in read_figures()}
+    used |= {figure.quantity for figure in read_figures()}
     assert used == set(QUANTITIES)
     for name, quantity in QUANTITIES.items():
         assert not quantity.unit or name.endswith(f"_{quantity.unit}")
@@ -291,7 +291,7 @@ def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     figures = read_figures(written(tmp_path))
     panel = program.pictures()["noise"].panels[1]
     requests = [(AZURE, panel.quantity, point) for point in panel.points("")[1::5]]
-    requests += [(AZURE, figure.quantity.name, figure.conditions) for figure in figures]
+    requests += [figure.request for figure in figures]
     one = measured(requests, QUICK, tmp_path, jobs=1)
     two = measured(tuple(reversed(requests)), QUICK, tmp_path, jobs=2)
     assert set(one) == set(two) == set(requests)

@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -95,7 +96,7 @@ class Published(Config):
         return f"{bound:g}" if key == "value" else f"{key} {bound:g}"
 
 
-class FigureEntry(Config):
+class Figure(Config):
     """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it.
     ``kind``: a figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit."""
 
@@ -116,33 +117,29 @@ class FigureEntry(Config):
         return self.published.limits(NEAR if self.kind == "reality" else 0.0)
 
     @property
-    def blind(self) -> bool:
-        """True where the figure tests the model against real cameras and was not used for it."""
-        return self.kind == "reality" and not self.calibration
+    def use(self) -> Literal["blind", "calibration", "code"]:
+        """Blind: it tests the model against real cameras and was not used for it."""
+        return "code" if self.kind == "code" else "calibration" if self.calibration else "blind"
+
+    @cached_property
+    def measures(self) -> Quantity:
+        """The quantity of its name."""
+        return QUANTITIES[self.quantity]
+
+    @cached_property
+    def request(self) -> Request:
+        """What is to be measured, with all its conditions."""
+        return self.camera, self.quantity, self.measures.conditions.from_data(self.conditions)
+
+    def what(self) -> str:
+        """``temporal deviation, 1.5 m, albedo 0.8``."""
+        return f"{self.measures.title}, {in_words(self.request[2])}"
 
 
 class FiguresFile(Config):
     """The file: a list of figures."""
 
-    figures: Annotated[tuple[FigureEntry, ...], Field(min_length=1)]
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One published figure with its quantity and its complete conditions."""
-
-    entry: FigureEntry
-    quantity: Quantity
-    conditions: Config
-
-    @property
-    def name(self) -> str:
-        """The key of the figure in the baseline."""
-        return self.entry.name
-
-    def what(self) -> str:
-        """``temporal deviation, 1.5 m, albedo 0.8``."""
-        return f"{self.quantity.title}, {in_words(self.conditions)}"
+    figures: Annotated[tuple[Figure, ...], Field(min_length=1)]
 
 
 def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
@@ -165,11 +162,7 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
     file, found = validated(FiguresFile, source, splices)
     if problems or file is None:
         raise DeclarationError(str(path), [*problems, *found])
-    return tuple(
-        Figure(entry, quantity, quantity.conditions.from_data(entry.conditions))
-        for entry in file.figures
-        for quantity in [QUANTITIES[entry.quantity]]
-    )
+    return file.figures
 
 
 @dataclass(frozen=True)
@@ -183,7 +176,7 @@ class Score:
     @property
     def passes(self) -> bool:
         """True where the simulated value lies within the entry's limits; False without a value."""
-        low, high = self.figure.entry.limits
+        low, high = self.figure.limits
         return bool(np.isfinite(self.simulated.value) and low <= self.simulated.value <= high)
 
     @property
@@ -334,53 +327,52 @@ def _tone(score: Score) -> Tone:
     return "good" if score.passes else "bad"
 
 
-def _ratio(score: Score) -> float:
-    return score.figure.entry.published.ratio(score.simulated.value)
-
-
-def _use(score: Score) -> str:
-    entry = score.figure.entry
-    return "code" if entry.kind == "code" else "calibration" if entry.calibration else "blind"
-
-
-def _first_hand(score: Score) -> str:
-    return "yes" if score.figure.entry.tag in "RW" else "no"
-
-
 SIMULATED = _reading("simulated", "low", "high", "simulated value", "simulated")
 VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
-ENTRY, PUBLISHED = "figure.entry", "figure.entry.published"
 SCORES = Table(
     "scorecard",
     "one row per published figure",
     (
         Column("name", "", "figure.name", "name in the file of figures"),
-        Column("camera", "camera", f"{ENTRY}.camera", "simulated camera"),
+        Column("camera", "camera", "figure.camera", "simulated camera"),
         Column("figure", "figure", lambda score: score.figure.what(), "quantity and conditions in words"),
-        Column("quantity", "", f"{ENTRY}.quantity", "quantity that is measured"),
-        Column("unit", "", "figure.quantity.unit", "unit of all values"),
-        Column("conditions", "", lambda score: _conditions(score.figure.conditions), "conditions", spread=True),
+        Column("quantity", "", "figure.quantity", "quantity that is measured"),
+        Column("unit", "", "figure.measures.unit", "unit of all values"),
+        Column("conditions", "", lambda score: _conditions(score.figure.request[2]), "conditions", spread=True),
         *SIMULATED,
-        Column("published", "published", lambda score: score.figure.entry.published.in_words(), "published value"),
+        Column("published", "published", lambda score: score.figure.published.in_words(), "published value"),
         Column(
             "tolerance",
             "tolerance",
-            f"{PUBLISHED}.tolerance",
+            "figure.published.tolerance",
             "how far beyond it the simulated value may lie",
             lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
         ),
-        Column("", "unit", lambda score: score.figure.quantity.unit or "–"),
-        Column("ratio", "ratio", _ratio, "simulated by published, or by the nearer bound", number),
-        Column("passes_from", "", lambda score: score.figure.entry.limits[0], "lowest value that passes"),
-        Column("passes_to", "", lambda score: score.figure.entry.limits[1], "highest value that passes"),
+        Column("", "unit", lambda score: score.figure.measures.unit or "–"),
+        Column(
+            "ratio",
+            "ratio",
+            lambda score: score.figure.published.ratio(score.simulated.value),
+            "simulated by published, or by the nearer bound",
+            number,
+        ),
+        Column("passes_from", "", lambda score: score.figure.limits[0], "lowest value that passes"),
+        Column("passes_to", "", lambda score: score.figure.limits[1], "highest value that passes"),
         Column("verdict", "verdict", "verdict", "whether the simulated value passes", tone=_tone),
         Column("passed_before", "", "passed_before", "whether it passed in the baseline; empty where that lacks it"),
-        Column("use", "use", _use, "blind, calibration (the camera's file was, or may be, fitted to it) or code"),
-        Column("tag", "", f"{ENTRY}.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
-        Column("first_hand", "first hand", _first_hand, "whether the source itself was read, or the capture measured"),
-        Column("source", "", f"{ENTRY}.source", "source of the published value"),
-        Column("", "source", lambda score: f"[{score.figure.entry.tag}] {score.figure.entry.source}"),
-        Column("note", "note", f"{ENTRY}.note", "what was assumed", brief=False),
+        Column(
+            "use", "use", "figure.use", "blind, calibration (the camera's file was, or may be, fitted to it) or code"
+        ),
+        Column("tag", "", "figure.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
+        Column(
+            "first_hand",
+            "first hand",
+            lambda score: "yes" if score.figure.tag in "RW" else "no",
+            "whether the source itself was read, or the capture measured",
+        ),
+        Column("source", "", "figure.source", "source of the published value"),
+        Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
+        Column("note", "note", "figure.note", "what was assumed", brief=False),
         VERSION,
     ),
     left=20,

@@ -135,13 +135,13 @@ def _draw_panel(
 
 def _draw_published(axis: Any, panel: Panel, score: scoring.Score, styles: Mapping[str, Any]) -> None:
     """Mark a published value hollow if it is of the panel's quantity, under the conditions of one of its lines."""
-    entry, conditions = score.figure.entry, score.figure.conditions
-    if entry.quantity != panel.quantity or entry.published.value is None or entry.camera not in styles:
+    camera, quantity, conditions = score.figure.request
+    if quantity != panel.quantity or score.figure.published.value is None or camera not in styles:
         return
     x = getattr(conditions, panel.key)
     if any(type(conditions).from_data({**fixed, panel.key: x}) == conditions for fixed in panel.lines.values()):
         hollow = {"markersize": 11, "markerfacecolor": "none", "linestyle": "none", "markeredgewidth": 1.6}
-        axis.plot(x, entry.published.value, **{**styles[entry.camera], **hollow})
+        axis.plot(x, score.figure.published.value, **{**styles[camera], **hollow})
 
 
 def run_scorecard(options: argparse.Namespace, command: str) -> int:
@@ -152,16 +152,16 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     # figures of one's own are no figures of the committed baseline
     baseline_file = options.baseline or (None if options.figures else scoring.BASELINE_FILE)
     every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
-    published = dict.fromkeys(figure.entry.camera for figure in every)
+    published = dict.fromkeys(figure.camera for figure in every)
     titles = {name: load_camera(name).title for name in (dict.fromkeys(options.camera) or published)}
-    figures = tuple(figure for figure in every if figure.entry.camera in titles)
+    figures = tuple(figure for figure in every if figure.camera in titles)
     drawn = {name: title for name, title in titles.items() if options.camera or name in scoring.DRAWN}
     baseline = scoring.read_baseline(baseline_file) if baseline_file else {}
     points = curves_of(drawn)
-    wanted = [(each.entry.camera, each.quantity.name, each.conditions) for each in figures]
+    wanted = [figure.request for figure in figures]
     wanted += [(point.camera, point.quantity.name, point.conditions) for point in points]
     found = scoring.measured(dict.fromkeys(wanted), FULL, options.out / ".cache" / "renders", options.jobs)
-    simulated = {each.name: found[request] for each, request in zip(figures, wanted, strict=False)}
+    simulated = {figure.name: found[figure.request] for figure in figures}
     scores = scoring.judged(figures, simulated, baseline)
     curves = [
         replace(point, simulated=found[request]) for point, request in zip(points, wanted[len(figures) :], strict=True)
@@ -175,12 +175,12 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         "seconds": round(time.perf_counter() - began, 1),
     }
     answer = _answer(scores)
-    real = [score for score in scores if score.figure.entry.kind == "reality"]
-    code = [score for score in scores if score.figure.entry.kind == "code"]
+    real = [score for score in scores if score.figure.kind == "reality"]
+    code = [score for score in scores if score.figure.kind == "code"]
     groups = [
         (title, scoring.SCORES.grid(own, heads={"camera": ""}).html() if own else "")
         for camera, title in titles.items()
-        for own in [[score for score in real if score.figure.entry.camera == camera]]
+        for own in [[score for score in real if score.figure.camera == camera]]
     ]
     images = all_figures(drawn, found, scores)
     page = template("scorecard.html", Path(__file__).parent).render(
@@ -218,7 +218,7 @@ def _said_what_fell_behind(scores: Sequence[scoring.Score], baseline: Mapping[st
         print(f"passed in the baseline and is no longer among the figures: {name}", file=sys.stderr)
     fallen = [score for score in scores if score.regressed]
     for score in fallen:
-        low, high = score.figure.entry.limits
+        low, high = score.figure.limits
         told = f"{score.figure.what()}): simulated {score.simulated.value:.4g}, passes from {low:g} to {high:g}"
         print(f"passed in the baseline and fails now: {score.figure.name} ({told}", file=sys.stderr)
     return 1 if fallen or gone else 0
@@ -234,15 +234,15 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     def share(chosen: Sequence[scoring.Score]) -> str:
         return f"{sum(score.passes for score in chosen)} of {len(chosen)}"
 
-    blind = [score for score in scores if score.figure.entry.blind]
-    fitted = [score for score in scores if score.figure.entry.kind == "reality" and not score.figure.entry.blind]
+    by_use = {use: [score for score in scores if score.figure.use == use] for use in ("blind", "calibration", "code")}
+    blind = by_use["blind"]
     families: dict[str, list[scoring.Score]] = {}
     for score in blind:
-        first = score.figure.entry.camera.partition("_")[0]
+        first = score.figure.camera.partition("_")[0]
         families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
     each = ", ".join(f"{name} {share(own)}" for name, own in families.items())
     text = f"{share(blind)} blind figures are within 25 %{f' ({each})' if len(families) > 1 else ''}; "
-    text += f"of figures that calibrated a camera {share(fitted)}; "
-    text += f"of checks of the code {share([score for score in scores if score.figure.entry.kind == 'code'])}."
+    text += f"of figures that calibrated a camera {share(by_use['calibration'])}; "
+    text += f"of checks of the code {share(by_use['code'])}."
     regressed = [score.figure.name for score in scores if score.regressed]
     return text + (f" Passed before and fail now: {', '.join(regressed)}." if regressed else "")
