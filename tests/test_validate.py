@@ -192,7 +192,7 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
     _, wide = read_figures(written(tmp_path, value))
     assert wide.limits == pytest.approx((0.3, 0.7)) and wide.use == "blind"
     assert reality.limits == (0.5, float("inf")) and reality.published.ratio(0.4) == pytest.approx(0.8)
-    answer = program._answer(judged((check, reality), {"wall": Reading(0.9), "neighbours": Reading(0.4)}, {}), False)
+    answer = program._answer(judged((check, reality), {"wall": Reading(0.9), "neighbours": Reading(0.4)}, {}))
     assert answer.startswith("0 of 1 blind figures are within 25 %;") and answer.endswith("checks of the code 1 of 1.")
 
 

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from harness.report import blocks, sections
 from harness.tables.trials import POSTERIOR
-from harness.thesis.inference import SET_UP, borne_out_if
+from harness.thesis.inference import SET_UP
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +18,7 @@ SHOWN = 10
 
 
 def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
-    """Heading, sentence, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
+    """Heading, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
     axes = posterior[posterior["axis"] != SET_UP]
     names = list(dict.fromkeys(axes["axis"]))
 
@@ -28,7 +28,9 @@ def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
             rows = axes[axes["axis"] == name]
             panel.bar(rows["value"], rows["posterior_share"], color=blocks.BLUE, label="posterior")
             panel.step(rows["value"], rows["prior_share"], where="mid", color=blocks.GREY, label="prior")
-            panel.set(title=name, ylim=(0, 1))
+            panel.set_title(name, fontsize=8)
+            panel.tick_params(axis="x", labelsize=8)
+            panel.set(ylim=(0, 1))
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         panels[0].legend()
@@ -37,7 +39,6 @@ def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
     best = posterior[posterior["axis"] == SET_UP].head(SHOWN)
     return [
         blocks.heading("What would make the thesis true"),
-        blocks.paragraph(borne_out_if(posterior)),
         blocks.figure(figures, "posterior", "Share of the posterior (bars) and of the prior (line) of each fact."),
         POSTERIOR.grid(sections.records(best)).html(),
     ]

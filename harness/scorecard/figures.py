@@ -128,7 +128,7 @@ class Figure(Config):
 
     @cached_property
     def request(self) -> Request:
-        """What is to be measured, with all its conditions."""
+        """Camera, quantity and complete conditions of what is to be measured."""
         return self.camera, self.quantity, self.measures.conditions.from_data(self.conditions)
 
     def what(self) -> str:

@@ -43,7 +43,7 @@ class Panel(Config):
     key: str
     label: str
     values: tuple[int | float, ...]
-    lines: dict[str, dict[str, Any]] = Field(default_factory=lambda: {"": {}})
+    lines: dict[str, dict[str, Any]] = Field(default_factory=lambda: dict[str, dict[str, Any]]({"": {}}))
     scales: tuple[str, str] = ("linear", "linear")
 
     def points(self, line: str) -> list[Config]:

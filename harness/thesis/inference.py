@@ -74,7 +74,7 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
     asked = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
         kept = rows["value"][~doubted[rows.index]]
-        without = any(name.endswith(_of_kind(kind)) for kind in posterior["value"][doubted])
+        without = any(str(name).endswith(_of_kind(kind)) for kind in posterior["value"][doubted])
         asked += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
     said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
     return (
