@@ -5,9 +5,10 @@ The truth stays on this side: a detector is handed clouds only.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -173,9 +174,25 @@ def at_hand(path: str) -> Path:
     return sent_views / place.name if sent_views is not None and not place.exists() else place
 
 
-@lru_cache(maxsize=32)
+KEPT, KEPT_BYTES = 32, 200_000_000
+"""Most set-ups that a worker keeps, and most light of their views: three views from near of a lidar, whose light has 31
+frequencies."""
+_kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
+
+
 def load_set_up(ref: SetUpRef) -> SetUp:
-    """Return the set-up behind a reference, kept for the worker's next trials."""
+    """Return the set-up behind a reference, kept for the worker's next trials within ``KEPT`` and ``KEPT_BYTES``."""
+    if ref not in _kept:
+        _kept[ref] = _read_set_up(ref)
+    _kept.move_to_end(ref)
+    while len(_kept) > KEPT or (
+        len(_kept) > 1 and sum(kept.unit.view.phasor.nbytes for kept in _kept.values()) > KEPT_BYTES
+    ):
+        _kept.popitem(last=False)
+    return _kept[ref]
+
+
+def _read_set_up(ref: SetUpRef) -> SetUp:
     place, T_camera_board = at_hand(ref.view_path), ref.target.pose.T_camera_board
     view = read_view(place)
     if view is None:
