@@ -229,18 +229,18 @@ whole millimetres, everything but two plaster walls masked out) against the came
 
 ![{_ALT}]({FIGURE})
 
-Each wall's plane is fitted robustly (exactly linear in 1/z over the rays' slopes), rendered in closed form and put
-through the simulated chain, as many frames as were recorded. One analysis is applied to both. Nothing is fitted to make
-them agree. The set has no intrinsics: the lens is the camera file's nominal one with its centre at ({lens.cx:.0f},
+Each wall's plane is fitted robustly (it is exactly linear in 1/z over the rays' slopes), rendered in closed form and
+passed through the simulated camera for as many frames as were recorded. The same analysis is applied to both. Nothing
+is fitted to make them agree. The set has no intrinsics: the lens is the camera file's nominal one with its centre at ({lens.cx:.0f},
 {lens.cy:.0f}). The walls' albedo at 850 nm is not known: both have {albedo}, the albedo of the calibration point.
 Pixels within 3 px of a wall's edge are left out, as their filter window holds other light. "Lit cone" means pixels
 within 32.5 degrees of the axis, half the specification's smaller angle of view; beyond it the real light falls off to
 the edge of its field, and the closed-form plane has no such fall-off. The illuminated polygon of the camera file is
 opened for this check, so that every measured pixel has a simulated one.
 
-    python tests/validation/azure_walls.py FOLDER
+To repeat the comparison:
 
-repeats it."""
+    python tests/validation/azure_walls.py FOLDER"""
 
 
 _ALT = "Six panels: temporal deviation against range and angle, correlation and fixed pattern of both walls"
@@ -330,7 +330,8 @@ def _why(checks: Sequence[WallCheck]) -> str:
 - **Correlation beyond the window.** Simulated noise within a frame is uncorrelated at 5 px, the real one is not
   quite: beside the frames' common jitter, which is modelled, something varies smoothly within a frame, which is not.
 - **Fixed pattern: measured by simulated {times}.** The camera file's two sizes were set from these very frames, so
-  this agreement is no test. The measured one contains the plaster's own relief and texture and
+  this agreement is no test. The white part was set from patches of 3 to 15 pixels, which ask for less
+  than this analysis finds. The measured one contains the plaster's own relief and texture and
   light between walls and ceiling, so it is an upper bound of the camera's. Its covariance falls faster than a Gaussian
   at the first lags, has a longer tail and differs between x and y; the model is one isotropic Gaussian and white noise.
 - **One unit, one pair of walls, {len(checks[0].wall.z_m)} frames.** The spread between units is not known."""
