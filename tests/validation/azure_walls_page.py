@@ -233,10 +233,10 @@ Each wall's plane is fitted robustly (it is exactly linear in 1/z over the rays'
 passed through the simulated camera for as many frames as were recorded. The same analysis is applied to both. Nothing
 is fitted to make them agree. The set has no intrinsics: the lens is the camera file's nominal one with its centre at
 ({lens.cx:.0f}, {lens.cy:.0f}). The walls' albedo at 850 nm is not known: both have {albedo}, the albedo of the
-calibration point. Pixels within 3 px of a wall's edge are left out, as their filter window holds other light. "Lit cone" means pixels
-within 32.5 degrees of the axis, half the specification's smaller angle of view; beyond it the real light falls off to
-the edge of its field, and the closed-form plane has no such fall-off. The illuminated polygon of the camera file is
-opened for this check, so that every measured pixel has a simulated one.
+calibration point. Pixels within 3 px of a wall's edge are left out, as their filter window holds other light. "Lit
+cone" means pixels within 32.5 degrees of the axis, half the specification's smaller angle of view; beyond it the real
+light falls off to the edge of its field, and the closed-form plane has no such fall-off. The illuminated polygon of
+the camera file is opened for this check, so that every measured pixel has a simulated one.
 
 To repeat the comparison:
 
