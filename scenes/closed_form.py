@@ -8,14 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import Lens, Region
-from scenes.optics import Beams, NoiseFreeView, Optics, Quadrilaterals, wave_numbers
+from harness.vocabulary.geometry import Region
+from scenes.optics import NoiseFreeView, Optics, footprint_of, wave_numbers
 from scenes.sensor.camera import AnyCamera
 
-COARSE, FINE = 4, 12
-"""Sub-rays along each side of a footprint; fine where it or a neighbour's meets an edge or a shadow's edge."""
-BEAM_REACH_FWHM = 1.25
-"""Half width of a beam's grid of sub-rays: 2.9 deviations, beyond which lies 1.3 % of a round Gaussian's light."""
 WHITE = 0.8
 """The colour albedo of closed-form surfaces; no sensor uses it."""
 
@@ -75,6 +71,7 @@ def layered_view(
     the emitter passes the front. Surfaces: "front", "back". Left out: the front's thickness and its edge's own face,
     light between the planes, the emitter's cone."""
     lens, optics, waves = camera.nominal_lens, camera.optics, wave_numbers(camera.optics.frequencies_hz)
+    footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
 
     def meet(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return for rays (..., 2): whether they meet the front, where they end (..., 3), the light there, its path in
@@ -96,36 +93,20 @@ def layered_view(
 
     phasor, (intensity, share) = np.zeros((len(waves), *region.shape), complex), np.zeros((2, *region.shape))
     pixels = np.ones(region.shape, bool)
-    for side in (COARSE, FINE):
-        rays, weights = sub_rays(optics, lens, region, pixels, side)
-        on_front, _, light, path_m, shadowed = meet(rays)
+    for sub_rays in (footprint.coarse, footprint.fine):  # fine where a footprint or a neighbour's meets an edge
+        on_front, _, light, path_m, shadowed = meet(sub_rays(*np.nonzero(pixels)))
         for line, wave in enumerate(waves):
-            phasor[line, pixels] = (weights * light * np.exp(1j * wave * path_m)).sum(axis=-1)
-        intensity[pixels], share[pixels] = (weights * light).sum(axis=-1), (weights * on_front).sum(axis=-1)
+            phasor[line, pixels] = (light * np.exp(1j * wave * path_m)).mean(axis=-1)
+        intensity[pixels], share[pixels] = light.mean(axis=-1), on_front.mean(axis=-1)
         state, mixed = on_front + 2 * shadowed, np.zeros(region.shape, bool)
         mixed[pixels] = state.min(axis=-1) != state.max(axis=-1)
-        pixels = ndimage.binary_dilation(mixed, np.ones((3, 3), bool))
+        pixels = ndimage.binary_dilation(mixed, np.ones((3, 3), bool), footprint.reach_px or 1)
         if not pixels.any():
             break
     slopes = lens.region_slopes(region)
     on_front, points, *_ = meet(slopes)
     surface, coverage = np.where(on_front, 0, 1), np.where(on_front, share, 1 - share)
     return _view(optics, region, slopes, phasor, intensity, points, surface, ("front", "back"), coverage)
-
-
-def sub_rays(
-    optics: Optics, lens: Lens, region: Region, pixels: np.ndarray, side: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of side x side rays over the footprints of the chosen ``pixels`` (h, w) bool: slopes
-    (n, side^2, 2), and the share of the footprint's light (side^2,) that each stands for."""
-    rows, cols = np.nonzero(pixels)
-    if optics.beam_fwhm_rad is None:
-        return Quadrilaterals(lens, region).strata(rows, cols, side), np.full(side**2, 1 / side**2)
-    place, fwhm_rad = ((np.arange(side) + 0.5) / side * 2 - 1) * BEAM_REACH_FWHM, optics.beam_fwhm_rad
-    down, across = (each.ravel() for each in np.meshgrid(place, place, indexing="ij"))
-    weight = np.exp(-4 * np.log(2) * (down**2 + across**2))
-    rays = Beams(lens, region, fwhm_rad).turned(rows, cols, fwhm_rad * np.column_stack([across, down]))
-    return rays, np.asarray(weight / weight.sum())
 
 
 def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -37,9 +37,9 @@ class Optics:
     full_half_angle_deg: float
     cutoff_half_angle_deg: float
     frequencies_hz: tuple[float, ...]
-    beam_fwhm_rad: float | None
     wavelength_nm: float
     margin_px: int
+    beam_fwhm_rad: float | None = None
     nearest_m: float = 0.0
     farthest_m: float = float("inf")
     limits_along: Literal["ray", "axis"] = "ray"
@@ -76,17 +76,22 @@ def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Qua
     return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
 
 
+def corners_of(lens: Lens, region: Region) -> np.ndarray:
+    """Return the slopes (h + 1, w + 1, 2) of the corners of a region's pixels."""
+    v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
+    return lens.slopes(u, v)
+
+
 class Quadrilaterals:
     """An imager's pixels: the area between a pixel's corners, evenly weighted. Fine sub-rays lie on a golden lattice:
     an edge along the rows or columns moves past them one by one and not sixteen at a time. Inside a pixel the lens is
     linear to 1e-7 in slope (0.1 um at 1 m), so slopes are interpolated between its corners."""
 
-    reach_px = 1
+    reach_px = 0
     """Pixels around an edge that have a part of it in their footprint, besides the edge's own."""
 
     def __init__(self, lens: Lens, region: Region) -> None:
-        v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
-        self._corner = lens.slopes(u, v)
+        self.corner = corners_of(lens, region)
 
     def coarse(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return slopes (n, COARSE^2, 2) of pixels, a grid by rows."""
@@ -105,7 +110,7 @@ class Quadrilaterals:
 
     def _placed(self, rows: np.ndarray, cols: np.ndarray, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights."""
-        fx, fy, corner = fx[None, :, None], fy[None, :, None], self._corner
+        fx, fy, corner = fx[None, :, None], fy[None, :, None], self.corner
         c00, c01 = corner[rows, cols][:, None], corner[rows, cols + 1][:, None]
         c10, c11 = corner[rows + 1, cols][:, None], corner[rows + 1, cols + 1][:, None]
         return np.asarray((1 - fy) * ((1 - fx) * c00 + fx * c01) + fy * ((1 - fx) * c10 + fx * c11))
@@ -119,6 +124,7 @@ class Beams:
 
     def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
         self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
+        self.corner = corners_of(lens, region)
         # Away from the axis an angle spans more slope, and so more pixels, by 1 + slope^2.
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
         self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
@@ -184,10 +190,10 @@ class RenderConfig(Config):
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
     face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")
-    face_samples: int = Field(131072, ge=8, description="paths for each node on the face")
+    face_samples: int = Field(32768, ge=8, description="paths for each node on the face")
     hole_noise_mm: float = Field(
         0.1, gt=0, description="aimed at in pixels inside the board's outline but off its face, as a deviation of range"
     )
     hole_samples: int = Field(8192, ge=8, description="paths for each of those pixels at most")
-    rest_samples: int = Field(32, ge=8, description="paths for each pixel around the board")
+    rest_samples: int = Field(16, ge=8, description="paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

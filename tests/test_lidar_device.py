@@ -260,7 +260,7 @@ def test_the_closed_form_hole_is_the_one_of_a_sampled_view():
         ({"code.integration_ns": 200.0}, "at most three times scan.point_ns"),
         ({"code.band_floor": 1.0}, "code.band_floor must be above 0 and below 1"),
         ({"code.period_ns": 2.0}, "code.period_ns must be longer"),
-        ({"receiver.cutoff_half_angle_deg": 30.0}, "must be above receiver.full_half_angle_deg"),
+        ({"receiver.cutoff_half_angle_deg": 30.0}, "cutoff_half_angle_deg must be above full_half_angle_deg"),
         ({"engine.min_range_mm": 2e4}, "engine.min_range_mm must lie within"),
         ({"beam.fwhm_mrad": 0.0}, "must be above 0"),
         ({"beam.fwhm_mrad": 300.0}, "at most 20 milliradians"),

@@ -236,10 +236,10 @@ def test_emitter_beside_the_lens_is_corrected_for():
 
 
 def test_fixed_pattern_has_the_size_and_length_of_its_facts():
-    config = CameraConfig(unit_seed=4)
+    config = CameraConfig(unit_seed=4, effects=NO_EFFECTS.model_copy(update={"fixed_pattern": True}))
     lens = CAMERA.nominal_lens
     imager = AmcwImager(CAMERA, config, lens.whole, lens.region_slopes(lens.whole))
-    pattern = imager.fixed_pattern_m
+    pattern = imager.static_error_m
     smooth, pixel = CAMERA.fixed_pattern.smooth_mm.value, CAMERA.fixed_pattern.pixel_mm.value
     assert pattern.std() * 1e3 == pytest.approx(np.hypot(smooth, pixel), rel=0.05)
     for lag in (3, 6, 12):

@@ -25,8 +25,7 @@ from harness.scorecard.bench import (
 )
 from harness.scorecard.quantities import QUANTITIES, PlateauConditions
 from harness.vocabulary.geometry import Region
-from scenes.closed_form import BEAM_REACH_FWHM, Plane, layered_view, plane_view, sub_rays
-from scenes.optics import Optics
+from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import CameraConfig, camera_of
 
 AZURE = "azure_kinect_nfov"
@@ -228,20 +227,6 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
         dark = np.where(view.surface == 1, 1 - view.intensity / lit, 0)
         assert dark.sum(axis=1) == pytest.approx(wanted, abs=1 / 12)
     assert x_end / 0.95 * lens.fx > 2.4
-
-
-def test_a_beam_is_a_round_gaussian_of_its_width():
-    """Second moment fwhm / 2.355 within 2 % of the truncated grid; weights sum to 1; the centre is the pixel's ray."""
-    fwhm = 2e-3
-    optics = Optics("beam", PINHOLE.nominal_lens, np.zeros(3), 38, 42, (1e8,), fwhm, 860.0, 0)
-    rays, weights = sub_rays(optics, PINHOLE.nominal_lens, REGION, np.ones(REGION.shape, bool), 24)
-    off = rays.reshape(*REGION.shape, -1, 2) - PINHOLE.nominal_lens.region_slopes(REGION)[..., None, :]
-    assert weights.sum() == pytest.approx(1)
-    row, column = 15, 320 - REGION.col0
-    spread = np.sqrt((weights[:, None] * off[row, column] ** 2).sum(axis=0))
-    assert spread == pytest.approx(fwhm / np.sqrt(8 * np.log(2)), rel=0.03)
-    assert np.abs((weights[:, None] * off[row, column]).sum(axis=0)).max() < 1e-7
-    assert np.abs(off[row, column]).max() < 1.01 * BEAM_REACH_FWHM * fwhm
 
 
 # ---- the bench -------------------------------------------------------------------------------------------------------

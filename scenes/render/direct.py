@@ -17,8 +17,9 @@ FINEST = 2048
 """Sub-rays where that still leaves an error in a hole: a dark wall beside a strip of what lies behind."""
 RAYS_AT_ONCE = 1 << 22
 """Sub-rays cast at once: 4 million take 0.6 GB."""
-KINK_M = 2e-5
-"""Sub-rays of one pixel that leave a plane by more have met an edge, such as that of a strip of tape."""
+KINK_M, BENT_M = 2e-5, 2e-6
+"""Where a pixel's corners leave the plane at its centre by more than the first it has an edge in it, such as that of a
+strip of tape; up to the second its light follows from that plane, without casting sub-rays."""
 UNSURE_M = 1e-4
 """Pixels whose direct light may be wrong by more are divided once more."""
 UNEVEN = 0.2
@@ -43,7 +44,7 @@ def phasor_sums(amplitude: np.ndarray, path_m: np.ndarray, frequencies_hz: tuple
     comb is summed by multiplying with the phasor of its spacing: rounding grows to 1e-14 over 100 lines."""
     waves = wave_numbers(frequencies_hz)
     out = np.empty((len(waves), len(path_m)), np.complex128)
-    amplitude, path_m = np.ascontiguousarray(amplitude, float), np.ascontiguousarray(path_m, float)
+    amplitude, path_m = np.ascontiguousarray(amplitude), np.ascontiguousarray(path_m)
     step = comb_step(frequencies_hz)
     if step is None:
         _sum_list(amplitude, path_m, waves, out)
@@ -87,8 +88,9 @@ def _sum_comb(amplitude: np.ndarray, path_m: np.ndarray, first: float, step: flo
 
 @dataclass(frozen=True)
 class Hits:
-    """Hits of n rays from the lens: true range (NaN where a ray met nothing), path out and back, amplitude of direct
-    light, albedo, surface (-1 for nothing), texture place (n, 2), and whether it is the board's undamaged face."""
+    """Hits of n rays from the lens, float32: range (NaN where a ray met nothing), path out and back, amplitude of
+    direct light, albedo, surface (-1 for nothing), texture place (n, 2), whether it is the board's undamaged face, and
+    the unit normal (n, 3)."""
 
     range_m: np.ndarray
     path_m: np.ndarray
@@ -97,6 +99,7 @@ class Hits:
     surface: np.ndarray
     uv: np.ndarray
     on_face: np.ndarray
+    normal: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -140,25 +143,76 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     import drjit as dr
 
     mi = lit.mi
-    direction = mi.Vector3f(mi.Float(slopes[:, 0].astype(np.float32)), mi.Float(slopes[:, 1].astype(np.float32)), 1.0)
-    hit = lit.scene.ray_intersect(mi.Ray3f(mi.Point3f(0.0), direction / dr.norm(direction)))
-    valid = hit.is_valid()
-    arriving, leg = lit.arriving(hit, valid)
-    albedo = dr.select(valid, hit.bsdf().eval_diffuse_reflectance(hit, valid)[0], 0)
-    surface, amplitude = lit.surface_index(hit), albedo * arriving
-    on_face = valid & lit.on_face(hit, valid)
-    dr.eval(hit.t, leg, amplitude, albedo, surface, valid, hit.uv, on_face)
-    ok = valid.numpy()
-    range_m = np.where(ok, hit.t.numpy().astype(float), np.nan)
+    x, y = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in slopes.T)
+    met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
+    arriving, leg = lit.arriving(met, met.valid)
+    albedo, uv = lit.albedo(met), lit.uv(met.place)
+    range_m = dr.select(met.valid, met.distance, dr.nan)
+    path_m, amplitude = dr.select(met.valid, met.distance + leg, 0), albedo * arriving
+    surface = dr.select(met.valid, mi.Int32(met.surface), -1)
+    on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
+    dr.eval(range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal)
     return Hits(
-        range_m=range_m,
-        path_m=np.where(ok, range_m + leg.numpy(), 0.0),
-        amplitude=amplitude.numpy().astype(float),
-        albedo=albedo.numpy().astype(float),
-        surface=np.where(ok, surface.numpy().astype(np.int64), -1).astype(np.int16),
-        uv=hit.uv.numpy().T,
+        range_m=range_m.numpy(),
+        path_m=path_m.numpy(),
+        amplitude=amplitude.numpy(),
+        albedo=albedo.numpy(),
+        surface=surface.numpy().astype(np.int16),
+        uv=uv.numpy().T,
         on_face=on_face.numpy(),
+        normal=met.normal.numpy().T,
     )
+
+
+@numba.njit(**FAST)
+def _even_moments(  # type: ignore[no-untyped-def]
+    slopes, centre, normal, emitter, albedo, texture, uv_of, to_light, to_face
+):
+    """Sum a pixel's light over sub-rays that meet the plane of its centre: ``slopes`` (n, m, 2); ``centre`` and
+    ``normal`` (n, 3). Writes moments (4, n) of order 0 to 3: of amplitude (1 at the centre, times the albedo) about the
+    centre's path, and of the albedo about its range. ``albedo`` (n,), negative where ``texture`` gives it."""
+    rows, columns = texture.shape
+    n, m, _ = slopes.shape
+    for i in range(n):
+        x0, y0, z0 = centre[i]
+        nx, ny, nz = normal[i]
+        height = nx * x0 + ny * y0 + nz * z0
+        ex, ey, ez = emitter[0] - x0, emitter[1] - y0, emitter[2] - z0
+        leg0 = np.sqrt(ex * ex + ey * ey + ez * ez)
+        range0 = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
+        facing0 = (nx * ex + ny * ey + nz * ez) / leg0**3
+        for j in range(m):
+            z = height / (nx * slopes[i, j, 0] + ny * slopes[i, j, 1] + nz)
+            x, y = slopes[i, j, 0] * z, slopes[i, j, 1] * z
+            range_m = np.sqrt(x * x + y * y + z * z)
+            dx, dy, dz = emitter[0] - x, emitter[1] - y, emitter[2] - z
+            leg = np.sqrt(dx * dx + dy * dy + dz * dz)
+            a = albedo[i]
+            if a < 0.0:
+                u = uv_of[0, 0] * x + uv_of[0, 1] * y + uv_of[0, 2] * z + uv_of[0, 3]
+                v = uv_of[1, 0] * x + uv_of[1, 1] * y + uv_of[1, 2] * z + uv_of[1, 3]
+                across = min(max(u * columns - 0.5, 0.0), columns - 1.0)
+                down = min(max(v * rows - 0.5, 0.0), rows - 1.0)
+                c, r = min(int(across), columns - 2), min(int(down), rows - 2)
+                p, q = across - c, down - r
+                above = (1.0 - p) * texture[r, c] + p * texture[r, c + 1]
+                a = (1.0 - q) * above + q * ((1.0 - p) * texture[r + 1, c] + p * texture[r + 1, c + 1])
+            light = a * (nx * dx + ny * dy + nz * dz) / leg**3 / facing0 if facing0 > 0.0 else 0.0
+            longer, farther = range_m + leg - range0 - leg0, range_m - range0
+            for order in range(4):
+                to_light[order, i] += light / m
+                to_face[order, i] += a / m
+                light *= longer
+                a *= farther
+
+
+def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,), which differ by little from it: the
+    series of the exponential ends at the third order, 1e-6 of the light at 0.07 rad."""
+    waves = wave_numbers(frequencies_hz)[:, None]
+    zeroth, first, second, third = moments
+    series = zeroth - waves**2 * second / 2 + 1j * (waves * first - waves**3 * third / 6)
+    return np.asarray(series * np.exp(1j * waves * about_m))
 
 
 def direct_light(
@@ -168,20 +222,22 @@ def direct_light(
     frequencies_hz: tuple[float, ...],
     closely: np.ndarray | None = None,
 ) -> DirectLight:
-    """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2), finely divided where a
-    footprint meets an edge or a shadow's edge, and once more where that leaves an error in the pixels ``closely``
-    (h, w). A pixel that is divided again replaces what was there."""
+    """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2). Rays are cast to pixels'
+    centres and corners; where these meet one plane, evenly lit, the pixel's light follows from it. Elsewhere sub-rays
+    are cast: few on a bent surface, many where a footprint meets an edge or a shadow's edge and in the pixels
+    ``closely`` (h, w), and there once more where that leaves an error. A pixel that is divided again replaces what was
+    there."""
     (h, w), lines = slopes.shape[:2], len(frequencies_hz)
     n = h * w
     rows, cols = np.divmod(np.arange(n), w)
     central = cast(lit, slopes.reshape(-1, 2))
     phasor, face = np.zeros((lines, n), complex), np.zeros((lines + 1, n), complex)
-    intensity, coverage, face_range_m = np.zeros(n), np.zeros(n), np.zeros(n)
-    flagged, unsure, seen = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
+    intensity, coverage, face_range_m = np.zeros(n), np.ones(n), np.zeros(n)
+    unsure, seen = np.zeros(n, bool), np.zeros(n, bool)
     passes: list[tuple[np.ndarray, np.ndarray, int, np.ndarray]] = []
 
-    def add(here: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cast sub-rays (n, m, 2) of pixels; returns their amplitudes, ranges and paths (n, m)."""
+    def add(here: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cast sub-rays (n, m, 2) of pixels; returns their amplitudes and paths (n, m)."""
         m = rays.shape[1]
         hits = cast(lit, rays.reshape(-1, 2))
         amplitude, range_m, path_m, surface, albedo, on_face = (
@@ -189,7 +245,7 @@ def direct_light(
             for each in (hits.amplitude, hits.range_m, hits.path_m, hits.surface, hits.albedo, hits.on_face)
         )
         phasor[:, here] = phasor_sums(amplitude, path_m, frequencies_hz)
-        intensity[here] = amplitude.mean(axis=1)
+        intensity[here] = amplitude.mean(axis=1, dtype=float)
         coverage[here] = (surface == central.surface[here, None]).mean(axis=1)
         some = on_face.any(axis=1)
         chosen, without = here[some], here[~some]
@@ -199,16 +255,38 @@ def direct_light(
         face_range_m[chosen] = to_face.sum(axis=1) / on_face[some].sum(axis=1)
         off = ~on_face & (surface >= 0)
         passes.append((here, off.sum(axis=1), m, rays[off].astype(np.float32)))
-        return amplitude, range_m, path_m
+        return amplitude, path_m
 
-    for here in _chunks(np.arange(n), COARSE**2):
-        amplitude, range_m, _ = add(here, footprint.coarse(rows[here], cols[here]))
-        flagged[here] = _edges(amplitude, range_m) | (coverage[here] < 1)
+    def add_even(here: np.ndarray) -> None:
+        """Add the light of pixels that see one plane."""
+        rays, central_m = footprint.coarse(rows[here], cols[here]), central.range_m[here].astype(float)
+        ray = np.column_stack([slopes.reshape(-1, 2)[here], np.ones(len(here))])
+        centre = ray * (central_m / np.linalg.norm(ray, axis=1))[:, None]
+        albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
+        textured = central.surface[here] == lit.textured
+        texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
+        uv_of = np.zeros((2, 4)) if lit.uv_of is None else lit.uv_of
+        normal, plain = central.normal[here].astype(float), np.where(textured, -1.0, albedo)
+        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, uv_of, to_light, to_face)
+        to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
+        phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies_hz)
+        intensity[here] = to_light[0]
+        on = central.on_face[here]
+        face[:-1, here[on]] = _of_moments(to_face[:, on], central_m[on], frequencies_hz)
+        face[-1, here[on]], face_range_m[here[on]] = to_face[0, on], central_m[on]
+        counts = np.where(on, 0, rays.shape[1])
+        passes.append((here, counts, rays.shape[1], rays[~on].reshape(-1, 2).astype(np.float32)))
+
+    bend_m, edge = _corners(lit, footprint.corner, slopes, central)
+    edge |= False if closely is None else closely
     reach = 2 * footprint.reach_px + 1
-    fine = ndimage.binary_dilation(flagged.reshape(h, w), np.ones((reach, reach), bool)).ravel()
+    fine = ndimage.binary_dilation(edge, np.ones((reach, reach), bool)).ravel()
+    met, bent = central.surface >= 0, bend_m.ravel() > BENT_M
+    add_even(np.flatnonzero(~fine & ~bent & met))
+    for here in _chunks(np.flatnonzero(~fine & bent), COARSE**2):
+        add(here, footprint.coarse(rows[here], cols[here]))
     for here in _chunks(np.flatnonzero(fine), FINE):
-        amplitude, _, path_m = add(here, footprint.fine(rows[here], cols[here]))
-        unsure[here] = _error_m(amplitude, path_m) > UNSURE_M
+        unsure[here] = _error_m(*add(here, footprint.fine(rows[here], cols[here]))) > UNSURE_M
     unsure &= False if closely is None else closely.ravel()
     for here in _chunks(np.flatnonzero(unsure), FINEST):
         add(here, footprint.fine(rows[here], cols[here], FINEST))
@@ -221,7 +299,7 @@ def direct_light(
     return DirectLight(
         phasor=phasor.reshape(-1, h, w),
         intensity=intensity.reshape(h, w),
-        range_m=central.range_m.reshape(h, w),
+        range_m=central.range_m.reshape(h, w).astype(float),
         surface=central.surface.reshape(h, w),
         uv=central.uv.reshape(h, w, 2),
         coverage=coverage.reshape(h, w).astype(np.float32),
@@ -237,15 +315,28 @@ def _chunks(pixels: np.ndarray, per_pixel: int) -> list[np.ndarray]:
     return [pixels[begin : begin + at_once] for begin in range(0, len(pixels), at_once)]
 
 
-def _edges(amplitude: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """Find pixels (n,) bool whose sub-rays (n, COARSE^2) differ in light, or leave a plane."""
-    uneven = amplitude.max(axis=1) - amplitude.min(axis=1) > UNEVEN * amplitude.max(axis=1)
-    # Sub-rays of a smooth surface lie on a plane: the sum of opposite corners equals that of the centre's two.
-    grid = range_m.reshape(-1, COARSE, COARSE)
-    with np.errstate(invalid="ignore"):
-        bend = np.abs(grid[:, 0, 0] + grid[:, -1, -1] - grid[:, 0, -1] - grid[:, -1, 0])
-        bend = np.maximum(bend, np.abs(grid[:, 0, 0] + grid[:, -1, -1] - grid[:, 1, 1] - grid[:, 2, 2]))
-    return np.asarray(uneven | ~(bend < KINK_M))
+def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:
+    """Return (h, w) each: by how much rays through a pixel's corners, with slopes ``corner`` (h + 1, w + 1, 2), leave
+    the plane that its centre met, and whether they say that an edge or a shadow's is in the pixel."""
+    h, w = slopes.shape[:2]
+    hits = cast(lit, corner.reshape(-1, 2))
+    rays = np.concatenate([slopes, np.ones((h, w, 1))], axis=-1)
+    normal = central.normal.reshape(h, w, 3).astype(float)
+    middle_m, surface = central.range_m.reshape(h, w).astype(float), central.surface.reshape(h, w)
+    height_m = middle_m * (normal * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+    bare = np.divide(hits.amplitude, hits.albedo, out=np.zeros(len(hits.albedo)), where=hits.albedo > 0)
+    middle = np.divide(central.amplitude, central.albedo, out=np.zeros(h * w), where=central.albedo > 0).reshape(h, w)
+    most, least, bend_m, edge = middle.copy(), middle.copy(), np.zeros((h, w)), np.zeros((h, w), bool)
+    for at in ((down, across) for down in (slice(h), slice(1, None)) for across in (slice(w), slice(1, None))):
+        range_m, light, other = (each.reshape(h + 1, w + 1)[at] for each in (hits.range_m, bare, hits.surface))
+        x, y = corner[at][..., 0], corner[at][..., 1]
+        length = np.sqrt(1 + x * x + y * y)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off_m = np.abs(range_m - height_m * length / (normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]))
+        bend_m = np.fmax(bend_m, off_m)
+        edge |= other != surface
+        most, least = np.maximum(most, light), np.minimum(least, light)
+    return bend_m, edge | (bend_m > KINK_M) | (most - least > UNEVEN * most)
 
 
 def _error_m(amplitude: np.ndarray, path_m: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,44 +101,76 @@ LIFT_M = 1e-5
 lift, 0.15 mm at 0.7 m, is a tenth of the smallest hole."""
 
 
-def facing(interaction: Any) -> Any:
-    """The geometric normal on the side from which the ray came."""
-    import drjit as dr
+class Met(NamedTuple):
+    """Hits of rays, Dr.Jit arrays: whether there is one, its distance and place, the unit normal on the side from which
+    the ray came, the surface's index, the triangle's, and the direction back along the ray."""
 
-    return dr.mulsign(interaction.n, interaction.wi.z)
+    valid: Any
+    distance: Any
+    place: Any
+    normal: Any
+    surface: Any
+    triangle: Any
+    viewer: Any
 
 
 @dataclass(frozen=True)
 class LitScene:
-    """A Mitsuba scene with the emitter described beside it: a point with uniform intensity in a soft-edged cone.
-    ``names`` are the surfaces in order; `surface_index` maps a hit to them. ``gloss``: share and exponent of their
-    lobes, None where nothing is glossy. Mitsuba supplies geometry, textures and
-    visibility; the emitter stays outside so that its phase and its connection to each vertex are ours."""
+    """A target's parts as one Mitsuba mesh, with the emitter described beside it: a point with uniform intensity in a
+    soft-edged cone. Mitsuba supplies the rays' hits alone: one shape without materials needs no virtual calls, so that
+    all scenes share their compiled kernels. By triangle stand ``surface_of`` (index into ``parts``), ``normal_of`` and
+    ``on_face``; by surface ``albedos`` and, where any is glossy, ``gloss``: share and exponent of the lobes. The part
+    ``textured`` has ``texture`` at ``uv_of`` (2, 4), affine in place; None where all are plain."""
 
     mi: Any
     scene: Any
-    names: tuple[str, ...]
+    parts: tuple[TargetPart, ...]
     emitter_m: np.ndarray
     cos_full: float
     cos_cutoff: float
+    surface_of: Any
+    normal_of: Any
+    on_face: Any
+    albedos: Any
     gloss: tuple[Any, Any] | None
-    _identity: Any
-    _first_triangle: Any
-    _on_face: Any
+    textured: int
+    texture: Any
+    uv_of: np.ndarray | None
 
-    def surface_index(self, interaction: Any) -> Any:
-        """Return the index into ``names`` of each hit; meaningless where the ray met nothing."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the surfaces in order."""
+        return tuple(part.name for part in self.parts)
+
+    def meet(self, origin: Any, direction: Any) -> Met:
+        """Return where rays along unit directions first meet the scene."""
         import drjit as dr
 
-        number: Any = dr.reinterpret_array(self.mi.UInt32, interaction.shape)
-        return dr.gather(self.mi.UInt32, self._identity, number)
+        mi = self.mi
+        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
+        valid, triangle = found.is_valid(), found.prim_index
+        normal = dr.gather(mi.Normal3f, self.normal_of, triangle, valid)
+        surface = dr.gather(mi.UInt32, self.surface_of, triangle, valid)
+        normal = dr.mulsign(normal, -dr.dot(normal, direction))
+        distance = dr.select(valid, found.t, 0)
+        place = mi.Point3f(origin + distance * direction)
+        return Met(valid, distance, place, normal, surface, triangle, -direction)
 
-    def on_face(self, interaction: Any, active: Any) -> Any:
-        """Tell whether each hit lies on a triangle that was said to belong to the undamaged face."""
+    def uv(self, place: Any) -> Any:
+        """Return where the texture stands at places of the part that has one."""
+        (ux, uy, uz, u0), (vx, vy, vz, v0) = np.zeros((2, 4)) if self.uv_of is None else self.uv_of.tolist()
+        x, y, z = place.x, place.y, place.z
+        return self.mi.Point2f(ux * x + uy * y + uz * z + u0, vx * x + vy * y + vz * z + v0)
+
+    def albedo(self, met: Met) -> Any:
+        """Return the albedo at hits; 0 where a ray met nothing."""
         import drjit as dr
 
-        first = dr.gather(self.mi.UInt32, self._first_triangle, self.surface_index(interaction), active)
-        return dr.gather(self.mi.Bool, self._on_face, first + interaction.prim_index, active)
+        plain = dr.gather(self.mi.Float, self.albedos, met.surface, met.valid)
+        if self.texture is None:
+            return plain
+        here = met.valid & (met.surface == self.textured)
+        return dr.select(here, self.texture.eval(self.uv(met.place), here)[0], plain)
 
     def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
         """Return what a surface reflects from ``direction`` to ``viewer``, as a multiple of what a Lambertian one of
@@ -151,74 +183,77 @@ class LitScene:
         cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
 
-    def reflected(self, interaction: Any, direction: Any) -> Any:
+    def reflected(self, met: Met, direction: Any) -> Any:
         """Return `lobe` of hits, from ``direction`` back along the ray that met them."""
-        viewer = interaction.to_world(interaction.wi)
-        return self.lobe(self.surface_index(interaction), facing(interaction), viewer, direction)
+        return self.lobe(met.surface, met.normal, met.viewer, direction)
 
-    def arriving(self, interaction: Any, active: Any) -> tuple[Any, Any]:
+    def arriving(self, met: Met, active: Any) -> tuple[Any, Any]:
         """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
         irradiance = cone(direction) cos(incidence) / d^2, times `reflected`, and 0 behind an occluder."""
         import drjit as dr
 
         mi = self.mi
         emitter = mi.Point3f(*self.emitter_m.tolist())
-        towards = emitter - interaction.p
+        towards = emitter - met.place
         squared = dr.squared_norm(towards)
         distance = dr.sqrt(squared)
         towards /= distance
-        cosine = dr.dot(facing(interaction), towards)
+        cosine = dr.dot(met.normal, towards)
         on_axis = -towards.z
         cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
         lit = active & (cosine > 0) & (cone > 0)
         # what stands between the surface, on the side from which the ray came, and the emitter
-        origin = interaction.p + LIFT_M * facing(interaction)
+        origin = met.place + LIFT_M * met.normal
         way = emitter - origin
         reach = dr.norm(way)
         ray = mi.Ray3f(origin, way / reach)
         ray.maxt = reach - 2 * LIFT_M
         lit &= ~self.scene.ray_test(ray, lit)
-        return dr.select(lit, cone * cosine / squared * self.reflected(interaction, towards), 0), distance
+        return dr.select(lit, cone * cosine / squared * self.reflected(met, towards), 0), distance
 
 
 def lit_scene(
     mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
 ) -> LitScene:
-    """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss. ``on_face``: for each
-    part which of its triangles (n,) lie on the undamaged face; None means none."""
+    """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss, one of them with a texture
+    at most. ``on_face``: for each part which of its triangles (n,) lie on the undamaged face; None means none."""
     import drjit as dr
+    import trimesh
 
-    names = tuple(part.name for part in parts)
-    description = {"type": "scene", **{part.name: _mesh(mi, part) for part in parts}}
-    scene = mi.load_dict(description)
-    registered: np.ndarray = mi.UInt32(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).numpy()
-    identity = np.zeros(int(registered.max()) + 1, np.uint32)
-    for shape, number in zip(scene.shapes(), registered, strict=True):
-        identity[number] = names.index(shape.id())
-    triangles = [np.zeros(len(part.mesh.faces), bool) for part in parts] if on_face is None else list(on_face)
-    first = np.cumsum([0, *(len(flags) for flags in triangles[:-1])]).astype(np.uint32)
-    full, cutoff = (float(np.cos(np.deg2rad(a))) for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg))
-    faces = mi.UInt32(identity), mi.UInt32(first), mi.Bool(np.concatenate(triangles))
-    shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
-    gloss = (shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None
-    return LitScene(mi, scene, names, optics.emitter_m, full, cutoff, gloss, *faces)
-
-
-def _mesh(mi: Any, part: TargetPart) -> Any:
-    """Return one part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
-    reflectance: dict[str, Any] = {"type": "uniform", "value": float(part.albedo_850)}
-    if part.texture_850 is not None:
-        bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
-        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
-    properties, textured = mi.Properties(), part.uv is not None
-    material = {"type": "diffuse", "reflectance": reflectance}
-    properties["material"] = mi.load_dict({"type": "twosided", "material": material})
-    vertices, faces = np.asarray(part.mesh.vertices, np.float32), np.asarray(part.mesh.faces, np.uint32)
-    mesh = mi.Mesh(part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties)
-    mesh.set_id(part.name)
+    whole: Any = trimesh.util.concatenate([part.mesh for part in parts])
+    counts = [len(part.mesh.faces) for part in parts]
+    vertices, faces = np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32)
+    mesh = mi.Mesh("target", len(vertices), len(faces))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
-    if part.uv is not None:
-        parameters["vertex_texcoords"] = np.asarray(part.uv, np.float32).ravel()
     parameters.update()
-    return mesh
+    corners = np.asarray(whole.vertices)[whole.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    textured = next((k for k, part in enumerate(parts) if part.texture_850 is not None), -1)
+    texture = uv_of = None
+    if textured >= 0:
+        part: Any = parts[textured]
+        image = mi.TensorXf(np.ascontiguousarray(part.texture_850[..., None], np.float32))
+        texture = mi.Texture2f(image, wrap_mode=dr.WrapMode.Clamp)
+        places = np.column_stack([part.mesh.vertices, np.ones(len(part.mesh.vertices))])
+        uv_of = np.linalg.lstsq(places, part.uv, rcond=None)[0].T
+    flags = np.zeros(len(faces), bool) if on_face is None else np.concatenate(list(on_face))
+    full, cutoff = (float(np.cos(np.deg2rad(a))) for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg))
+    shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
+    return LitScene(
+        mi=mi,
+        scene=mi.load_dict({"type": "scene", "target": mesh}),
+        parts=tuple(parts),
+        emitter_m=optics.emitter_m,
+        cos_full=full,
+        cos_cutoff=cutoff,
+        surface_of=mi.UInt32(np.repeat(np.arange(len(parts)), counts).astype(np.uint32)),
+        normal_of=mi.Float(normals.astype(np.float32).ravel()),
+        on_face=mi.Bool(flags),
+        albedos=mi.Float([float(part.albedo_850) for part in parts]),
+        gloss=(shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None,
+        textured=textured,
+        texture=texture,
+        uv_of=uv_of,
+    )

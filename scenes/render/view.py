@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -21,16 +22,19 @@ from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, 
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
 from scenes.perspectives import seen_region
 from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light
-from scenes.render.scene import LIFT_M, LitScene, facing, lit_scene, load_mitsuba
+from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba
 from scenes.target.mesh import Target
+from scenes.target.truth import face_of
 
 BATCHES = 8
 PATHS_A_LANE = 64
 """Enough that lanes end together although paths differ in length, few enough that a small job fills the machine."""
 NOISE_LINES = 4
 """Lines of a comb of many that tell what noise does to range: paths are the same for all lines."""
-PER_VERTEX = 2
-"""Low-discrepancy dimensions at each vertex: a direction."""
+PER_VERTEX = 3
+"""Low-discrepancy dimensions at each vertex: a direction, and whether the path goes on."""
+CERTAIN = 2
+"""Vertices from which every path goes on; at later ones it does so with the albedo as its chance (Russian roulette)."""
 START_DIMENSIONS = 2
 FLOATS_AT_ONCE = 1 << 26
 """Results held on the device at once: 0.25 GB."""
@@ -52,11 +56,17 @@ class PathWork:
 
 
 def gather_at_points(
-    lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int
+    lit: LitScene,
+    points_m: np.ndarray,
+    normals: np.ndarray,
+    work: PathWork,
+    samples: int,
+    bright: np.ndarray | None = None,
 ) -> np.ndarray:
     """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
-    that what noise is left is smooth from point to point."""
+    that what noise is left is smooth from point to point. ``bright`` (4, 4): half of the paths go on from their first
+    hit towards a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance."""
     import drjit as dr
 
     mi = lit.mi
@@ -70,7 +80,7 @@ def gather_at_points(
         seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
         return point, point + LIFT_M * normal, direction, seen
 
-    return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True)
+    return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True, bright=bright)
 
 
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
@@ -116,7 +126,49 @@ def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
     return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
 
 
-def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, on_surface: bool) -> np.ndarray:
+@lru_cache(maxsize=8)
+def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
+    """Return low-discrepancy points of all batches, flat in the order batch, point, dimension, float32."""
+    rng = np.random.default_rng([seed, 0x1D1EC7])
+    points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
+    return np.ascontiguousarray(points, np.float32).ravel()
+
+
+def _towards(lit: LitScene, bright: np.ndarray, place: Any, normal: Any, turned: Any, u1: Any, u2: Any) -> Any:
+    """Return a direction from a surface and its weight, drawn evenly by its cosine (``turned``: one drawn so) or, from
+    before the rectangle ``bright``, with a chance of a half towards an even point of it: a mixture of both densities
+    (Veach and Guibas' balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2`` in 0..1."""
+    import drjit as dr
+
+    mi = lit.mi
+    axis_x, axis_y, middle = (mi.Vector3f(*bright[:3, k].tolist()) for k in (0, 1, 3))
+    half = [float(np.linalg.norm(bright[:3, k])) for k in (0, 1)]
+    out = mi.Vector3f(*np.cross(bright[:3, 0] / half[0], bright[:3, 1] / half[1]).tolist())
+    from_middle = mi.Vector3f(place) - middle
+    before = dr.dot(from_middle, out) > 0
+    chosen = before & (u1 < 0.5)
+    aimed = dr.normalize((4 * u1 - 1) * axis_x + (2 * u2 - 1) * axis_y - from_middle)
+    direction = dr.select(chosen, aimed, turned)
+    # where it meets the rectangle's plane; its density there, over that by the cosine
+    falling = -dr.dot(direction, out)
+    way = dr.dot(from_middle, out) / falling
+    at = from_middle + way * direction
+    met = (falling > 0) & (dr.abs(dr.dot(at, axis_x)) <= half[0] ** 2) & (dr.abs(dr.dot(at, axis_y)) <= half[1] ** 2)
+    cosine = dr.dot(normal, direction)
+    area = 4 * half[0] * half[1]
+    ratio = dr.select(met, dr.pi * dr.square(way) / (area * falling * dr.maximum(cosine, 1e-9)), 0)
+    return direction, dr.select(cosine > 0, dr.select(before, 2 / (1 + ratio), 1), 0)
+
+
+def _gather(
+    lit: LitScene,
+    start: Any,
+    samples: np.ndarray,
+    work: PathWork,
+    *,
+    on_surface: bool,
+    bright: np.ndarray | None = None,
+) -> np.ndarray:
     """Walk ``samples`` (n,) paths from each place; returns the light (BATCHES, f + 1, n) complex64 of each batch,
     frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in `NoiseFreeView`, without the
     place's albedo where the start was a surface point, with it where the start was the lens. ``start`` (place, u1, u2):
@@ -128,10 +180,8 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
 
     mi, bounces, seed = lit.mi, work.bounces, work.seed
     lines, per_batch = len(work.frequencies_hz), np.maximum(samples // BATCHES, 1)
-    rng = np.random.default_rng([seed, 0x1D1EC7])
     dimensions, longest = START_DIMENSIONS + PER_VERTEX * (bounces + 1), int(per_batch.max())
-    points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
-    table = mi.Float(np.ascontiguousarray(points, np.float32).ravel())
+    table = mi.Float(_sobol(dimensions, longest, seed))
 
     # lanes for so many paths a batch at each place, and where those of each place and batch begin
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
@@ -162,21 +212,32 @@ def _gather(lit: LitScene, start: Any, samples: np.ndarray, work: PathWork, *, o
             direction = dr.select(fresh, start_direction, direction)
             length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
 
-            hit = lit.scene.ray_intersect(mi.Ray3f(origin, direction))
-            met, normal = hit.is_valid(), facing(hit)
-            length = length + dr.select(met, dr.norm(hit.p - before), 0)
-            throughput = throughput * dr.select(met, hit.bsdf().eval_diffuse_reflectance(hit, met)[0], 0)
+            hit = lit.meet(origin, direction)
+            met, normal = hit.valid, hit.normal
+            length = length + dr.select(met, dr.norm(hit.place - before), 0)
+            albedo = lit.albedo(hit)
+            throughput = throughput * albedo
             arriving, leg = lit.arriving(hit, met if on_surface else met & ~fresh)
-            light = throughput * arriving
-            totals = _added(totals, dr.select(met, light, 0), length + leg, work.frequencies_hz)
+            totals = _added(totals, dr.select(met, throughput * arriving, 0), length + leg, work.frequencies_hz)
 
             more = met & (vertex < bounces) & (throughput > 0)
             dimension = START_DIMENSIONS + PER_VERTEX * vertex
-            chosen = mi.Point2f(uniform(sample, dimension), uniform(sample, dimension + 1))
-            direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(chosen))
+            u1, u2, u3 = (uniform(sample, dimension + k) for k in range(PER_VERTEX))
+            by_chance = vertex >= CERTAIN
+            more &= ~by_chance | (u3 < albedo)
+            throughput = throughput / dr.select(by_chance & more, albedo, 1)
+            direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+            if bright is not None:
+                # the half of the square that the other choice leaves is a square too
+                wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
+                spread = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
+                aimed, weight = _towards(lit, bright, hit.place, normal, spread, u1, u2)
+                direction = dr.select(fresh, aimed, direction)
+                throughput = throughput * dr.select(fresh, weight, 1)
             throughput = throughput * lit.reflected(hit, direction)
+            more &= throughput > 0
             sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
-            return sample, vertex, hit.p, normal, direction, length, throughput, totals
+            return sample, vertex, hit.place, normal, direction, length, throughput, totals
 
         n, kinds = dr.width(place), (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
@@ -248,16 +309,17 @@ def face_light(
     ends = ((each.min(), each.max()) for each in (x_seen, y_seen))
     xs, ys = (np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3)) for low, high in ends)
     # points above the face, and its unit normals, in the camera's frame
+    face, T_camera_board = face_of(target.config.board), target.T_camera_board
     x, y = (each.ravel() for each in np.meshgrid(xs, ys))
-    step, height_m = 1e-5, target.face_height_m
-    slope_x = (height_m(x + step, y) - height_m(x - step, y)) / (2 * step)
-    slope_y = (height_m(x, y + step) - height_m(x, y - step)) / (2 * step)
-    normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    point = np.stack([x, y, height_m(x, y)], axis=-1) + ABOVE_FACE_M * normal
-    T_camera_board = target.T_camera_board
+    normal = face.normal(x, y)
+    point = face.point(x, y) + ABOVE_FACE_M * normal
     position, normals = transform_points(T_camera_board, point), rotate_vectors(T_camera_board, normal)
-    light = gather_at_points(lit, position, normals, work, samples)
+    # the face's bounds, which light the surfaces before it
+    bright, outline = T_camera_board.copy(), target.outline_board_m[:, :2]
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
+    bright[:3, :2] *= (high - low) / 2
+    light = gather_at_points(lit, position, normals, work, samples, bright)
     weights = between_nodes(xs, ys, x_seen, y_seen)
     share = direct.face[:, seen]
     few = noise_lines(work.frequencies_hz)
@@ -284,7 +346,9 @@ def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np
 RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
 HOLE_RIM_PX = 1
-PILOT_SAMPLES = 128
+NARROW = ("through", "blind", "slot", "gouge", "chip")
+"""Kinds of damage that may lie between a pixel's corners and its centre."""
+PILOT_SAMPLES = 64
 """Paths that tell a pixel's noise, within a third."""
 PILOT_SEED = 1 << 20
 """Offset that keeps those apart from the ones that count."""
@@ -363,19 +427,17 @@ def indirect_light(
         indirect[:, seen] = mean
         total[:, seen] += mean[:-1]
         variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2
-    work = PathWork(frequencies, config.bounces, config.seed)
-    off_face, within = direct.off_face, inside.ravel()[direct.off_face.pixel]
-    for inner in (True, False):
-        rays = off_face.chosen(within == inner)
-        here, share = rays.pixel, rays.share
-        if here.size:
-            many = _samples_inside(lit, rays, total[:, here], work, config) if inner else config.rest_samples
-            light = gather_in_pixels(lit, rays, work, many)
-            mean = share * light.mean(axis=0, dtype=complex)
-            indirect[:, here] += mean
-            total[:, here] += mean[:-1]
-            batches = share * light[:, noise_lines(frequencies)]
-            variance[here] += range_noise_m(batches, total[:, here], frequencies) ** 2
+    work, rays = PathWork(frequencies, config.bounces, config.seed), direct.off_face
+    here, share, within = rays.pixel, rays.share, inside.ravel()[rays.pixel]
+    if here.size:
+        many = np.full(here.size, config.rest_samples)
+        if within.any():
+            many[within] = _samples_inside(lit, rays.chosen(within), total[:, here[within]], work, config)
+        light = gather_in_pixels(lit, rays, work, many)
+        mean = share * light.mean(axis=0, dtype=complex)
+        indirect[:, here] += mean
+        total[:, here] += mean[:-1]
+        variance[here] += range_noise_m(share * light[:, noise_lines(frequencies)], total[:, here], frequencies) ** 2
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
@@ -396,18 +458,15 @@ def _samples_inside(
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """Find pixels (h, w) bool whose central ray goes through a hole's or slot's mouth, or HOLE_RIM_PX beside it."""
+    """Find pixels (h, w) bool whose central ray goes through the mouth of `NARROW` damage, or HOLE_RIM_PX beside it."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    found = np.zeros(slopes.shape[:2], bool)
+    found, T_board_camera = np.zeros(slopes.shape[:2], bool), invert(target.T_camera_board)
     for hole, declared in zip(target.truth, target.config.damages, strict=True):
-        if hole.kind in ("through", "blind", "slot"):
-            centre = hole.centre_camera_m
+        if hole.kind in NARROW:
+            centre, axis = hole.centre_camera_m, hole.axis_camera
             rim_m = HOLE_RIM_PX * float(centre[2]) / min(optics.lens.fx, optics.lens.fy)
             with np.errstate(divide="ignore", invalid="ignore"):
-                on_plane = rays * ((centre @ hole.axis_camera) / (rays @ hole.axis_camera))[..., None]
-            if hole.outline_board_m is None:
-                found |= np.linalg.norm(on_plane - centre, axis=-1) < declared.reach_mm * MM + rim_m
-            else:
-                on_board = transform_points(invert(target.T_camera_board), on_plane)
-                found |= hole.within(on_board[..., 0], on_board[..., 1], rim_m)
+                on_plane = rays * ((centre @ axis) / (rays @ axis))[..., None]
+            x, y, _ = np.moveaxis(transform_points(T_board_camera, on_plane), -1, 0)
+            found |= hole.within(x, y, rim_m + declared.reach_mm * MM - hole.reach_m)
     return found

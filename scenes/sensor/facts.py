@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.geometry import Lens, Region
+from harness.vocabulary.geometry import MM, Lens, Region
+from scenes.optics import Optics
 
 T = TypeVar("T")
 
@@ -147,6 +148,32 @@ class UnitFacts(Config):
     jitter_mm: NonNegative
 
 
+class OutputFacts(Config):
+    """Least range that a camera gives, and the step of the stored z."""
+
+    min_range_mm: NonNegative
+    output_step_mm: Positive
+
+
+class ConeFacts(Config):
+    """A cone about the optical axis, from ``position_mm``, with a linear roll-off between two half angles."""
+
+    position_mm: Fact[tuple[float, float, float]]
+    full_half_angle_deg: HalfAngle
+    cutoff_half_angle_deg: HalfAngle
+
+    @model_validator(mode="after")
+    def _rolls_off_outwards(self) -> Self:
+        if self.cutoff_half_angle_deg.value <= self.full_half_angle_deg.value:
+            raise ValueError("cutoff_half_angle_deg must be above full_half_angle_deg")
+        return self
+
+    def optics(self) -> dict[str, Any]:
+        """Return what a camera's optics take of it."""
+        angles = {key: getattr(self, key).value for key in ("full_half_angle_deg", "cutoff_half_angle_deg")}
+        return {"emitter_m": np.array(self.position_mm.value) * MM, **angles}
+
+
 class CameraFacts(Config):
     """Contents of every camera's file, whatever its kind."""
 
@@ -155,6 +182,7 @@ class CameraFacts(Config):
     wavelength_nm: Wavelength
     lens: LensFacts
     unit: UnitFacts
+    engine: OutputFacts
     modes: dict[str, ModeFacts] = Field(default_factory=dict, exclude=True)
     """Other modes by name: only their images are known. No simulation uses them, so that digests leave them out."""
 
@@ -162,6 +190,16 @@ class CameraFacts(Config):
     def nominal_lens(self) -> Lens:
         """The lens of the file; without distortion, that of a scanner is the raster of its beam's directions."""
         return self.lens.lens()
+
+    @property
+    def z_step_m(self) -> float:
+        """The rounding step of the output's z."""
+        return self.engine.output_step_mm.value * MM
+
+    def optics_with(self, **own: Any) -> Optics:
+        """Return the camera's optics for the render; ``own``: what its kind alone knows."""
+        facts = {"title": self.title, "lens": self.nominal_lens, "wavelength_nm": self.wavelength_nm.value}
+        return Optics(**facts, nearest_m=self.engine.min_range_mm.value * MM, **own)  # type: ignore[arg-type]
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
         """Tell which points (..., 3) have an image on the sensor and within the lens's field, (...) bool."""

@@ -3,7 +3,7 @@ camera."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import MM, Reason
+from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
@@ -108,6 +108,22 @@ def unit_error_m(camera: AnyCamera, config: CameraConfig, slope_x: np.ndarray) -
         deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
         error = error + deviation * camera.unit.offset_mm.value * MM
     return np.asarray(error)
+
+
+def static_error_m(
+    camera: AnyCamera,
+    config: CameraConfig,
+    region: Region,
+    slopes: np.ndarray,
+    pattern_mm: Callable[[np.random.Generator, tuple[int, int]], np.ndarray],
+) -> np.ndarray:
+    """Return (h, w): all errors of range, metres, that frames of a unit share, as far as they are on. ``pattern_mm``
+    draws the fixed pattern on the whole sensor, from which the region is cut."""
+    error, lens = unit_error_m(camera, config, slopes[..., 0]), camera.nominal_lens
+    if not config.effects.fixed_pattern:
+        return error
+    drawn_mm = pattern_mm(random_stream(config.unit_seed, "fixed pattern", camera.name), (lens.height, lens.width))
+    return np.asarray(error + (drawn_mm * MM * config.fixed_pattern_scale)[region.within(lens.whole)])
 
 
 def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:

@@ -49,8 +49,7 @@ def check_target(config: custom.TargetConfig) -> None:
 
 def _name(damage: custom.AnyDamage) -> str:
     kind, (x, y) = "hole" if isinstance(damage, custom.HoleConfig) else damage.kind.replace("_", " "), damage.centre_mm
-    size = damage.size_of if isinstance(damage, FlawConfig) else "diameter"
-    return f"{kind} {damage.id} ({size} {damage.size_mm:g} mm at ({x:g}, {y:g}) mm)"
+    return f"{kind} {damage.id} ({damage.size_of} {damage.size_mm:g} mm at ({x:g}, {y:g}) mm)"
 
 
 def _size(board: custom.BoardConfig) -> str:

@@ -17,7 +17,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest
 from harness.vocabulary.geometry import MM, rotation_xyz_deg
-from scenes.target.flaws import AnyFlawConfig, Coordinate, DamageId, FlawConfig, PlaceMm
+from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
 NEAR_NM = 20.0
 """An albedo holds this far around its wavelength: over it wood and paint change by a per cent or two (a guess)."""
@@ -157,17 +157,10 @@ class BoardConfig(Config):
     shape: ShapeConfig
 
 
-class DamageConfig(Config):
+class DamageConfig(PlacedConfig):
     """Declaration that holes and dents have in common."""
 
-    id: DamageId
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
-    centre_mm: PlaceMm
-
-    @property
-    def centre_m(self) -> tuple[float, float]:
-        """Place in plan, metres."""
-        return self.centre_mm[0] * MM, self.centre_mm[1] * MM
 
     @property
     def radius_m(self) -> float:
@@ -180,22 +173,22 @@ class DamageConfig(Config):
         return self.radius_m
 
     @property
-    def size_mm(self) -> float:
-        """The size in plan that limits are of, as `scenes.target.flaws` has it."""
-        return self.diameter_mm
-
-    @property
     def reach_mm(self) -> float:
         """Radius of a circle about the centre that holds the outline."""
         return self.mouth_m / MM
 
 
-class HoleConfig(DamageConfig):
-    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
+class DrillConfig(Config):
+    """The drill of all holes of a board, in place of what each hole says."""
 
+    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     kind: Literal["through", "blind"] = "through"
     depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
     chamfer_mm: Chamfer = 0.0
+
+
+class HoleConfig(DrillConfig, DamageConfig):
+    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
 
     @property
     def mouth_m(self) -> float:
@@ -209,15 +202,6 @@ class HoleConfig(DamageConfig):
         if self.kind == "through" and self.depth_mm is not None:
             raise ValueError("a through-hole takes no depth_mm; its depth is the board's thickness")
         return self
-
-
-class DrillConfig(Config):
-    """The drill of all holes of a board, in place of what each hole says."""
-
-    diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
-    kind: Literal["through", "blind"] = "through"
-    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
-    chamfer_mm: Chamfer = 0.0
 
 
 class DentConfig(DamageConfig):

@@ -12,6 +12,7 @@ Not modelled: burrs, spring-back, rust that stands on the face, another albedo o
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -52,8 +53,8 @@ class Relief:
     open_row: bool = False
 
 
-class _FlawConfig(Config):
-    """Declaration that these kinds have in common."""
+class PlacedConfig(Config):
+    """Declaration that all damage has in common."""
 
     id: DamageId
     centre_mm: PlaceMm
@@ -69,6 +70,10 @@ class _FlawConfig(Config):
     def size_mm(self) -> float:
         """The size that ``size_of`` names."""
         return float(getattr(self, f"{self.size_of}_mm"))
+
+
+class _FlawConfig(PlacedConfig):
+    """Declaration that these kinds have in common."""
 
     @property
     def sides_mm(self) -> tuple[float, float]:
@@ -87,9 +92,9 @@ class _FlawConfig(Config):
         relief = self.relief()
         return float(np.hypot(relief.s_m, relief.t_m).max()) / MM
 
+    @abstractmethod
     def relief(self) -> Relief:
         """Return the depth over the damage's frame."""
-        raise NotImplementedError
 
 
 class _LongConfig(_FlawConfig):

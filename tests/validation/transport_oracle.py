@@ -16,6 +16,7 @@ import numpy as np
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics
 from scenes.render.scene import LitScene
+from scenes.target.mesh import TargetPart
 
 NEAR_CLIP_M = 1e-3
 BINS, BIN_M = 3_000, 4e-3
@@ -106,9 +107,28 @@ def oracle(lit: LitScene, optics: Optics, frequencies_hz: tuple[float, ...], *, 
         "film": film,
         "sampler": {"type": "independent"},
     }
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(lit.scene.shapes())}
+    shapes = {f"shape_{k}": _mesh(mi, part) for k, part in enumerate(lit.parts)}
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes})
     return Oracle(mi, optics, scene, frequencies_hz, histogram)
+
+
+def _mesh(mi: Any, part: TargetPart) -> Any:
+    """One part as a Mitsuba mesh with face normals and a two-sided diffuse material."""
+    reflectance: dict[str, Any] = {"type": "uniform", "value": float(part.albedo_850)}
+    if part.texture_850 is not None:
+        bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
+        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+    properties, textured = mi.Properties(), part.uv is not None
+    material = {"type": "diffuse", "reflectance": reflectance}
+    properties["material"] = mi.load_dict({"type": "twosided", "material": material})
+    vertices, faces = np.asarray(part.mesh.vertices, np.float32), np.asarray(part.mesh.faces, np.uint32)
+    mesh = mi.Mesh(part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
+    if part.uv is not None:
+        parameters["vertex_texcoords"] = np.asarray(part.uv, np.float32).ravel()
+    parameters.update()
+    return mesh
 
 
 def _emitter(mi: Any, optics: Optics) -> dict[str, Any]:

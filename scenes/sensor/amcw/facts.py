@@ -15,10 +15,11 @@ from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics
 from scenes.sensor.facts import (
     CameraFacts,
+    ConeFacts,
     Fact,
-    HalfAngle,
     LengthPx,
     NonNegative,
+    OutputFacts,
     Positive,
     PositiveInt,
     Share,
@@ -117,22 +118,17 @@ WIDEST_PX = 2128
 """Longest row, the filter's window included: `kernels.STRIDE`, written again so that declarations compile nothing."""
 
 
-class EmitterFacts(Config):
-    """The light source: a point beside the lens, uniform intensity in a cone with a linear roll-off.
+class EmitterFacts(ConeFacts):
+    """The light source: a point beside the lens, uniform intensity in its cone.
     ``irradiance_w_m2``: on a surface that faces it on the axis at 1 m; only ambient light is measured by it.
     ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a convex polygon outside which the
     camera gives no range."""
 
-    position_mm: Fact[tuple[float, float, float]]
-    full_half_angle_deg: HalfAngle
-    cutoff_half_angle_deg: HalfAngle
     irradiance_w_m2: Positive
     mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
 
     @model_validator(mode="after")
-    def _rolls_off_outwards(self) -> EmitterFacts:
-        if self.cutoff_half_angle_deg.value <= self.full_half_angle_deg.value:
-            raise ValueError("cutoff_half_angle_deg must be above full_half_angle_deg")
+    def _mask_is_convex(self) -> EmitterFacts:
         if self.mask_slopes is not None:
             # corners of a convex area turn one way, counter-clockwise in axes x right, y down as the file has them
             corners = np.array(self.mask_slopes.value)
@@ -252,7 +248,7 @@ class FlyingPixelFacts(Config):
     most_mm: NonNegative
 
 
-class EngineFacts(Config):
+class EngineFacts(OutputFacts):
     """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is none.
 
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
@@ -283,7 +279,6 @@ class EngineFacts(Config):
     max_range_mm: Positive
     limits_along: Fact[Literal["ray", "axis"]]
     flying_pixels: FlyingPixelFacts | None = None
-    output_step_mm: Positive
 
     @model_validator(mode="after")
     def _gates_can_hold(self) -> EngineFacts:
@@ -332,25 +327,13 @@ class AmcwCamera(CameraFacts):
         blur_px = int(np.ceil(3 * self.scatter.blur_px.value)) if self.scatter else 0
         return self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px
 
-    @property
-    def z_step_m(self) -> float:
-        """The rounding step of the output's z."""
-        return self.engine.output_step_mm.value * MM
-
     @cached_property
     def optics(self) -> Optics:
         """Optics of this camera for the render."""
-        return Optics(
-            title=self.title,
-            lens=self.nominal_lens,
-            emitter_m=self.emitter_position_m,
-            full_half_angle_deg=self.emitter.full_half_angle_deg.value,
-            cutoff_half_angle_deg=self.emitter.cutoff_half_angle_deg.value,
+        return self.optics_with(
+            **self.emitter.optics(),
             frequencies_hz=self.frequencies_hz,
-            beam_fwhm_rad=None,
-            wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
-            nearest_m=self.engine.min_range_mm.value * MM,
             farthest_m=self.engine.max_range_mm.value * MM,
             limits_along=self.engine.limits_along.value,
         )

@@ -20,14 +20,13 @@ import numpy as np
 from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Region
-from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.at_once import windows_of
 from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, unit_error_m
+from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, static_error_m
 
 f4 = np.float32
 HIGHEST_HARMONIC = 31  # harmonics above change the phase by less than 0.1 mrad in all
@@ -168,25 +167,22 @@ class AmcwImager:
         return np.asarray(area * lens.fx * lens.fy / (1 + (self.slopes**2).sum(axis=-1)) ** 2)
 
     @cached_property
-    def fixed_pattern_m(self) -> np.ndarray:
-        """(h, w): this unit's error of range before the filter, cut from a field over the whole sensor."""
-        facts, lens = self.camera.fixed_pattern, self.camera.nominal_lens
-        rng = random_stream(self.config.unit_seed, "fixed pattern", self.camera.name)
-        smooth, pixel = rng.standard_normal((2, lens.height, lens.width), dtype=f4)
-        smooth = smooth_field(smooth, facts.smooth_length_px.value)
-        field = (facts.smooth_mm.value * smooth + facts.pixel_mm.value * pixel) * MM * self.config.fixed_pattern_scale
-        return field[self.region.within(lens.whole)]
+    def static_error_m(self) -> np.ndarray:
+        """(h, w): all errors of range that frames of this unit share, before the filter."""
+        return static_error_m(self.camera, self.config, self.region, self.slopes, self._pattern_mm)
+
+    def _pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        facts = self.camera.fixed_pattern
+        smooth, pixel = rng.standard_normal((2, *shape), dtype=f4)
+        return facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value) + facts.pixel_mm.value * pixel
 
     def expose(self, view: NoiseFreeView) -> AmcwExposure:
         """Return the noise-free samples of a view that covers this imager's region."""
-        # all errors of range that frames of this unit share before the filter, as far as they are on
-        error_m = unit_error_m(self.camera, self.config, self.slopes[..., 0])
-        error_m = error_m + self.fixed_pattern_m if self.config.effects.fixed_pattern else error_m
         if self.camera.scatter is not None:
             light, facts = (view.phasor, view.phasor_direct, view.intensity), self.camera.scatter
             phasor, direct, intensity = (scattered(image, facts) for image in light)
             view = replace(view, phasor=phasor, phasor_direct=direct, intensity=intensity)
-        return exposure_of(self.camera, self.config, view, self.gathered, error_m)
+        return exposure_of(self.camera, self.config, view, self.gathered, self.static_error_m)
 
     def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
-from scenes.sensor.facts import CameraFacts, Fact, NonNegative, Positive, checked
+from scenes.sensor.facts import CameraFacts, Fact, NonNegative, OutputFacts, Positive, checked
 
 CARRIER_HZ = 1e6
 """Frequency whose phase tells the mean distance over a pixel's footprint, without ambiguity up to 150 m; complex64
@@ -71,12 +71,10 @@ class EdgeKernelFacts(Config):
     least_step_mm: Positive
 
 
-class OutputFacts(Config):
-    """Limits of range along the ray, and the step of the stored z."""
+class LimitFacts(OutputFacts):
+    """Limits of range, along the ray."""
 
-    min_range_mm: NonNegative
     max_range_mm: Positive
-    output_step_mm: Positive
 
 
 class EmpiricalCamera(CameraFacts):
@@ -88,7 +86,7 @@ class EmpiricalCamera(CameraFacts):
     fixed_pattern: FilteredPatternFacts
     dropouts: DropoutFacts
     edge: EdgeKernelFacts
-    engine: OutputFacts
+    engine: LimitFacts
 
     @model_validator(mode="after")
     def _possible(self) -> EmpiricalCamera:
@@ -105,24 +103,14 @@ class EmpiricalCamera(CameraFacts):
         """Pixels beyond a region whose depth reaches it through the edge's kernel."""
         return int(np.ceil(BLUR_REACH * self.edge.blur_px.value) + np.ceil(self.edge.gap_px.value / 2)) + 1
 
-    @property
-    def z_step_m(self) -> float:
-        """The rounding step of the output's z."""
-        return self.engine.output_step_mm.value * MM
-
     @cached_property
     def optics(self) -> Optics:
         """Optics for the render: a source of light in the lens itself, which leaves no shadows."""
-        return Optics(
-            title=self.title,
-            lens=self.nominal_lens,
+        return self.optics_with(
             emitter_m=np.zeros(3),
             full_half_angle_deg=89.0,
             cutoff_half_angle_deg=89.9,
             frequencies_hz=(CARRIER_HZ,),
-            beam_fwhm_rad=None,
-            wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
-            nearest_m=self.engine.min_range_mm.value * MM,
             farthest_m=self.engine.max_range_mm.value * MM,
         )

@@ -16,13 +16,12 @@ import numpy as np
 from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, Reason, Region
-from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView, wave_numbers
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.tabled import filtered
-from scenes.sensor.unit import DecodedFrame, unit_error_m
+from scenes.sensor.unit import DecodedFrame, static_error_m
 
 f4 = np.float32
 
@@ -47,17 +46,14 @@ class EmpiricalImager:
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share; the fixed pattern is cut from the sensor's."""
-        camera, config = self.camera, self.config
-        error = unit_error_m(camera, config, self.slopes[..., 0])
-        if not config.effects.fixed_pattern:
-            return error
-        facts, lens = camera.fixed_pattern, camera.nominal_lens
-        rng = random_stream(config.unit_seed, "fixed pattern", camera.name)
-        white = rng.standard_normal((lens.height, lens.width), dtype=f4)
-        field = filtered(white, *(np.asarray(taps.value, f4) for taps in (facts.rows, facts.columns)))
-        pattern_m = field * facts.deviation_mm.value * MM * config.fixed_pattern_scale
-        return np.asarray(error + pattern_m[self.region.within(lens.whole)])
+        """(h, w): all errors of range that frames of this unit share; the fixed pattern has the measured spectrum."""
+        facts = self.camera.fixed_pattern
+        taps = [np.asarray(each.value, f4) for each in (facts.rows, facts.columns)]
+
+        def pattern_mm(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+            return filtered(rng.standard_normal(shape, dtype=f4), *taps) * facts.deviation_mm.value
+
+        return static_error_m(self.camera, self.config, self.region, self.slopes, pattern_mm)
 
     def _sigma_m(self, range_m: np.ndarray, brightness: np.ndarray) -> np.ndarray:
         law = self.camera.noise

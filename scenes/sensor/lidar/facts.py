@@ -6,22 +6,24 @@ from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, Optics
-from scenes.sensor.facts import CameraFacts, Fact, HalfAngle, LengthPx, NonNegative, Positive, Share, checked
+from scenes.sensor.facts import (
+    CameraFacts,
+    ConeFacts,
+    Fact,
+    LengthPx,
+    NonNegative,
+    OutputFacts,
+    Positive,
+    Share,
+    checked,
+)
 
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
-
-
-class ReceiverFacts(Config):
-    """The one detector that stares at the whole field, beside the transmitter, which is the origin."""
-
-    position_mm: Fact[tuple[float, float, float]]
-    full_half_angle_deg: HalfAngle
-    cutoff_half_angle_deg: HalfAngle
 
 
 class BeamFacts(Config):
@@ -75,7 +77,7 @@ class RippleFacts(Config):
     smooth_length_px: LengthPx
 
 
-class LidarEngineFacts(Config):
+class LidarEngineFacts(OutputFacts):
     """Processing on the device. ``window_px``: height and width of the smoothing's window, odd. ``agree_deviations``:
     a neighbour in it joins the mean where its half path differs by at most so many expected deviations.
     ``least_agreeing``: share of the window that must agree. ``confidence_electrons``: least strength."""
@@ -86,15 +88,13 @@ class LidarEngineFacts(Config):
     agree_deviations: Positive
     least_agreeing: Share
     confidence_electrons: NonNegative
-    min_range_mm: NonNegative
-    output_step_mm: Positive
 
 
 class ScannedLidar(CameraFacts):
     """A lidar that sends one beam per pixel, one after the other; pixels are directions at the transmitter."""
 
     kind: Literal["scanned_lidar"]
-    receiver: ReceiverFacts
+    receiver: Annotated[ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")]
     beam: BeamFacts
     scan: ScanFacts
     code: CodeFacts
@@ -108,8 +108,6 @@ class ScannedLidar(CameraFacts):
             raise ValueError("code.band_floor must be above 0 and below 1")
         if self.integration_points > 3:
             raise ValueError("code.integration_ns may span at most three times scan.point_ns")
-        if self.receiver.cutoff_half_angle_deg.value <= self.receiver.full_half_angle_deg.value:
-            raise ValueError("receiver.cutoff_half_angle_deg must be above receiver.full_half_angle_deg")
         if self.engine.min_range_mm.value * MM >= self.unambiguous_m:
             raise ValueError("engine.min_range_mm must lie within the range of one period of the code")
         if len(self.weights) < 3:
@@ -175,24 +173,13 @@ class ScannedLidar(CameraFacts):
         height, width = self.engine.window_px.value
         return height // 2, width // 2
 
-    @property
-    def z_step_m(self) -> float:
-        """The rounding step of the output's z."""
-        return self.engine.output_step_mm.value * MM
-
     @cached_property
     def optics(self) -> Optics:
         """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would."""
-        return Optics(
-            title=self.title,
-            lens=self.nominal_lens,
-            emitter_m=self.receiver_m,
-            full_half_angle_deg=self.receiver.full_half_angle_deg.value,
-            cutoff_half_angle_deg=self.receiver.cutoff_half_angle_deg.value,
+        return self.optics_with(
+            **self.receiver.optics(),
             frequencies_hz=tuple(float(k / self.period_s) for k in range(1, len(self.weights) + 1)),
             beam_fwhm_rad=self.beam.fwhm_mrad.value * MRAD,
-            wavelength_nm=self.wavelength_nm.value,
             margin_px=self.margin_px,
-            nearest_m=self.engine.min_range_mm.value * MM,
             farthest_m=self.unambiguous_m,
         )

@@ -18,14 +18,13 @@ import numpy as np
 from scipy import interpolate, linalg
 
 from harness.vocabulary.geometry import MM, Region
-from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.kernels import Peaks, strongest_peaks
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, unit_error_m
+from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, static_error_m
 
 f4 = np.float32
 BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB
@@ -69,16 +68,14 @@ class LidarScanner:
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share; the fixed pattern is cut from a field."""
-        camera, config = self.camera, self.config
-        error = unit_error_m(camera, config, self.slopes[..., 0])
-        if not config.effects.fixed_pattern:
-            return error
-        facts, lens = camera.fixed_pattern, camera.nominal_lens
-        rng = random_stream(config.unit_seed, "fixed pattern", camera.name)
-        field = smooth_field(rng.standard_normal((lens.height, lens.width), dtype=f4), facts.smooth_length_px.value)
-        ripples_m = field * facts.smooth_mm.value * MM * config.fixed_pattern_scale
-        return np.asarray(error + ripples_m[self.region.within(lens.whole)])
+        """(h, w): all errors of range that frames of this unit share; the fixed pattern is smooth ripples."""
+        facts = self.camera.fixed_pattern
+
+        def ripples_mm(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+            white = rng.standard_normal(shape, dtype=f4)
+            return smooth_field(white, facts.smooth_length_px.value) * facts.smooth_mm.value
+
+        return static_error_m(self.camera, self.config, self.region, self.slopes, ripples_mm)
 
     @cached_property
     def gathered(self) -> np.ndarray:
