@@ -20,6 +20,7 @@ import numpy as np
 from detectors.free_form import free_form, picture_places
 from detectors.masks import grown, on_grid
 from detectors.noise import median_of, sigma_of
+from detectors.reference import laid_on
 from detectors.surface import (
     BISQUARE_TUNING,
     Fit,
@@ -47,6 +48,8 @@ STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
 """Share with structure from which on a free form is tried, and from which on the surface is said not to fit."""
+STATED = ("polynomial", "mesh")
+"""Shapes that are not chosen by evidence."""
 STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
 """Side of what is averaged to see structure, its least significance, and the share of a pixel's noise."""
 
@@ -119,10 +122,11 @@ class _Shape(NamedTuple):
 def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
     """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true. Deterministic. Raises
     UserError where the points do not determine it."""
-    points = np.ascontiguousarray(cloud.points_m[mask])
+    points, central = np.ascontiguousarray(cloud.points_m[mask]), cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
-        name, fit = _stated(points, config if config.shape == "polynomial" else SurfaceConfig(degree=1))
+        stated = config.shape in STATED
+        name, fit = _stated(points, config if stated else SurfaceConfig(degree=1), central)
         fitted = fit(points)
         noise_m = sigma_of(points[:, 2] - fitted)
         warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
@@ -130,8 +134,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         z_m, residual_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted))
         return Background(z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, few)
     wavelength = None
-    if config.shape == "polynomial":
-        name, fit = _stated(points, config)
+    if config.shape in STATED:
+        name, fit = _stated(points, config, central)
     else:
         shape = _chosen(cells, config)
         for _ in range(2):
@@ -156,7 +160,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
         text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
     if unseen.mean() > 0.001:
-        steep = f"seen at more than {STEEPEST_DEG:g} degrees"
+        steep = f"seen at more than {STEEPEST_DEG:g} degrees" + " or at an edge of the mesh" * (config.shape == "mesh")
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
     # a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is much more
     padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
@@ -183,7 +187,9 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
-def _stated(points: np.ndarray, config: SurfaceConfig) -> tuple[str, Fit]:
+def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> tuple[str, Fit]:
+    if config.reference is not None:
+        return laid_on(points, config.reference, central)
     surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
     return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
 

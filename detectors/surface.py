@@ -11,16 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, Self
 
 import numba
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.linalg import cho_solve, eigh
 
 from detectors.clusters import PLAIN
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
@@ -37,19 +38,35 @@ TINY_M = 1e-9  # residuals below a nanometre are rounding of the arithmetic
 Solution = tuple[np.ndarray, int, bool, str]  # coefficients (p,), steps, whether these converged, and what was done
 
 
-class SurfaceConfig(Config):
-    """``shape``: ``polynomial`` of the stated degree; ``auto``: the simplest of plane, polynomials, quadric and free
-    form that the cloud's own evidence asks for, whatever ``degree`` says; ``free_form`` in any case. ``scale_mm``: the
-    width above which a free form follows the cloud. ``degree``: total degree; 3 has the 10 terms of MATLAB's poly33.
-    ``method``: ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics);
-    ``lts`` a FAST-LTS start, then bisquare, which survives damage of a third of the surface; ``least_squares``.
-    ``drop_cross_terms``: no term in both x and y (as the thesis' script)."""
+class ReferenceConfig(Config):
+    """A part's own mesh, which may be open: its ``unit``, and the axis of the file that points to the camera."""
 
-    shape: Literal["polynomial", "auto", "free_form"] = "polynomial"
+    file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
+    unit: FileUnit = "mm"
+    front: FrontAxis = "+z"
+
+
+class SurfaceConfig(Config):
+    """``shape``: ``polynomial`` of the stated degree; ``mesh``: the ``reference``, laid onto the cloud; ``auto``: the
+    simplest of plane, polynomials, quadric and free form that the cloud's own evidence asks for, whatever ``degree``
+    says; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``degree``:
+    total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals; ``bisquare``
+    Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a FAST-LTS start, then bisquare, which survives
+    damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: no term in both x and
+    y (as the thesis' script)."""
+
+    shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
+    reference: ReferenceConfig | None = None
     scale_mm: float | None = Field(default=None, gt=0)
     degree: int = Field(default=3, ge=0, le=8)
     method: Literal["lar", "bisquare", "lts", "least_squares"] = "lar"
     drop_cross_terms: bool = False
+
+    @model_validator(mode="after")
+    def _one_surface(self) -> Self:
+        if (self.shape == "mesh") != (self.reference is not None):
+            raise ValueError("shape: mesh and reference: {file: part.stl} need each other")
+        return self
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 from harness.tables.outputs import ATLAS_PAGE, ATLAS_PICTURE
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
+from harness.vocabulary.meshes import UNITS_M
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.atlas import LimitSurface
 
 STORED = "atlas.parquet"
-UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind"}
 BEST = "matched"
 
@@ -116,12 +116,12 @@ def _answer(
     from harness.tables.atlas import ATLAS, damage_words, rows_at
     from harness.tables.text import many, show
 
-    size_mm, distance_m = 1e3 * _length_m("--size", options.size), _length_m("--distance", options.distance)
+    size_mm, distance_m = 1e3 * length_m("--size", options.size), length_m("--distance", options.distance)
     kind = KINDS.get(options.damage, options.damage)
     asked = _chosen(options, surfaces, kind)
     place = {"distance_m": distance_m}
     if options.depth is not None:
-        place["depth_mm"] = 1e3 * _length_m("--depth", options.depth)
+        place["depth_mm"] = 1e3 * length_m("--depth", options.depth)
     if options.albedo is not None:
         place["albedo"] = options.albedo
     for axis, option in (("depth_mm", "--depth"), ("albedo", "--albedo")):
@@ -172,7 +172,8 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 
 
-def _length_m(option: str, text: str) -> float:
+def length_m(option: str, text: str) -> float:
+    """Return the metres of a length with its unit. Raises UserError, which names the option."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
     if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
         raise UserError(f"{option} {text}: no length with its unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")

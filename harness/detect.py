@@ -38,6 +38,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--detector", default="local", help="detector's name (default: local)")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
+    mesh = (
+        "the part's own mesh as its undamaged surface, laid onto the cloud; --set surface.reference.unit=m, .front=-y"
+    )
+    add("--reference", metavar="MESH", help=mesh)
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use the first N frames only")

@@ -75,7 +75,12 @@ def detector_of(
         settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
     elif arguments.target is not None:
         raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop that could take it")
-    if "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
+    reference = getattr(arguments, "reference", None)
+    if reference is not None:
+        if "surface" not in known.model_fields:
+            raise UserError(f"--reference {reference}: detector {arguments.detector} has no surface that it could be")
+        settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
+    elif "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
         settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)

@@ -17,6 +17,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest
 from harness.vocabulary.geometry import MM, rotation_xyz_deg
+from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
 NEAR_NM = 20.0
@@ -112,17 +113,12 @@ class RoughConfig(Config):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="drawn anew for every board of a family")
 
 
-FrontAxis = Annotated[
-    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points to the camera")
-]
-
-
 class MeshConfig(Config):
     """The front of a part from a mesh file (`scenes.target.part`); the board's sizes are then those of its bounds."""
 
     kind: Literal["mesh"]
     file: Annotated[str, Field(min_length=1, max_length=1000)]
-    unit: Literal["mm", "cm", "m", "in"] = "mm"
+    unit: FileUnit = "mm"
     front: FrontAxis = "+z"
     content: str = Field("", max_length=32, description="the file's digest; filled in, so that results know the file")
 

@@ -20,22 +20,12 @@ from scipy.ndimage import map_coordinates
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import bounded_bytes, file_digest, limited_memory
+from harness.vocabulary.files import file_digest
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.meshes import FileUnit, FrontAxis, front_first, read_mesh
 from scenes.target import custom
 
-MOST_BYTES, FILES = 1 << 29, ".stl, .ply, .obj or .glb"
 NODES = 1000
-UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-FRONTS = {
-    "+x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-    "+y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
-    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "-z": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
-}
-"""Rows: the part's x, y and z in the file's axes."""
 
 
 class MeshTargetConfig(Config):
@@ -43,8 +33,8 @@ class MeshTargetConfig(Config):
 
     name: Literal["mesh"]
     file: Annotated[str, Field(min_length=1, max_length=1000, description=".stl, .ply, .obj or .glb")]
-    unit: Literal["mm", "cm", "m", "in"] = "mm"
-    front: custom.FrontAxis = "+z"
+    unit: FileUnit = "mm"
+    front: FrontAxis = "+z"
     flaws: Annotated[tuple[custom.AnyFlawConfig, ...], Field(max_length=500)] = ()
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
     backing: custom.BackingConfig | None = None
@@ -64,37 +54,14 @@ class MeshTargetConfig(Config):
 OF_MESH = ("name", "file", "unit", "front")
 
 
-def _content(file: str) -> bytes:
-    path = Path(file)
-    if path.suffix.lower() in (".step", ".stp", ".iges", ".igs"):
-        fix = "convert it to triangles, for instance in FreeCAD: Mesh, Create mesh from shape, export as .stl"
-        raise UserError(f"{file}: holds surfaces of a CAD program, no triangles", legal=FILES, fix=fix)
-    try:
-        return bounded_bytes(path, MOST_BYTES)
-    except OSError as error:
-        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
-
-
 @lru_cache(maxsize=8)
 def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of a closed part, board frame, metres. Equal vertices are
     joined, flat and doubled triangles left out, and a part that is inside out is turned. Raises UserError, with the
     place, for what is open, not manifold, not oriented or no mesh."""
-    import io
-
-    import trimesh
-
-    content = _content(shape.file)
+    mesh = read_mesh(shape.file)
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
-    try:
-        with limited_memory():
-            kind = Path(shape.file).suffix.lower().removeprefix(".")
-            mesh: Any = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
-    except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
-        raise UserError(f"{shape.file}: is no mesh that can be read ({error})", legal=FILES) from error
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     for count, what, fix in ((1, "open", "close its holes"), (3, "shared by three faces or more", "split them")):
         edges, index = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
         wrong = edges[index == 1] if count == 1 else edges[index >= count]
@@ -109,7 +76,7 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
     if mesh.volume < 0:
         mesh.invert()
-    points = np.asarray(mesh.vertices, float) @ np.array(FRONTS[shape.front], float).T * UNITS_M[shape.unit]
+    points = front_first(mesh, shape.unit, shape.front)
     low, high = points.min(axis=0), points.max(axis=0)
     return points - [*(low[:2] + high[:2]) / 2, high[2]], np.asarray(mesh.faces, np.int64)
 

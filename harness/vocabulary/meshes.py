@@ -1,0 +1,57 @@
+"""Meshes of parts from files: read within bounds, in metres, their front turned to the camera."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import bounded_bytes, limited_memory
+
+MOST_BYTES, FILES = 1 << 29, ".stl, .ply, .obj or .glb"
+FrontAxis = Annotated[
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points to the camera")
+]
+FileUnit = Literal["mm", "cm", "m", "in"]
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+FRONTS = {
+    "+x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "+y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+}
+"""Rows: the part's x, y and z in the file's axes."""
+
+
+def read_mesh(file: str) -> Any:
+    """Return a file's triangles as a `trimesh.Trimesh`, equal vertices joined, flat and doubled triangles left out.
+    Raises UserError for what is no mesh."""
+    import trimesh
+
+    path = Path(file)
+    if path.suffix.lower() in (".step", ".stp", ".iges", ".igs"):
+        fix = "convert it to triangles, for instance in FreeCAD: Mesh, Create mesh from shape, export as .stl"
+        raise UserError(f"{file}: holds surfaces of a CAD program, no triangles", legal=FILES, fix=fix)
+    try:
+        content = bounded_bytes(path, MOST_BYTES)
+        with limited_memory():
+            kind = path.suffix.lower().removeprefix(".")
+            mesh: Any = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
+        raise UserError(f"{file}: is no mesh that can be read ({error})", legal=FILES) from error
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    return mesh
+
+
+def front_first(mesh: Any, unit: str, front: str) -> np.ndarray:
+    """Return a mesh's vertices (n, 3) in metres: z along its front axis, y as upright as that leaves it."""
+    return np.asarray(np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit])
