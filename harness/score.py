@@ -165,12 +165,15 @@ def _judged(
 ) -> tuple[SetUpLimit, dict[str, Any]]:
     """Judge the maps of a category, at a threshold that its good boards of ``validation`` set: their limit, and a row
     of the table of scores."""
+    import pandas as pd
+
     from harness.engine.boards import read_arrays, read_truth
     from harness.engine.judge import matched_places
     from harness.engine.setup import highest_within, pixel_areas
+    from harness.engine.study import judged_facts
     from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.study.limit import limit_of
-    from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+    from harness.evaluation.study.record import SetUpRecord
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Boards of a split: name, scores (NaN where not inspected), places, damage, area inspected."""
@@ -183,8 +186,7 @@ def _judged(
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
     radius_m, truths = index["hit_radius_mm"] * MM, []
-    inspected, size_of = list[dict[str, Any]](), "diameter"
-    calls: dict[bool, list[tuple[int, int, float]]] = {False: [], True: []}
+    holes, runs = list[dict[str, Any]](), list[dict[str, Any]]()
     pixels: list[np.ndarray] = []
     regions: list[np.ndarray] = []
     tops: list[tuple[float, bool]] = []
@@ -198,40 +200,32 @@ def _judged(
         rule = (radius_m, index["hit_overlap"], damage.shape)
         pairs, parts = matched_places(lines, outlines, centres_m, found, *rule)
         signals = highest_within(places_m, scores, lines, radius_m)
-        calls["/good/" not in name].append((board, len(found) - len(pairs) - parts, area_m2))
+        common: dict[str, Any] = {"board": board, "repeat": 0, "threshold": float(threshold), "scale_mm": np.nan}
+        calls = {"false_calls": len(found) - len(pairs) - parts, "no_return_calls": 0, "inspected_m2": area_m2}
+        runs.append({**common, "role": "hole_free" if "/good/" in name else "damaged", **calls})
         for number, one in enumerate(damages):
-            size_of = one.get("size_of", size_of)
-            sizes = {key: one[key] for key in ("diameter_mm", "depth_mm")}
-            sizes |= {"x_mm": one["x_board_mm"], "y_mm": one["y_board_mm"], "signal": float(signals[number])}
-            inspected.append({"board": board, "hole": str(one["id"]), "repeat": 0, "hit": number in pairs, **sizes})
+            place = {"true_x_mm": one["x_board_mm"], "true_y_mm": one["y_board_mm"], "signal": float(signals[number])}
+            sizes = {f"true_{key}": one[key] for key in ("diameter_mm", "depth_mm")}
+            hit = {"detected": number in pairs, "no_return": False, "size_of": one.get("size_of", "diameter")}
+            holes.append({**common, "hole": str(one["id"]), **sizes, **place, **hit})
         here = np.isfinite(scores)
         pixels.append(scores[here])
         regions.append(np.where(damage[here] > 0, damage[here].astype(int) + (len(truths) << 16), 0))
         tops.append((float(np.nanmax(scores)), bool(damages)))
 
-    if not inspected:
+    if not holes:
         raise UserError(f"{options.dataset}: {category} has no damage in view, so that there is no limit to state")
-
-    def unflawed(damaged: bool) -> Unflawed:
-        board, count, area_m2 = (np.array(column) for column in zip(*calls[damaged], strict=True))
-        return Unflawed(board=board, repeat=np.zeros_like(board), calls=count, area_m2=area_m2)
-
-    columns: dict[str, Any] = {key: np.array([row[key] for row in inspected]) for key in inspected[0]}
     record = SetUpRecord(
         variant=category,
         frames=index["categories"][category]["frames"],
         axes={},
         detector=options.name,
         detector_version=0,
-        threshold=float(threshold),
-        threshold_mm=float("nan"),
         calibration_runs=len(highest),
         failed=0,
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
-        inspected=Inspected(**columns, size_of=size_of),
-        unflawed=unflawed(False),
-        beside=unflawed(True),
+        **judged_facts(pd.DataFrame(holes), pd.DataFrame(runs)),
     )
     scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T

@@ -155,12 +155,12 @@ def _unseen(
         posed = target.model_copy(update={"pose": pose})
         found = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
         if found:
-            path, mistake = found
+            path, first = found
             where = (
                 f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
                 f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
             )
-            return path, UserError(f"{where}: {mistake.message}", legal=mistake.legal, fix=mistake.fix)
+            return path, UserError(f"{where}: {first.message}", legal=first.legal, fix=first.fix)
     return None
 
 

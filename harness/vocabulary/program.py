@@ -29,8 +29,8 @@ class Program:
 
     def parser(self) -> argparse.ArgumentParser:
         """Return a parser of its arguments."""
-        about = {"description": self.description, "epilog": self.epilog}
-        parser = argparse.ArgumentParser(prog=f"python -m {self.name}", **about)
+        name, about, further = f"python -m {self.name}", self.description, self.epilog
+        parser = argparse.ArgumentParser(prog=name, description=about, epilog=further)
         self.options(parser)
         return parser
 
