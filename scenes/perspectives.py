@@ -19,25 +19,22 @@ from scenes.target.checks import NEAREST_M
 from scenes.target.custom import PoseConfig, TargetConfig
 from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
-COARSE = 8  # every eighth row and column of the face's grid is tried first
-
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
     out of its range. A face partly out of view is legal, and damage there is no target; so is a face partly out of
     range: its pixels there have no range, as they would have in the real camera."""
-    face = _face_before_lens(config)
-    # a part of the outline or of the middle decides; all of the face only where these are out of view
-    if not optics.lens.images(face[::COARSE, ::COARSE]).any():
+    face, places = _face_before_lens(config), np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
+    centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
+    if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is
         seen_region(config, optics)
-    places = face_of(config.board).point(*np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2).T)
-    if len(places) and not optics.lens.images(transform_points(config.pose.T_camera_board, places)).any():
-        raise UserError(
-            f"none of the target's {len(places)} damages is in view of {optics.title}",
-            legal="one damage or more in view; those out of view are not counted as targets",
-            fix="change target.pose, or move the damage",
-        )
-    range_m = face[..., 2] if optics.limits_along == "axis" else np.linalg.norm(face, axis=-1)
+        if len(centres):
+            raise UserError(
+                f"none of the target's {len(centres)} damages is in view of {optics.title}",
+                legal="one damage or more in view; those out of view are not counted as targets",
+                fix="change target.pose, or move the damage",
+            )
+    range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(
             f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
