@@ -19,9 +19,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     cache.set_defaults(run=_clean_cache)
     results = parts.add_parser("results", help="one folder of results, or all of an experiment")
     results.add_argument("name", metavar="NAME[/DIGEST]", help="as python -m harness.ls results names it")
-    results.add_argument(
-        "--journal-only", action="store_true", help="only the records of trials: tables and report stay"
-    )
     results.set_defaults(run=_clean_results)
     for part in (cache, results):
         part.add_argument(
@@ -36,7 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
     "followed, and what a running sweep uses is left alone.",
     epilog="examples: python -m harness.clean cache --limit 5GB; "
-    "python -m harness.clean results averaging/69346a82f4194e03 --journal-only --dry-run",
+    "python -m harness.clean results averaging/69346a82f4194e03 --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake of the user."""
@@ -78,17 +75,16 @@ def _clean_results(options: argparse.Namespace) -> int:
     if not options.dry_run:
         with ExitStack() as held:  # a sweep that runs is told before anything is asked
             _hold(held, folders)
-    files = [file for folder in folders for file in removable(folder, journal_only=options.journal_only)]
+    files = [file for folder in folders for file in removable(folder)]
     print("\n".join(map(str, folders)))
-    what = "files of journals" if options.journal_only else "files"
     size = size_text(sum(file.size_bytes for file in files))
-    if not _agreed(options, f"{len(files)} {what} in {many(len(folders), 'folder')}, {size}", len(files)):
+    if not _agreed(options, f"{len(files)} files in {many(len(folders), 'folder')}, {size}", len(files)):
         return 0 if options.dry_run or not files else 1
     with ExitStack() as held:  # not while the question waits for its answer: that would block every sweep
         _hold(held, folders)
         gone = remove_results(folders, files)
     for folder in folders:
-        if not options.journal_only and folder.exists():
+        if folder.exists():
             print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
     return _concluded(len(gone), len(files), sum(file.size_bytes for file in gone))
 

@@ -435,8 +435,8 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     return found
 
 
-def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
-    """Return the files of a folder of results that tofpod wrote, locks last; with ``journal_only`` the records."""
+def removable(folder: Path) -> list[StoredFile]:
+    """Return the files of a folder of results that tofpod wrote, locks last."""
     from harness.engine.journal import SEGMENT_NAME
 
     found = []
@@ -452,7 +452,7 @@ def removable(folder: Path, *, journal_only: bool) -> list[StoredFile]:
                 ours = is_output(name, "results") or LOCK_NAME.fullmatch(name) is not None
             else:
                 ours = len(above) == 1 and POINT_NAME.fullmatch(above[0]) is not None and is_output(name, "capture")
-            if ours and stat.S_ISREG(file.st_mode) and (above[:1] == [JOURNAL] or not journal_only):
+            if ours and stat.S_ISREG(file.st_mode):
                 found.append(StoredFile(path, file.st_size, file.st_mtime))
     return sorted(found, key=lambda one: (LOCK_NAME.fullmatch(one.path.name) is not None, one.path))
 

@@ -341,14 +341,6 @@ def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
     assert (stranger / "report.html").read_text() == "mine"
 
 
-def test_the_journal_alone(tmp_path):
-    folder = results(tmp_path, "0" * 16, records=20, trials={"done": 20})
-    other = results(tmp_path, "1" * 16, records=1)
-    assert clean.main(["results", f"study/{'0' * 16}", "--journal-only", "--yes", "--out", str(tmp_path)]) == 0
-    assert left_in(folder) == {"experiment.yaml", "provenance.json", "report.html"}
-    assert len(Journal(other / "journal")) == 1
-
-
 def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
     first, second = (results(tmp_path, digit * 16, records=2) for digit in "01")
     with locked(second):
