@@ -50,8 +50,6 @@ from scenes.render.cache import cached_view
 from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
-from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.thesis import TARGETS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,15 +71,7 @@ def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: b
     >>> len(tofpod.target(family, board=7).damages)
     3
     """
-    if not isinstance(what, Mapping):
-        config = declared(str(what), board)
-    elif what.get("name") not in TARGETS:
-        raise UserError(f"a target called {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}")
-    else:
-        told = settings_of(TARGETS[what["name"]], what, "target")
-        if board and not isinstance(told, DrawnTargetConfig):
-            raise UserError(f"board {board}: the declaration is of one board, not of a family", legal="board 0")
-        config = told.drawn("damaged", board) if isinstance(told, DrawnTargetConfig) else told.declare()
+    config = declared(what, board)
     return config.hole_free() if hole_free else config
 
 

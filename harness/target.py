@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
@@ -52,27 +53,30 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def declared(name_or_path: str, board: int) -> TargetConfig:
-    """Read a declaration, and draw the board asked for where it declares a family."""
-    from harness.vocabulary.declaration.diagnose import read_as
+def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
+    """Return the target of a name, of a file, or of a declaration as plain data; of a family the ``board`` asked for.
+    Raises UserError with every mistake of the declaration."""
+    from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig
     from scenes.target.thesis import TARGETS
 
-    if name_or_path in NAMED_TARGETS:
-        config = TARGETS[name_or_path].from_data({"name": name_or_path})
-    elif not Path(name_or_path).exists():
-        raise UserError(
-            f"{name_or_path}: no such file, and no target of that name", legal=f"{', '.join(NAMED_TARGETS)} or a file"
-        )
+    what = {"name": what} if what in NAMED_TARGETS else what
+    if isinstance(what, Mapping):
+        if what.get("name") not in TARGETS:
+            raise UserError(f"a target called {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}")
+        config = settings_of(TARGETS[what["name"]], what, "target")
+    elif not Path(what).exists():
+        legal = f"{', '.join(NAMED_TARGETS)} or a file"
+        raise UserError(f"{what}: no such file, and no target of that name", legal=legal)
     else:
-        config = read_as(TARGETS, "name", read_yaml(Path(name_or_path)))
+        config = read_as(TARGETS, "name", read_yaml(Path(what)))
     if isinstance(config, DrawnTargetConfig):
         if board < 0:
-            raise UserError(f"--board {board}: boards are numbered from 0")
+            raise UserError(f"board {board}: boards are numbered from 0")
         return config.drawn("damaged", board)
     if board:
-        raise UserError(f"--board {board}: {name_or_path} declares one board, not a family", legal="--board 0")
+        raise UserError(f"board {board}: the target declares one board, not a family", legal="board 0")
     return config.declare()
 
 
