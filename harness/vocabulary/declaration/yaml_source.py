@@ -17,7 +17,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
@@ -194,7 +194,16 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
     if version:
         problem = Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))
         raise DeclarationError(origin, [problem])
+    depth = nodes = 0
     try:
+        for event in YAML(typ="safe", pure=True).parse(text[start:]):
+            # composing recurses, scanning slows with depth, nodes take memory; keys are nodes, too
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            nodes += isinstance(event, NodeEvent)
+            if depth > MAX_DEPTH or nodes > 2 * MAX_NODES:
+                at = place(event.start_mark.index, event.start_mark.index + 1)
+                message, limit = ("nested too deep", MAX_DEPTH) if depth > MAX_DEPTH else ("too many values", MAX_NODES)
+                raise DeclarationError(origin, [Problem(message, at, legal=f"at most {limit}")])
         root = YAML(typ="safe", pure=True).compose(text[start:])
         builder = _Builder(place)
         data = None if root is None else builder.build(root, (), ())
@@ -213,14 +222,6 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         problem = Problem(f"character {letter} is not allowed in YAML", place(index, index + 1))
     except YAMLError as error:
         problem = Problem(f"no valid YAML: {error}", place(0, 1))
-    except RecursionError:  # composing recurses, parsing does not
-        depth, where = 0, place(0, 1)
-        for event in YAML(typ="safe", pure=True).parse(text[start:]):
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                where = place(event.start_mark.index, event.start_mark.index + 1)
-                break
-        problem = Problem("nested too deep", where, legal=f"at most {MAX_DEPTH} levels")
     raise DeclarationError(origin, [problem])
 
 
