@@ -190,7 +190,7 @@ class RenderConfig(Config):
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
     face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")
-    face_samples: int = Field(32768, ge=8, description="paths for each node on the face")
+    face_samples: int = Field(8192, ge=8, description="paths for each node on the face")
     hole_noise_mm: float = Field(
         0.1, gt=0, description="aimed at in pixels inside the board's outline but off its face, as a deviation of range"
     )

@@ -31,11 +31,12 @@ PATHS_A_LANE = 64
 """Enough that lanes end together although paths differ in length, few enough that a small job fills the machine."""
 NOISE_LINES = 4
 """Lines of a comb of many that tell what noise does to range: paths are the same for all lines."""
-PER_VERTEX = 3
-"""Low-discrepancy dimensions at each vertex: a direction, and whether the path goes on."""
-CERTAIN = 2
-"""Vertices from which every path goes on; at later ones it does so with the albedo as its chance (Russian roulette)."""
+PER_VERTEX = 2
+"""Low-discrepancy dimensions at each vertex: a direction."""
 START_DIMENSIONS = 2
+CELLS, PROBES, OFTEN = 16, 2, 0.9
+"""Cells along each side of the square of first directions from the face, probes along each side of a cell, and share
+of paths that begin in cells in which a probe met something; the rest begin anywhere, so that nothing is left out."""
 FLOATS_AT_ONCE = 1 << 26
 """Results held on the device at once: 0.25 GB."""
 FACE_WITHIN_M = 0.001 * MM
@@ -66,19 +67,40 @@ def gather_at_points(
     """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
     that what noise is left is smooth from point to point. ``bright`` (4, 4): half of the paths go on from their first
-    hit towards a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance."""
+    hit towards a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First
+    directions are drawn from cells of the hemisphere in which a probe met something, and seldom from all."""
     import drjit as dr
 
     mi = lit.mi
     columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
     board = lit.names.index("board") if "board" in lit.names else 0
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+    def drawn(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         x, y, z, nx, ny, nz = (dr.gather(mi.Float, column, place) for column in columns)
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
         return point, point + LIFT_M * normal, direction, seen
+
+    side, cells = CELLS * PROBES, CELLS**2
+    places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
+    probe = [mi.Float(((each + 0.5) / side).astype(np.float32)) for each in (across, down)]
+    _, origin, direction, _ = drawn(mi.UInt32(places.astype(np.uint32)), *probe)
+    met = lit.meet(origin, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
+    chosen = np.flatnonzero(met if met.any() else ~met)
+    shares = np.full(cells, 1 - OFTEN)
+    shares[chosen] += OFTEN * cells / chosen.size
+    table, density = mi.UInt32(chosen.astype(np.uint32)), mi.Float(shares.astype(np.float32))
+
+    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+        often = u1 < OFTEN
+        number = dr.select(often, u1 * (chosen.size / OFTEN), (u1 - OFTEN) * (cells / (1 - OFTEN)))
+        whole = dr.minimum(mi.UInt32(number), dr.select(often, mi.UInt32(chosen.size - 1), mi.UInt32(cells - 1)))
+        cell = dr.select(often, dr.gather(mi.UInt32, table, whole, often), whole)
+        u1 = (mi.Float(cell % CELLS) + dr.minimum(number - mi.Float(whole), 1.0)) / CELLS
+        u2 = (mi.Float(cell // CELLS) + u2) / CELLS
+        point, origin, direction, seen = drawn(place, u1, u2)
+        return point, origin, direction, seen / dr.gather(mi.Float, density, cell)
 
     return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True, bright=bright)
 
@@ -215,17 +237,13 @@ def _gather(
             hit = lit.meet(origin, direction)
             met, normal = hit.valid, hit.normal
             length = length + dr.select(met, dr.norm(hit.place - before), 0)
-            albedo = lit.albedo(hit)
-            throughput = throughput * albedo
+            throughput = throughput * lit.albedo(hit)
             arriving, leg = lit.arriving(hit, met if on_surface else met & ~fresh)
             totals = _added(totals, dr.select(met, throughput * arriving, 0), length + leg, work.frequencies_hz)
 
             more = met & (vertex < bounces) & (throughput > 0)
             dimension = START_DIMENSIONS + PER_VERTEX * vertex
-            u1, u2, u3 = (uniform(sample, dimension + k) for k in range(PER_VERTEX))
-            by_chance = vertex >= CERTAIN
-            more &= ~by_chance | (u3 < albedo)
-            throughput = throughput / dr.select(by_chance & more, albedo, 1)
+            u1, u2 = uniform(sample, dimension), uniform(sample, dimension + 1)
             direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
             if bright is not None:
                 # the half of the square that the other choice leaves is a square too
@@ -348,7 +366,7 @@ RIM_PX = 3
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")
 """Kinds of damage that may lie between a pixel's corners and its centre."""
-PILOT_SAMPLES = 64
+PILOT_SAMPLES = 128
 """Paths that tell a pixel's noise, within a third."""
 PILOT_SEED = 1 << 20
 """Offset that keeps those apart from the ones that count."""
