@@ -13,7 +13,6 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
-    from detectors.recordings import Recording
     from harness.tables.characteristics import OwnFigure
 
 CAMERA_FILE = "my_camera.yaml"
@@ -54,11 +53,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings
-    from harness.own_camera.camera_file import Stated, simulated, write_camera
+    from harness.own_camera.camera_file import Stated, camera_of_size, opened_as, simulated, with_lens, write_camera
     from harness.own_camera.certificate import write_certificate
     from harness.own_camera.measure import characteristics, read_still
     from harness.own_camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
-    from harness.scorecard.capture import camera_of_size, twin_of
     from harness.tables.characteristics import OWN_FIGURES
     from harness.tables.text import show
     from harness.vocabulary.files import write_text
@@ -77,7 +75,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     captures = []
     for path in options.paths:
-        recording = _opened(options, path)
+        recording = opened_as(options.like, [path], options.intrinsics, unit=options.unit)
         captures.append(read_still(recording))
         print(f"{recording.name}: {len(captures[-1].z_m)} frames, {recording.unit_text}", flush=True)
         print_notes(recording.notes)
@@ -97,15 +95,16 @@ def main(options: argparse.Namespace, command: str) -> int:
     known = options.like
     with suppress(UserError):  # none is as large, or it sees nothing of the surfaces
         known = known or camera_of_size(captures[0].lens)
-        other = twin_of(known, captures[0].lens, options.albedo).camera
-        sources[KNOWN] = characteristics(simulated(other, found, options.albedo), poses)
+        other = simulated(with_lens(known, captures[0].lens), found, options.albedo)
+        sources[KNOWN] = characteristics(other, poses)
     rows = beside(found, twin, sources.get(KNOWN))
     show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": known or ""})])
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     answer += f" {CAMERA_FILE} repeats it within {100 * _worst(rows):.0f} %." if noise else ""
     print(answer)
-    write_page(options.out, sources, rows, f"{options.title}, characterised", answer, known or "", command)
+    page, title = options.out / "characterise.html", f"{options.title}, characterised"
+    write_page(page, sources, rows, title, answer, known or "", command)
     if options.certificate:
         lens = captures[0].lens
         size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")
@@ -114,21 +113,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         write_certificate(options.out, found, about, poses, study, command)
     origin = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts, "like": options.like}
     write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
-    print(f"wrote {options.out / 'characterise.html'}, {CAMERA_FILE} and the tables")
+    print(f"wrote {page}, {CAMERA_FILE} and the tables")
     return 0
-
-
-def _opened(options: argparse.Namespace, path: Path) -> Recording:
-    """Open a capture; without a lens anywhere, the nominal one of --like counts."""
-    from harness.inspection.arguments import opened
-
-    try:
-        return opened([path], options.intrinsics, unit=options.unit)
-    except UserError:
-        if not options.like or options.intrinsics is not None:
-            raise
-        print(f"note: the capture names no lens; the nominal one of {options.like} counts")
-        return opened([path], options.like, unit=options.unit)
 
 
 def _worst(rows: list[OwnFigure]) -> float:

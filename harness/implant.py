@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from harness.engine.implants import Scan
     from scenes.target.drawn import DrawnTargetConfig
 
+DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
 MOST_AT_ONCE, FILLED = 8, 0.25
 """Damages of one placement at most, and the share of the scan that discs as wide as they are apart may cover."""
 
@@ -24,9 +25,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
-    add("--damage", required=True, choices=("through", "blind", "dent"), help="as on the drawn boards of an experiment")
-    add("--diameters", required=True, type=span, metavar="FROM:TO", help="of the damage, mm")
-    add("--depths", type=span, metavar="FROM:TO", help="of blind holes and dents, mm")
+    add("--damage", required=True, choices=DAMAGES, help="as on the drawn boards of an experiment")
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="of the damage, mm; of slots their widths")
+    add("--depths", type=span, metavar="FROM:TO", help="depths, mm (of bumps and protrusions: heights)")
+    add("--lengths", type=span, metavar="FROM:TO", help="of slots, mm")
     add("--thickness", type=float, default=12.7, metavar="MM", help="of the part (default: 12.7)")
     behind = "distance of what stands behind a through-hole, mm, or none (default: 20)"
     add("--backing", default="20", metavar="MM|none", help=behind)
@@ -161,8 +163,9 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     apart_mm = options.apart or 2 * options.hit_radius + 10
     room = FILLED * min(scan.area_m2 for scan in scans) / (math.pi / 4 * (apart_mm * MM) ** 2)
     damage = {"kind": options.damage, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
-    damage |= {"diameter_mm": list(options.diameters)}
+    damage |= {"width_mm" if options.damage == "slot" else "diameter_mm": list(options.diameters)}
     damage |= {"depth_mm": list(options.depths)} if options.depths else {}
+    damage |= {"length_mm": list(options.lengths)} if options.lengths else {}
     wavelength_nm = camera_of(CameraConfig(name=options.camera)).optics.wavelength_nm
     albedos = {"wavelength_nm": wavelength_nm, "board": options.albedo, "backing": options.albedo}
     try:

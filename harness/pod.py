@@ -12,6 +12,7 @@ from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.statement import PodStatement
+    from harness.evaluation.pod.transfer import Mapod
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
 BOUNDED = ("none", "floor", "ceiling", "both")
@@ -68,36 +69,31 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
     import json
 
-    if options.prior is not None:
-        return _corrected(options, command)
-    statement = _stated(options)
+    from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
     from harness.report.pod import pod_html, pod_parts, save_pod_png
     from harness.tables.text import show
     from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
 
-    show(pod_parts(statement))
-    data, picture, page = (options.out / name for name in FILES)
-    told = {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
+    found: Any = _stated(options) if options.prior is None else _corrected(options)
+    alone, combined = (pod_parts, save_pod_png, pod_html), (mapod_parts, save_mapod_png, mapod_html)
+    parts, save_png, html = alone if options.prior is None else combined  # type: ignore[assignment]
+    show(parts(found))
+    data, picture, page = (options.out / name for name in (FILES if options.prior is None else MAPOD_FILES))
+    told = {"results_version": RESULTS_VERSION, **found.to_data(), "command": command}
     write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
-    save_pod_png(picture, statement)
-    write_text(page, pod_html(statement, command))
+    save_png(picture, found)
+    write_text(page, html(found, command))
     print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
 
-def _corrected(options: argparse.Namespace, command: str) -> int:
-    """Correct a study's curve by the inspections; write the page, picture and data of MAPOD."""
-    import json
-
+def _corrected(options: argparse.Namespace) -> Mapod:
+    """Return a study's curve corrected by the inspections."""
     from harness.evaluation.pod import inspections as table
     from harness.evaluation.pod.transfer import Mapod
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
-    from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
-    from harness.tables.text import show
-    from harness.vocabulary.files import write_text
-    from harness.vocabulary.provenance import RESULTS_VERSION
 
     for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log", "bounded", "bound"):
         if getattr(options, name) is not None:
@@ -112,15 +108,7 @@ def _corrected(options: argparse.Namespace, command: str) -> int:
     if read.targets < len(read.size):
         raise UserError(f"{options.file}: targets stand in it more than once", fix="keep one inspection of each target")
     boards = table.texts_of(read, options.board) if options.board else None
-    found = Mapod.of(limit.record.label, limit.statement, limit.why, read, boards)
-    show(mapod_parts(found))
-    data, picture, page = (options.out / name for name in MAPOD_FILES)
-    told = {"results_version": RESULTS_VERSION, "prior": str(options.prior), **found.to_data(), "command": command}
-    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
-    save_mapod_png(picture, found)
-    write_text(page, mapod_html(found, command))
-    print(f"wrote {data}, {picture.name}, {page.name}")
-    return 0
+    return Mapod.of(limit.record.label, limit.statement, limit.why, read, boards)
 
 
 def _stated(options: argparse.Namespace) -> PodStatement:

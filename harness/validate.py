@@ -43,16 +43,18 @@ def main(options: argparse.Namespace, command: str) -> int:
         for name in ("update_baseline", "figures", "baseline"):
             if getattr(options, name):
                 raise UserError(f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture")
-        from harness.scorecard.capture import run_capture
-
         if options.board is None:
+            from harness.own_camera.capture import run_capture
+
             return run_capture(options, command)
+        from harness.inspection.arguments import opened
         from harness.scorecard.board import run_board
-        from harness.scorecard.capture import opened_capture
 
         if options.camera or options.mask:
             raise UserError("--camera and --mask do not go with --board: the experiment names the camera")
-        return run_board(options, opened_capture(options) if options.capture else None, command)
+        reading = {"unit": options.unit, "frames": slice(options.frames) if options.frames else None}
+        recording = opened(options.capture, options.intrinsics, **reading) if options.capture else None
+        return run_board(options, recording, command)
     for name in ("unit", "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")

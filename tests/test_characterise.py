@@ -145,8 +145,8 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     for words in ("firmware: 1.6", "warm-up: not stated", "LoD95", "ISO 10360-13", "No accreditation"):
         assert words in certificate
     told = json.loads((out / "certificate.json").read_text())
-    flat = [row for row in told["figures"] if row["quantity"] == "temporal noise"]
-    assert flat[0]["value"].startswith(f"{table['measured'].iloc[0]:.3g} (")
+    assert told["surfaces"][0]["temporal_mm"] == pytest.approx(table["measured"].iloc[0], rel=1e-5)
+    assert [row["surface"].split(",")[0] for row in told["surfaces"]] == [path.name for path in paths]
     assert "Measured and simulated" in page and "/tmp" not in re.sub(r"<pre>.*?</pre>", "", page, flags=re.DOTALL)
 
 

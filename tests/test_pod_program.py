@@ -95,6 +95,17 @@ def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path:
     assert stated(tmp_path)["a90_95"]["size"] == near[0]["a90_95"]["size"]
 
 
+def test_limits_that_hang_on_the_model_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Twenty targets do not tell links apart."""
+    few = table(tmp_path / "few.csv", size=SIZES[::3], hit=hits(SIZES[::3]))
+    assert main([str(few), "--size", "size", "--hit", "hit", "--out", str(tmp_path)]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("warning: ") and "a90/95 differ" in first
+    near = [row["a90_95"]["size"] or np.inf for row in stated(tmp_path)["models"] if row["in_a90_95"]]
+    assert max(near) > 1.05 * min(near) and len(stated(tmp_path)["warnings"]) == 1
+    assert "a90/95 differ" in (tmp_path / "pod.html").read_text()
+
+
 def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every target inspected five times, alike each time: the limit is that of the targets, and both are shown."""
     single = read_inspections(table(tmp_path / "one.csv", size=SIZES, hit=hits()), "size", ["hit"])

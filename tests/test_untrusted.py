@@ -18,7 +18,7 @@ from harness.evaluation.pod.inspections import read_inspections
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import assign, read_poses
-from harness.scorecard.capture import read_mask
+from harness.own_camera.capture import read_mask
 from harness.scorecard.figures import read_baseline
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError

@@ -21,7 +21,7 @@ from detectors.average import AverageConfig, average
 from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.engine.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
-from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, pixel_areas
+from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, outlined, pixel_areas
 from harness.engine.study import judged_facts
 from harness.engine.tables import columns_of
 from harness.evaluation.study.record import SetUpRecord
@@ -41,6 +41,8 @@ MOST_EMPTY = 200
 """Placements in a row without a place for any damage, after which there is none."""
 NORMAL_PX = 4
 """Half the side of the square of the surface whose plane is taken as the tangent plane."""
+TELLING_DEG = 5.0
+"""Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own."""
 VARIANT = "main"
 
 
@@ -116,6 +118,40 @@ class Scan:
         areas = pixel_areas(self.places_m)
         return float(np.nansum(areas[self.judged]))
 
+    @property
+    def pitch_m(self) -> float:
+        """Side in plan of a square as large as what a judged pixel sees."""
+        return math.sqrt(self.area_m2 / max(self.judged.sum(), 1))
+
+    @cached_property
+    def angle_deg(self) -> np.ndarray:
+        """(h, w) angle between each judged pixel's ray and the fitted surface's normal, NaN elsewhere."""
+        points = self.rays * self.surface_z_m[..., None]
+        down, across = np.gradient(points, axis=(0, 1))
+        normal = np.cross(down, across)
+        along = (normal * self.rays).sum(-1) / (np.linalg.norm(normal, axis=-1) * np.linalg.norm(self.rays, axis=-1))
+        return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
+
+    def rim_px(self, family: DrawnTargetConfig) -> float:
+        """Return how far inside of what is judged a damage's centre lies at least; as far for the smallest as for the
+        largest, so that size and place are independent."""
+        return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
+
+    def left_out(self, family: DrawnTargetConfig) -> str:
+        """Return a sentence on the rim that no damage is placed on, empty where it is as steep as the rest, and so
+        tells nothing of its own."""
+        inner, known = self.depth_px >= self.rim_px(family), np.isfinite(self.angle_deg)
+        if not (inner & known).any():
+            return ""
+        steep = [float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)]
+        if steep[1] - steep[0] < TELLING_DEG:
+            return ""
+        percent, name = 100 * (inner & known).sum() / known.sum(), self.recording.name
+        return (
+            f"{name}: damage is placed on the inner {percent:.0f} % of what is judged, seen at up to {steep[0]:.0f} "
+            f"degrees; the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        )
+
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
         """Return the average of some frames, as `harness.detect` takes it."""
         cloud = average(replace(self.recording, read=lambda: iter(frames), selection=None), AverageConfig())
@@ -146,14 +182,8 @@ class Scan:
 
     def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
         """Return a cloud of this scan with the truth of the damages that were put into it."""
-        truth, outlines = truth_of(target, self.T_camera_board), {}
-        intact = self.judged.copy()
-        margin_m = INTACT_MARGIN_PX * math.sqrt(self.area_m2 / max(self.judged.sum(), 1))
-        for damage in truth:
-            apart_m = np.linalg.norm(self.places_m - damage.centre_board_m[:2], axis=-1)
-            inside = np.flatnonzero(apart_m.ravel() < damage.diameter_m / 2)
-            outlines[damage.id] = inside if inside.size else np.array([int(np.nanargmin(apart_m))])
-            intact &= ~(apart_m < damage.diameter_m / 2 + margin_m)
+        truth = truth_of(target, self.T_camera_board)
+        outlines, intact = outlined(truth, self.places_m, self.judged, INTACT_MARGIN_PX * self.pitch_m)
         depths = {damage.id: damage.depth_m for damage in truth}
         return KnownCloud(cloud, invert(self.T_camera_board), target, truth, outlines, self.places_m, intact, depths)
 
@@ -206,11 +236,8 @@ def placements(
 
 
 def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: Purpose, number: int) -> TargetConfig:
-    """Return a board of the family with those of its damages that have enough judged surface around them; as much for
-    the smallest as for the largest, so that size and place are independent."""
-    drawn = family.drawn(purpose, number)
-    pitch_m = math.sqrt(scan.area_m2 / max(scan.judged.sum(), 1))
-    rim_px = family.damage.widest_mm * MM / 2 / pitch_m + BEYOND_PX + scan.reach_px
+    """Return a board of the family with those of its damages that have enough judged surface around them."""
+    drawn, rim_px = family.drawn(purpose, number), scan.rim_px(family)
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
     return drawn.model_copy(
         update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
@@ -234,8 +261,7 @@ def judge_scans(
     Where a recording has two groups of so many frames or more, every second sets the threshold and the others are
     judged; else the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
-    warnings: list[str] = []
-    calibrated = {}
+    warnings, calibrated = [said for scan in scans if (said := scan.left_out(family))], {}
     for count in frames:
         groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
         if not groups:

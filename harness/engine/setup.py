@@ -268,14 +268,23 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
     half = np.array([first.target.board.width_mm, first.target.board.height_mm]) / 2 * MM - margin_m
     with np.errstate(invalid="ignore"):
         bare = (np.abs(place) < half).all(axis=-1)
+    outlines, intact = outlined(first.truth, place, bare, margin_m)
+    undamaged = bare if hole_free and not intact.any() else intact
+    return KnownCloud(cloud, T_board_cloud, first.target, first.truth, outlines, place, undamaged, first.seen_depth_m)
+
+
+def outlined(
+    truth: Sequence[Damage], places_m: np.ndarray, bare: np.ndarray, margin_m: float
+) -> tuple[dict[int, np.ndarray], np.ndarray]:
+    """Return the flat indices of the places (h, w, 2) inside each damage by its id, the nearest where none is; and
+    what of ``bare`` (h, w) bool is farther than a margin from all."""
     outlines, intact = {}, bare.copy()
-    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
-    for damage in first.truth:
+    x, y = np.ascontiguousarray(places_m[..., 0]), np.ascontiguousarray(places_m[..., 1])
+    for damage in truth:
         intact &= ~damage.within(x, y, margin_m)
         within = np.flatnonzero(damage.within(x, y).ravel())
         outlines[damage.id] = within if within.size else nearest_place(x, y, damage)
-    undamaged = bare if hole_free and not intact.any() else intact
-    return KnownCloud(cloud, T_board_cloud, first.target, first.truth, outlines, place, undamaged, first.seen_depth_m)
+    return outlines, intact
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -17,15 +17,33 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from harness.own_camera.measure import Characteristics, StillCapture, characteristics, mean_amplitude, surfaces_of
-from harness.scorecard.capture import WIDEST_PX, twin_of
+from detectors.recordings import Recording
+from harness.inspection.arguments import opened
+from harness.own_camera.measure import (
+    WIDEST_PX,
+    Characteristics,
+    StillCapture,
+    characteristics,
+    mean_amplitude,
+    surfaces_of,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
-from harness.vocabulary.geometry import MM
+from harness.vocabulary.geometry import MM, Lens
 from scenes.closed_form import image_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import with_number
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig, is_camera_path, read_camera
+from scenes.sensor.camera import (
+    AnyCamera,
+    CameraConfig,
+    EffectsConfig,
+    camera_names,
+    camera_of,
+    guessed_precision,
+    is_camera_path,
+    load_camera,
+    read_camera,
+)
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import taps_of
@@ -38,6 +56,48 @@ STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
 EDGE_SHARE = 2.56
 """Width of a blurred edge between a tenth and nine tenths of its step, in deviations of the Gaussian."""
 NOT_TOLD = "not told by the captures"
+
+
+def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any) -> Recording:
+    """Open a capture; without a lens anywhere, the nominal one of the ``camera`` that took it counts."""
+    try:
+        return opened(paths, intrinsics, **reading)
+    except UserError:
+        if camera is None or intrinsics is not None:
+            raise
+        recording = opened(paths, None, lens=load_camera(camera).nominal_lens, **reading)
+        print(f"note: the capture names no lens; the nominal one of {camera} counts")
+        return recording
+
+
+def camera_of_size(lens: Lens) -> str:
+    """Return the one simulated camera with as many pixels; of several the one whose precision is no guess. Raises
+    UserError where there is none, or more than one."""
+    sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
+    fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
+    known = [name for name in fitting if not guessed_precision(load_camera(name))]
+    if len(known or fitting) == 1:
+        return (known or fitting)[0]
+    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not ones aligned to a"
+    raise UserError(
+        f"several cameras have {wrong}: {', '.join(fitting)}" if fitting else f"no simulated camera has {wrong}",
+        legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
+        fix="name the one that took it with --camera" if fitting else f"{size} colour camera or of another mode",
+    )
+
+
+def with_lens(name: str, lens: Lens) -> AnyCamera:
+    """Return a known camera with the capture's lens. Raises UserError for an unknown camera or another size."""
+    own = load_camera(name).nominal_lens
+    if (own.width, own.height) != (lens.width, lens.height):
+        raise UserError(
+            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {own.width} x {own.height}",
+            legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
+            fix="name the camera that took it, or record the depth images themselves",
+        )
+    numbers = {f"lens.{key}_px": getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
+    distortion = [*map(float, lens.distortion)]
+    return camera_of(CameraConfig(name=name, numbers={**numbers, "lens.distortion": distortion}))
 
 
 class Stated(NamedTuple):
@@ -140,7 +200,7 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
 
 
 def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
-    camera = twin_of(like, found.captures[0].lens, albedo).camera
+    camera = with_lens(like, found.captures[0].lens)
     if isinstance(camera, EmpiricalCamera) or not found.surfaces:
         what = "is an empirical camera" if found.surfaces else "is refitted on flat surfaces, and none was found"
         raise UserError(f"--like {like}: {what}", fix="leave out --like: the file is then an empirical camera")

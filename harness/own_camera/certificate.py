@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -19,9 +20,9 @@ from detectors.noise import rounding_left_m2
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import StudyRecord
 from harness.own_camera.measure import Characteristics
-from harness.own_camera.page import own_figures
+from harness.own_camera.page import shared_figures
 from harness.report.blocks import bullets, heading, note, page
-from harness.tables.characteristics import CERTIFIED
+from harness.tables.characteristics import CERTIFIED, FLAT_SURFACES
 from harness.tables.limits import LIMITS
 from harness.tables.text import many
 from harness.vocabulary.files import write_text
@@ -35,6 +36,12 @@ PRINTED = Markup(
     " input { display: none } }</style>"
 )
 SHOWN_LIMITS = ("set-up", "a90/95 (mm)", "over boards (mm)", "a90 (mm)", "a50 (mm)", "calls/m² (95 %)", "found")
+OF_SURFACES = (
+    "Temporal noise: deviation of single pixels over frames, of z. Plane-fit rms: distance of points from their own "
+    "plane. Dispersion: width that 95 % of a frame's points need, in the manner of ISO 10360-13; flatness: 99.7 %, in "
+    "the manner of VDI/VDE 2634-2; all three include the surface's own shape and the lens' error. Fill rate: share of "
+    "pixels and frames with a return. LoD95: 1.96 deviations of a pixel's z, fixed pattern and rounding included."
+)
 POD = (
     "a50, a90, a90/95 in the manner of MIL-HDBK-1823A, ASTM E2862 (hits and misses) and E3023 (signals); false calls"
     " per square metre with the exact 95 % Poisson interval; a finding within {:g} mm of a damage is a hit."
@@ -64,22 +71,27 @@ def spacings_mm(found: Characteristics, poses: Sequence[np.ndarray]) -> Iterator
         yield float(plane.distance_m * plane.normal[2] - point @ plane.normal) / MM
 
 
+def of_surfaces(found: Characteristics) -> Iterator[dict[str, Any]]:
+    """Yield the rows of `FLAT_SURFACES`."""
+    names = ("frame_rms_mm", "average_rms_mm", "form95_mm", "form997_mm", "fill_rate")
+    for one in found.surfaces:
+        lods = [level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES]
+        ends = one.temporal.interval
+        temporal = {"temporal_mm": one.temporal.value, "temporal_low_mm": ends.low, "temporal_high_mm": ends.high}
+        levels = {f"lod95_{frames}_mm": lod for frames, lod in zip(LOD_FRAMES, lods, strict=True)}
+        yield {"surface": one.where, **temporal, **{name: getattr(one, name) for name in names}, **levels}
+
+
 def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Iterator[dict[str, str]]:
-    """Yield the rows: the page's figures, then those of the standards."""
+    """Yield the rows of `CERTIFIED`: figures that are of no single surface, then those of the standards."""
 
     def row(quantity: str, conditions: str, value: str, manner: str) -> dict[str, str]:
         return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner}
 
-    for name, where, unit, reading, meaning in own_figures(found):
+    for name, where, unit, reading, meaning in shared_figures(found):
         if name.endswith("correlation") and not where.endswith(" lag 1"):
             continue  # the rest stands on the page
-        ends = reading.interval
-        told = f" ({ends.low:.3g} to {ends.high:.3g})" if np.isfinite(ends.low) else ""
-        yield row(name, where, f"{reading.value:.3g}{told} {unit}".removesuffix(" 1"), meaning)
-    for one in found.surfaces:
-        lods = [level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES]
-        value, manner = " / ".join(f"{lod:.3g}" for lod in lods), "1.96 deviations of a pixel's z, pattern included"
-        yield row(f"LoD95, {' / '.join(map(str, LOD_FRAMES))} frames", one.where, f"{value} mm", manner)
+        yield row(name, where, f"{reading.value:.3g} {unit}".removesuffix(" 1"), meaning)
     flat = all(capture.planes for capture in found.captures)
     errors = [] if poses is None or not flat else list(spacings_mm(found, poses))
     value = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
@@ -98,19 +110,26 @@ def write_certificate(
     """Write ``certificate.html`` and ``certificate.json`` into a folder. ``about``: unit, mode, firmware, warm-up and
     such, in words. Raises UserError where they cannot be written."""
     rows, limits = list(certified(found, poses)), [limit_of(one) for one in study.set_ups] if study else []
+    surfaces = list(of_surfaces(found))
     share = "The camera's figures are measured."
     if study is not None:
         implanted = "Of the detection limits the frames are measured and the damage is simulated."
         share += f" {implanted if study.name == 'implant' else 'The detection limits are simulated.'}"
     frames = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]
-    body += [heading("Measured"), CERTIFIED.grid(rows).html()]
+    body += [heading("Measured"), FLAT_SURFACES.grid(surfaces).html(), note(OF_SURFACES), CERTIFIED.grid(rows).html()]
     if study is not None:
         body += [heading("Probability of detection"), LIMITS.grid(limits, only=SHOWN_LIMITS).html()]
         body += [note(POD.format(study.hit_radius_mm))]
     body += [heading("Validity"), bullets((share, *CONDITIONS)), note(f"{date.today().isoformat()}: {command}")]
     text = page(f"Certificate of measurement: {about['unit']}", frames, body, warnings=found.doubts)
-    told = {"results_version": RESULTS_VERSION, "about": about, "figures": rows, "conditions": [share, *CONDITIONS]}
+    told = {
+        "results_version": RESULTS_VERSION,
+        "about": about,
+        "figures": rows,
+        "surfaces": FLAT_SURFACES.data(surfaces),
+        "conditions": [share, *CONDITIONS],
+    }
     told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)
     write_text(folder / "certificate.json", json.dumps(told, indent=2, ensure_ascii=False) + "\n")

@@ -7,6 +7,7 @@ displacement taken off. Not told: errors that all frames and all pixels share, a
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,11 +21,17 @@ from detectors.flat_captures import Separated, flattened, separated
 from detectors.noise import LEAST_FRAMES, rounding_left_m2
 from detectors.recordings import Recording
 from harness.scorecard import bench
-from harness.scorecard.capture import EDGE_PX, LEAST_BIN_PX, LEAST_PLANE_PX, LEAST_STEP_M, TOLERANCE_M, WIDEST_PX
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens
 from scenes.closed_form import Plane
 
+TOLERANCE_M, LEAST_PLANE_PX = 8 * MM, 2000
+"""A point this near to a plane is on it: a nominal lens bows real walls by 3 mm rms. Pixels of the smallest plane."""
+EDGE_PX, WIDEST_PX, LEAST_STEP_M = 3, 24, 20 * MM
+"""Pixels nearer to a plane's rim are left out: the camera's filter mixes in what is beyond. Farthest pixels that two
+surfaces at an edge lie apart, and the least step of depth there."""
+LEAST_BIN_PX = 300
+"""Some 12 windows of 5 x 5: the deviation of 20 frames is then known to 5 %."""
 MOST_FRAMES = 300
 """Frames of a capture that are held in memory: 440 MB of 640 x 576 pixels."""
 RANGE_CELLS, LIGHT_CELLS, ANGLE_CELL_DEG = 1.08, 1.25, 10.0
@@ -45,7 +52,8 @@ recording was averaged, smoothed or rounded before it was stored."""
 @dataclass(frozen=True)
 class StillCapture:
     """Frames of a static scene: ``z_m`` (n, h, w) float32, NaN where invalid; ``slopes`` (h, w, 2); mean ``amplitude``
-    (h, w), NaN where never above 0, or None; ``step_m`` of the stored z; ``planes`` with their pixels (h, w) bool."""
+    (h, w), NaN where never above 0, or None; ``step_m`` of the stored z; ``planes`` with their pixels (h, w) bool;
+    ``used`` (h, w) bool: pixels that count."""
 
     name: str
     lens: Lens
@@ -54,6 +62,7 @@ class StillCapture:
     amplitude: np.ndarray | None
     step_m: float
     planes: tuple[tuple[Plane, np.ndarray], ...]
+    used: np.ndarray
 
     @cached_property
     def steady(self) -> np.ndarray:
@@ -121,6 +130,11 @@ class StillCapture:
             cosine[mask] = np.abs(along) / self.stretch[mask]
         return cosine
 
+    def whole(self, mask: np.ndarray) -> np.ndarray:
+        """Return a surface's pixels (h, w) bool, those without a return among them, without its rim."""
+        near = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
+        return np.asarray(inner(np.asarray(ndimage.binary_fill_holes(near))[8:-8, 8:-8]) & self.used)
+
     def cloud(self) -> Cloud:
         """Return the average of the frames that do not jump."""
         count = np.isfinite(self.noise_m).sum(axis=0)
@@ -134,9 +148,9 @@ def inner(mask: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] > EDGE_PX)
 
 
-def read_still(recording: Recording) -> StillCapture:
-    """Read a recording into memory, `MOST_FRAMES` at most. Raises UserError where it has too few frames, no grid of
-    pixels or no lens, or where nothing in it varies."""
+def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCapture:
+    """Read a recording into memory, `MOST_FRAMES` at most, and of ``used`` (h, w) pixels. Raises UserError where it
+    has too few frames, no grid of pixels, no lens, another size than ``used``, or where nothing in it varies."""
     name, lens, slopes = recording.name, recording.lens, recording.slopes
     if not recording.organised or lens is None or slopes is None:
         what = f"{name}: points without a pixel grid and a lens do not tell a camera's noise"
@@ -146,6 +160,11 @@ def read_still(recording: Recording) -> StillCapture:
         what = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}; temporal noise needs repeats"
         raise UserError(what, legal=f"{LEAST_FRAMES} frames or more of a static scene", fix="record 50 or more")
     z_m = np.stack([frame.z_m for frame in frames]).astype(np.float32)
+    used = np.ones(z_m.shape[1:], bool) if used is None else used
+    if used.shape != z_m.shape[1:]:
+        sizes = (f"{one.shape[-1]} x {one.shape[-2]}" for one in (used, z_m))
+        raise UserError("--mask: {} pixels, but the frames have {}".format(*sizes))
+    z_m[:, ~used] = np.nan
     if all(np.array_equal(z_m[0], z_m[k], equal_nan=True) for k in (len(z_m) // 2, -1)):
         what = f"{name}: all frames are equal, so that they show no noise"
         raise UserError(what, legal="frames as the camera gives them", fix="record single frames, not their average")
@@ -154,7 +173,7 @@ def read_still(recording: Recording) -> StillCapture:
     median_m[often] = np.nanmedian(z_m[:, often], axis=0)
     planes = bench.find_planes(median_m, slopes, TOLERANCE_M, min(LEAST_PLANE_PX, often.size // 20))
     amplitude = mean_amplitude([frame.amplitude for frame in frames])
-    return StillCapture(name, lens, z_m, slopes, amplitude, recording.z_step_m, tuple(planes))
+    return StillCapture(name, lens, z_m, slopes, amplitude, recording.z_step_m, tuple(planes), used)
 
 
 def mean_amplitude(stack: Sequence[np.ndarray | None]) -> np.ndarray | None:
@@ -261,19 +280,13 @@ class Dropouts(NamedTuple):
     pixels: np.ndarray
 
 
-def surface_pixels(mask: np.ndarray) -> np.ndarray:
-    """Return a surface's pixels (h, w) bool, those without a return among them, without its rim."""
-    near = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
-    return inner(np.asarray(ndimage.binary_fill_holes(near))[8:-8, 8:-8])
-
-
 def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
     """Return the dropouts of all captures together, on their surfaces."""
     parts = [np.zeros((2, 0))]
     for capture in captures:
         share = 1 - np.isfinite(capture.z_m).mean(axis=0)
         level = np.full(share.shape, np.nan) if capture.amplitude is None else capture.amplitude
-        parts += [np.stack([level[whole], share[whole]]) for whole in (surface_pixels(m) for _, m in capture.planes)]
+        parts += [np.stack([level[whole], share[whole]]) for whole in (capture.whole(m) for _, m in capture.planes)]
     level, share = np.concatenate(parts, axis=1)
     number = np.nan_to_num(np.floor(np.log(level) / np.log(LIGHT_CELLS)), nan=-1e9)
     groups = [number == one for one in np.unique(number[np.isfinite(level)]) if (number == one).sum() >= LEAST_BIN_PX]
@@ -318,7 +331,7 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         temporal = bench.jackknifed(noise[:, None], lambda part: bench.temporal_sigma_m(part) / MM)
         rms_mm, *forms_mm = np.mean([_form(frame, slopes) for frame in z_m[:: max(1, len(z_m) // 5)]], axis=0).tolist()
         at = float(np.median(mean_m)), float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[few]))))
-        fill = float(np.isfinite(capture.z_m[:, surface_pixels(mask)]).mean())
+        fill = float(np.isfinite(capture.z_m[:, capture.whole(mask)]).mean())
         told: list[Any] = [*at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill]
         yield SurfaceFigures(capture.name, number, *told)
 
@@ -345,20 +358,26 @@ class EdgeFigures(NamedTuple):
 
 def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
     """Return the edges between surfaces of all captures together; None without any."""
-    found = []
+    lines = defaultdict[tuple[str, frozenset[int]], tuple[list[Any], list[Any]]](lambda: ([], []))
     for capture in captures:
         labels = np.zeros(capture.stretch.shape, int)
-        for number, (_, mask) in enumerate(capture.planes, start=1):
-            labels[mask] = number
-        images = labels, np.isfinite(capture.z_m).mean(axis=0), capture.mean_m
-        for image, share, z_m in (images, tuple(each.T for each in images)):
+        share = np.isfinite(capture.z_m).mean(axis=0)
+        for number, (plane, mask) in enumerate(capture.planes, start=1):
+            # of a simulated capture other pixels than those of the mask may be lost or off the surface
+            off_m = np.abs(capture.mean_m - plane.z_along_m(capture.slopes))
+            labels[mask & (share >= 0.5) & (off_m <= bench.GROWN * TOLERANCE_M)] = number
+        images = labels, share, capture.mean_m
+        for axis, (image, share, z_m) in enumerate((images, tuple(each.T for each in images))):
             for row, line in enumerate(image):
                 (known,) = np.nonzero(line)
                 for at in np.flatnonzero((np.diff(line[known]) != 0) & (np.diff(known) <= WIDEST_PX)):
                     last, first = known[at : at + 2]
                     between = share[row, last + 1 : first]
-                    found.append(((1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])))
-    rows = np.array([row for row in found if row[2] > LEAST_STEP_M])
+                    told = (1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])
+                    if told[2] > LEAST_STEP_M:
+                        lines[capture.name, frozenset(line[[last, first]])][axis].append(told)
+    # along the axis that cuts across more of the edge: the other one meets it aslant
+    rows = np.array([row for both in lines.values() for row in max(both, key=len)])
     if len(rows) < LEAST_BIN_PX // 10:
         return None
     return EdgeFigures(len(rows), float(rows[:, 0].mean()), float(rows[:, 1].mean()), float(np.median(rows[:, 2])))

@@ -28,12 +28,16 @@ SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
     "Upper row: the surfaces that were found; temporal noise against range, the dots in cells of like angle and "
     "brightness; its correlation between neighbours. Lower row: displacement of whole frames; dropouts against "
-    "amplitude; correlation of the fixed pattern. The camera file's simulation is orange."
+    "amplitude; correlation of the fixed pattern. The simulation of the camera's file is orange."
 )
 
 
-def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading, str]]:
-    """Yield name, place, unit, value and meaning of each figure; the same of every source, in the same order."""
+Told = tuple[str, str, str, Reading, str]
+"""Name, place, unit, value and meaning of a figure."""
+
+
+def own_figures(found: Characteristics) -> Iterator[Told]:
+    """Yield each figure; the same of every source, in the same order."""
     for one in found.surfaces:
         relief = "the surface's own shape and the lens' error included"
         yield "temporal noise", one.where, "mm", one.temporal, "deviation of single pixels over frames, of z"
@@ -49,6 +53,11 @@ def own_figures(found: Characteristics) -> Iterator[tuple[str, str, str, Reading
         ):
             yield name, one.where, "mm", Reading(value), meaning
         yield "fill rate", one.where, "1", Reading(one.fill_rate), "share of pixels and frames with a return"
+    yield from shared_figures(found)
+
+
+def shared_figures(found: Characteristics) -> Iterator[Told]:
+    """Yield the figures that are of no single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
             alike = Reading(float(found.correlation[axis, lag]))
@@ -97,7 +106,7 @@ def beside(found: Characteristics, twin: Characteristics, known: Characteristics
 
 
 def write_page(
-    folder: Path,
+    path: Path,
     sources: Mapping[str, Characteristics],
     rows: list[OwnFigure],
     title: str,
@@ -105,9 +114,9 @@ def write_page(
     known: str,
     command: str,
 ) -> None:
-    """Write the tables' files and ``characterise.html`` into a folder. ``sources``: what was measured, simulated and,
-    where there is one, the ``known`` camera's by their names. Raises UserError where the folder cannot be written."""
-    found = sources[MEASURED]
+    """Write a page, and the tables' files beside it. ``sources``: what was measured, simulated and, where there is one,
+    the ``known`` camera's by their names. Raises UserError where they cannot be written."""
+    found, folder = sources[MEASURED], path.parent
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
@@ -117,13 +126,13 @@ def write_page(
         figure({"captures": drawn}, "captures", CAPTION),
         heading("Measured and simulated"),
         paragraph(
-            "The simulation is of the camera file, before the same surfaces as fitted planes, and is analysed like"
+            "The simulation is of the camera's file, before the same surfaces as fitted planes, and is analysed like"
             " the captures. A ratio of 1 says that the file repeats the camera."
         ),
         OWN_FIGURES.grid(rows, heads=heads).html(),
         *command_of(command),
     ]
-    write_text(folder / "characterise.html", page(title, answer, body, warnings=found.doubts))
+    write_text(path, page(title, answer, body, warnings=found.doubts))
 
 
 def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:

@@ -11,6 +11,7 @@ from harness.report.blocks import GREY, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MM_PER_INCH = 25.4
 PAPER_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -66,14 +67,11 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
 
 def template_svg(board: Any, dictionary: str) -> bytes:
     """Return one board as a drawing of its own size."""
-    size_mm = (board.width_mm + 2, board.height_mm + 2)
-
-    def draw(axes: Axes) -> None:
-        axes.set(xlim=(-size_mm[0] / 2, size_mm[0] / 2), ylim=(-size_mm[1] / 2, size_mm[1] / 2))
-        draw_board(axes, board, dictionary)
-
+    wide, high = board.width_mm + 2, board.height_mm + 2
+    figure, axes = _sheet((-wide / 2, -high / 2, wide, high), board.name)
+    draw_board(axes, board, dictionary)
     buffer = io.BytesIO()
-    _sheet(size_mm, draw, board.name).savefig(buffer, format="svg", metadata={"Date": None})
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
 
@@ -87,17 +85,11 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
             sheet, places = tiles_of(board.width_mm, board.height_mm, paper)
             for number, (x, y) in enumerate(places, start=1):
                 left, low = x - board.width_mm / 2, y - board.height_mm / 2
-                room = (sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM)
-
-                def draw(axes: Axes, board: Any = board, at: Any = (left, low, *room), said: str = "") -> None:
-                    left, low, wide, high = at
-                    axes.set(xlim=(left - MARGIN_MM, left + wide + MARGIN_MM),
-                             ylim=(low - MARGIN_MM - FOOT_MM, low + high + MARGIN_MM))  # fmt: skip
-                    draw_board(axes, board, dictionary)
-                    _frame(axes, at, said)
-
+                figure, axes = _sheet((left - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name)
+                draw_board(axes, board, dictionary)
                 said = f"{board.name}, tile {number} of {len(places)}: print at 100 %"
-                pages.savefig(_sheet(sheet, lambda axes, draw=draw, said=said: draw(axes, said=said), board.name))
+                _frame(axes, (left, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM), said)
+                pages.savefig(figure)
     return buffer.getvalue()
 
 
@@ -121,14 +113,15 @@ def _frame(axes: Axes, at: tuple[float, float, float, float], said: str) -> None
     axes.annotate(f"{SCALE_MM:g} mm   {said}", (left + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center")
 
 
-def _sheet(size_mm: tuple[float, float], draw: Any, name: str) -> Any:
-    """Return a figure of so many millimetres whose axes fill it, equally scaled: a millimetre is a millimetre."""
+def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:
+    """Return a figure of so many millimetres (left, low, wide, high) whose axes fill it: a millimetre is one on it."""
     from matplotlib import rcParams
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(size_mm[0] / MM_PER_INCH, size_mm[1] / MM_PER_INCH))
+    rcParams["svg.hashsalt"] = name
+    left, low, wide, high = view_mm
+    figure = Figure(figsize=(wide / MM_PER_INCH, high / MM_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
-    draw(axes)
-    rcParams["svg.hashsalt"] = name
-    return figure
+    axes.set(xlim=(left, left + wide), ylim=(low, low + high))
+    return figure, axes

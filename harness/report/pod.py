@@ -74,12 +74,13 @@ def pod_html(statement: PodStatement, command: str) -> str:
         body += [subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
     body += [heading("Notes"), bullets((*statement.notes, VALIDITY)), *command_of(command)]
     under = [note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
-    return page(f"Probability of detection: {statement.path.name}", answer(statement), body, under)
+    return page(f"Probability of detection: {statement.path.name}", answer(statement), body, under, statement.doubts)
 
 
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
     """Return what a terminal shows: the page's tables and sentences."""
-    parts: list[str | Grid] = [f"{statement.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
+    parts: list[str | Grid] = [f"warning: {doubt}" for doubt in statement.doubts]
+    parts += [f"{statement.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
     parts += ["", models_grid(statement), "", sizes_grid(statement), "", fit_grid(statement)]
     if statement.tests:
         parts += ["", *(f"{what}: p = {p:.3g}, {reads}" for what, p, reads in statement.tests)]

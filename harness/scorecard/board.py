@@ -12,6 +12,7 @@ depth image is interpolated linearly where the board's plane projects to).
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -25,12 +26,15 @@ from detectors.average import AverageConfig, average
 from harness.evaluation.match import match
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import ExperimentConfig, Point
-from harness.report.blocks import COLOURS, svg
+from harness.report.blocks import COLOURS, command_of, figure, heading, note, page, paragraph, svg
 from harness.scorecard.bench import Reading, jackknifed, mean_of, temporal_sigma_m
-from harness.scorecard.capture import write_comparison
-from harness.scorecard.figures import Beside
+from harness.scorecard.figures import BESIDE, Beside
+from harness.tables.schema import write_table
+from harness.tables.text import show
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM, Cloud, Lens, invert, transform_points
+from harness.vocabulary.provenance import RESULTS_VERSION, record
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import AnyCamera, camera_of
 from scenes.sensor.source import SimulatedUnit
@@ -48,6 +52,17 @@ OFF_RING = 4.0
 PATTERN_PX, ANGLES_DEG = (3, 6, 12), (0, 20, 35, 60)
 CLOSE = 0.3
 """A ratio this far from 1 counts as agreement."""
+HOW = (
+    "The board is declared, its view rendered with light between its surfaces, the camera simulated as its file "
+    "stands, and the frames resampled onto the capture's pixels. The same analysis is applied to both, in rings of "
+    "6.5 to 13.5 mm about the holes, each less a quadratic surface; a hole's peak is the largest deviation within 6 mm "
+    "of its centre. Nothing is fitted. Things that lie on the real board, its relief and what the camera's maker does "
+    "to pixels between two surfaces are not simulated; detectors see whole images, with one threshold for both."
+)
+CAPTION = (
+    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals, temporal deviations "
+    "those of a jackknife over frames."
+)
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
 """Readings, each with its number of pixels or holes, by quantity, condition and unit."""
 
@@ -202,10 +217,17 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
         print(f"simulated: {label}", flush=True)
     answer = _answer(rows) if recording else "No capture is given: the simulation stands alone."
     print("\n".join([answer, *told]))
-    facts = {"experiment": experiment.digest, "files": [str(path) for path in recording.files] if recording else []}
-    words = {"name": config.title or config.name, "camera": camera.title, "answer": answer, "remarks": told}
-    figure = svg("peaks", (7.2, 4.4), "Peaks of the holes", lambda figure: _draw(figure, target, judged))
-    write_comparison(options, rows, facts, command, **words, board=True, frames=frames, figure=figure)
+    drawn = svg("peaks", (7.2, 4.4), "Peaks of the holes", lambda canvas: _draw(canvas, target, judged))
+    body = [figure({"peaks": drawn}, "peaks", CAPTION), heading("All numbers"), BESIDE.grid(rows).html()]
+    under = [*map(note, told), paragraph(f"{frames} frames of each set-up. {HOW}")]
+    title = f"{config.title or config.name} beside the simulated {camera.title}"
+    show([BESIDE.grid(rows)])
+    write_table(options.out, BESIDE, BESIDE.frame(rows))
+    write_text(options.out / "capture.html", page(title, answer, [*body, *command_of(command)], under))
+    files = [str(path) for path in recording.files] if recording else []
+    origin = {"results_version": RESULTS_VERSION, **record(command), "experiment": experiment.digest, "files": files}
+    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
+    print(f"wrote {options.out / 'capture.html'}")
     return 0
 
 

@@ -63,6 +63,23 @@ OWN_CURVES = Table(
     ),
     formats=("csv",),
 )
+FLAT_SURFACES = Table(
+    "surfaces",
+    "one row per flat surface of a certificate",
+    (
+        Column("surface", "surface", note="capture, distance and angle of incidence"),
+        Column("temporal_mm", "temporal noise (mm)", note="of single pixels", interval=True),
+        Column("frame_rms_mm", "plane-fit rms, one frame (mm)", note="of points about their own plane"),
+        Column("average_rms_mm", "average (mm)", note="the same of the average of all frames"),
+        Column("form95_mm", "dispersion, 95 % (mm)", note="width that so many of a frame's points need"),
+        Column("form997_mm", "flatness, 99.7 % (mm)", note="likewise"),
+        Column("fill_rate", "fill rate", note="share of pixels and frames with a return"),
+        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection of one pixel's z"),
+        Column("lod95_10_mm", "10 frames (mm)", note="likewise"),
+        Column("lod95_50_mm", "50 frames (mm)", note="likewise"),
+    ),
+    formats=(),
+)
 CERTIFIED = Table(
     "certificate",
     "one row per figure of a certificate",

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import special, stats
 
 from harness.evaluation.pod.curve import Bound, PodCurve, ascend
-from harness.evaluation.pod.hit_miss import number_of_targets
+from harness.evaluation.pod.hit_miss import rows_of_target
 from harness.vocabulary.errors import UserError
 
 LEAST_TARGETS = 40
@@ -80,7 +80,8 @@ def fit_ahat(
     names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
     if not n == len(signals) == len(names):
         raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
-    targets = number_of_targets(sizes, names)
+    rows_each = rows_of_target(sizes, names)
+    targets = round(float((1 / rows_each).sum()))
     low, high = -np.inf if left is None else left, np.inf if right is None else right
     if not low < high:
         raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
@@ -100,7 +101,7 @@ def fit_ahat(
     if b1 <= 0:
         fix = "check the columns of size and signal, or take the signal with the other sign"
         raise UserError(f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit", fix=fix)
-    per_target = n / targets
+    per_target = float(rows_each.mean())  # the design effect of rows that are alike within a target (Kish)
     mu, sigma, covariance = float((threshold - b0) / b1), float(line.tau / b1), line.covariance * per_target
     jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
     curve = PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)

@@ -1,9 +1,10 @@
 """Probability of detection from hits and misses: a binomial regression on size, by MIL-HDBK-1823A appendix G.
 
 Rows that share an identity in ``inspections`` are one target and taken as fully dependent (the handbook's reading): of
-k rows a target, covariance and likelihood ratio criterion are scaled by k. P(hit) = f + (c - f) F(b0 + b1 z) with 0 <=
-f <= 1/2 <= c <= 1; with floor f or ceiling c fitted it is not concave, and maximised from several starts. Not modelled:
-targets that differ in anything but size, inspectors, a floor above or a ceiling below one half. Bounds are one-sided:
+k rows a target, covariance and likelihood ratio criterion are scaled by k; where numbers differ, rows are weighted so
+that each target counts once. P(hit) = f + (c - f) F(b0 + b1 z) with 0 <= f <= 1/2 <= c <= 1; with floor f or ceiling c
+fitted it is not concave, and maximised from several starts. Not modelled: targets that differ in anything but size,
+inspectors, a floor above or a ceiling below one half. Bounds are one-sided:
 
 - "likelihood ratio" (default): the set 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 in (mu, sigma), MIL-HDBK-1823A
   G.3; a90/95 is the largest a90 in it, which equals the profile likelihood of a90 at that criterion.
@@ -117,13 +118,16 @@ def fit_hit_miss(
     Where hits and misses do not overlap there is no maximum of the likelihood: Firth's penalised one is fitted, with a
     note. `UserError` for values that cannot be fitted and for a chance of detection that does not grow with size."""
     x, hits = _checked(size, hit, link, log_size, bounded)
-    n, targets = len(x), number_of_targets(x, inspections)
-    repeats, rate, centre, spread = n / targets, float(hits.mean()), float(x.mean()), float(x.std())
+    n, rows_each = len(x), rows_of_target(x, inspections)
+    targets = round(float((1 / rows_each).sum()))
+    repeats, centre, spread = n / targets, float(x.mean()), float(x.std())
+    weight = repeats / rows_each  # every target counts the same, however often it was inspected
+    rate = float(np.average(hits, weights=weight))
     # Complete and quasi-complete separation on a line, either way round: Albert and Anderson, Biometrika 71 (1984).
     separated = bool(x[~hits].max() <= x[hits].min() or x[hits].max() <= x[~hits].min())
     design = np.column_stack([np.ones_like(x), (x - centre) / spread])
-    found, penalty = hits.astype(float), repeats if separated else None
-    several = HitsAndMisses(design, found[None], 1.0 - found[None], link, penalty)
+    found, penalty = weight * hits, repeats if separated else None
+    several = HitsAndMisses(design, found[None], (weight - found)[None], link, penalty)
     notes: tuple[str, ...] = ()
     if separated:
         place = np.append(penalised_maxima(several, EXACT)[0], [0.0, 1.0])
@@ -136,12 +140,12 @@ def fit_hit_miss(
         start = np.array([float(link_ppf(link, np.array(rate))), 0.0])
         place = np.append(maxima(several, start, EXACT)[0], [0.0, 1.0])
         if bounded != "none" and place[1] > 0:
-            place, notes = _bounded_maximum(HitsAndMisses(design, found, 1.0 - found, link), place, bounded)
+            place, notes = _bounded_maximum(HitsAndMisses(design, found, weight - found, link), place, bounded)
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
         raise UserError("the chance of detection does not grow with size: the slope is not positive", fix=fix)
     floor, ceiling = float(place[2]), float(place[3])
-    single = HitsAndMisses(design, found, 1.0 - found, link, floor=floor, ceiling=ceiling)
+    single = HitsAndMisses(design, found, weight - found, link, floor=floor, ceiling=ceiling)
     log_likelihood = float(single.value(place[:2]))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
     b0, b1 = (float(b) for b in unscale @ place[:2])
@@ -149,6 +153,10 @@ def fit_hit_miss(
     slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
         notes += (f"{n} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
+        if np.ptp(rows_each):
+            notes += (
+                f"{rows_each.min()} to {rows_each.max()} inspections a target: weighted, each target counts once",
+            )
     curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T, floor, ceiling)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
     numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
@@ -206,11 +214,10 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
     share, miss, density = np.exp(logs_of_link(data.link, b0 + b1 * data.z))
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
     p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
-    hit = data.hits > 0
-    slope = np.where(hit, 1.0 / p_hit, -1.0 / p_miss)
+    slope = data.hits / p_hit - data.misses / p_miss
     along = slope * (ceiling - floor) * density
     gradient = np.array([along.sum(), along @ data.z, slope @ (1.0 - share), slope @ share])
-    return float(np.log(np.where(hit, p_hit, p_miss)).sum()), gradient
+    return float(data.hits @ np.log(p_hit) + data.misses @ np.log(p_miss)), gradient
 
 
 def most_likely_below(data: HitsAndMisses, place: np.ndarray, bounded: str, pod: float) -> float:
@@ -273,8 +280,9 @@ def _search(
 
     order = np.argsort(z, kind="stable")
     sizes, first = np.unique(z[order], return_index=True)
-    n_below, hits = first[1:], data.hits.sum()
-    below, n_above = np.append(0.0, np.cumsum(data.hits[order]))[n_below], len(z) - n_below
+    counts = np.stack([data.hits, data.hits + data.misses])
+    (below, n_below), (hits, n) = np.cumsum(counts[:, order], axis=1)[:, first[1:] - 1], counts.sum(axis=1)
+    n_above = n - n_below
     low, high = np.clip(below / n_below, *floor), np.clip((hits - below) / n_above, *ceiling)
     value = xlogy(below, low) + xlogy(n_below - below, 1.0 - low)
     value += xlogy(hits - below, high) + xlogy(n_above - (hits - below), 1.0 - high)
@@ -334,17 +342,17 @@ def _checked(
     return np.log(sizes) if log_size else sizes, hits == 1.0
 
 
-def number_of_targets(size: np.ndarray, inspections: ArrayLike | None) -> int:
-    """Count the different targets that rows (n,) inspect; each row is its own where ``inspections`` is None."""
+def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarray:
+    """Return how many rows (n,) inspect each row's target; each row has its own where ``inspections`` is None."""
     if inspections is None:
-        return len(size)
+        return np.ones(len(size), int)
     names = np.asarray(inspections).astype(str)
     if len(names) != len(size):
         raise UserError(f"{len(names)} identities of targets for {len(size)} rows", legal="one for each row")
     _, first, target = np.unique(names, return_index=True, return_inverse=True)
     if np.any(other := size != size[first][target]):
         raise UserError(f"target {names[other][0]} has more than one size", legal="one size for each target")
-    return len(first)
+    return np.bincount(target)[target]
 
 
 METHODS = ("likelihood ratio", "wald", "profile")

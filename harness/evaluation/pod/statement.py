@@ -12,6 +12,7 @@ from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, c
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import (
     METHODS,
+    NEAR_DEVIANCE,
     Between,
     HitMissFit,
     bound,
@@ -31,6 +32,8 @@ DRAWN = 241
 """Sizes at which curve and band are drawn."""
 LEAST_TARGETS = 60
 """MIL-HDBK-1823A: independent targets that a hit/miss study should have at least."""
+APART = 0.05
+"""Share by which a90/95 of models that fit about equally well may differ without a warning."""
 FEWEST_SITES = 5
 """Unflawed sites below which no law is fitted to their signals."""
 TESTED: dict[Between, str] = {
@@ -93,6 +96,16 @@ class PodStatement:
         rows = f"{len(self.size)} inspections of {self.targets} targets"
         return rows if self.signal else f"{rows}, {int(self.response.sum())} hits"
 
+    @property
+    def doubts(self) -> list[str]:
+        """Return a warning where a90/95 of models that fit about equally well differ by more than `APART`."""
+        most = min(row.criterion for row in self.models) + NEAR_DEVIANCE * len(self.size) / self.targets
+        limits = [row.bound.value for row in self.models if row.criterion <= most]
+        if max(limits) <= (1 + APART) * min(limits):
+            return []
+        texts = [f"{one:.4g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
+        return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}"]
+
     def to_data(self) -> dict[str, Any]:
         """The statement as JSON's types; an infinite size becomes None, and ``why`` says so."""
         curve, names = self.curve, ("kind", "unit", "size_column", "response_column", "targets", "model")
@@ -117,6 +130,7 @@ class PodStatement:
             "numbers": {name: finite(value) for name, value in self.numbers.items()},
             "tests": [{"test": what, "p": finite(p), "reads": reads} for what, p, reads in self.tests],
             "notes": list(self.notes),
+            "warnings": self.doubts,
         }
 
 

@@ -1,0 +1,66 @@
+"""``harness.validate --capture``: a static capture beside the simulation of a known camera, as its file stands.
+
+What is measured, and how it is simulated again, is as in `harness.characterise`; nothing is fitted to make both agree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from detectors.recordings.depth_images import read_picture
+from harness.own_camera.camera_file import camera_of_size, opened_as, simulated, with_lens
+from harness.own_camera.measure import characteristics, read_still
+from harness.own_camera.page import MEASURED, SIMULATED, beside, write_page
+from harness.tables.characteristics import OWN_FIGURES
+from harness.tables.text import show
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_text
+from harness.vocabulary.provenance import RESULTS_VERSION, record
+
+
+def run_capture(options: argparse.Namespace, command: str) -> int:
+    """Compare, print, write capture.html, the tables and provenance.json. Returns 0. Raises UserError for what cannot
+    be read or simulated: too few frames, another size, no plane, no lens."""
+    if len(options.camera) > 1:
+        raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
+    if not 0 < options.albedo <= 1:
+        raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+    first = slice(options.frames) if options.frames else None
+    known = options.camera[0] if options.camera else None
+    recording = opened_as(known, options.capture, options.intrinsics, unit=options.unit, frames=first)
+    capture = read_still(recording, None if options.mask is None else read_mask(options.mask))
+    name = known or camera_of_size(capture.lens)
+    camera, found = with_lens(name, capture.lens), characteristics([capture])
+    if not found.surfaces:
+        legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
+        fix = "check the lens (--intrinsics), or leave disturbing things out with --mask"
+        raise UserError(f"{capture.name}: no flat surface in it", legal=legal, fix=fix)
+    twin = characteristics(simulated(camera, found, options.albedo))
+    rows = beside(found, twin, None)
+    show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": ""})])
+    ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
+    answer = f"Temporal noise, simulated by measured: {ratios}. Albedo {options.albedo:g} is assumed."
+    title = f"{capture.name} beside the simulated {camera.title}"
+    print(answer)
+    sources = {MEASURED: found, SIMULATED: twin}
+    write_page(options.out / "capture.html", sources, rows, title, answer, "", command)
+    facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
+    origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": found.doubts}
+    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
+    print(f"wrote {options.out / 'capture.html'} and the tables")
+    return 0
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Return (h, w) bool: the pixels of an image that are not black. Raises UserError where it cannot be read."""
+    import cv2
+
+    try:
+        return np.asarray(read_picture(path, cv2.IMREAD_GRAYSCALE) > 0)
+    except UserError as error:
+        legal, why = "a PNG of the frames' size, black = left out", error.message.removeprefix(f"{path}: ")
+        raise UserError(f"--mask {path}: no image that can be read ({why})", legal=legal) from error
