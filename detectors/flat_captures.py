@@ -82,13 +82,11 @@ class FlatCapture:
 @dataclass(frozen=True)
 class PatternChange:
     """The pattern from one part of the captures beside that from another: correlation over pixels, rms of their
-    difference, and the rms that noise alone would make. ``half_m`` (h, w): half of the difference, which is as noisy as
-    the whole map."""
+    difference, and the rms that noise alone would make."""
 
     correlation: float
     difference_m: float
     noise_m: float
-    half_m: np.ndarray
 
     @property
     def excess_m(self) -> float:
@@ -265,7 +263,7 @@ def _change(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other:
     if both.sum() < 2:
         return None
     correlation = float(np.corrcoef(a[both], b[both])[0, 1])
-    return PatternChange(correlation, _rms((a - b)[both]), float(np.sqrt((of_a + of_b)[both].mean())), (a - b) / 2)
+    return PatternChange(correlation, _rms((a - b)[both]), float(np.sqrt((of_a + of_b)[both].mean())))
 
 
 def _with_doubts(found: Separated) -> Separated:

@@ -13,7 +13,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
-    from harness.tables.characteristics import OwnFigure
+    pass
 
 CAMERA_FILE = "my_camera.yaml"
 
@@ -101,7 +101,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": known or ""})])
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
-    answer += f" {CAMERA_FILE} repeats it within {100 * _worst(rows):.0f} %." if noise else ""
+    worst = max((abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"), default=0.0)
+    answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %." if noise else ""
     print(answer)
     page, title = options.out / "characterise.html", f"{options.title}, characterised"
     write_page(page, sources, rows, title, answer, known or "", command)
@@ -115,10 +116,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
     print(f"wrote {page}, {CAMERA_FILE} and the tables")
     return 0
-
-
-def _worst(rows: list[OwnFigure]) -> float:
-    return max(abs(row.ratio - 1) for row in rows if row.figure == "temporal noise")
 
 
 if __name__ == "__main__":

@@ -61,7 +61,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
     add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
     add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
-    add("--frames-report", action="store_true", help="list every frame with its valid part and median distance")
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is then one view. --crop cuts the target out of each; the detector judges all that is merged, unless"

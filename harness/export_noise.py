@@ -72,7 +72,9 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
     ``per_octave`` entries each; filters ``rows``, ``columns`` of the noise, ``pattern_rows``, ``pattern_columns`` of
     the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w): each pixel's light relative
     to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
-    optics, fine = camera.optics, _without_rounding(camera)
+    from scenes.sensor.calibration import with_number
+
+    optics, fine = camera.optics, with_number(camera, "engine", "output_step_mm", 1e-3)  # the table rounds by itself
     nearest_m, farthest_m = max(1.05 * optics.nearest_m, 0.1), 0.95 * min(optics.farthest_m, 15.0)
     levels = np.arange(np.log2(DARKEST / farthest_m**2), np.log2(1.0 / nearest_m**2), 1.0 / MEASURED)
     measured = [_before_plane(fine, level, nearest_m, farthest_m) for level in levels]
@@ -81,7 +83,8 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
     places = np.arange(levels[0], levels[-1], 1.0 / PER_OCTAVE)
     sigma_m = np.exp(np.interp(places, levels[known], np.log(sigma_m[known])))
     at = int(np.argmin(np.abs(levels - np.log2(ALBEDO / np.sqrt(nearest_m * min(farthest_m, 4.0)) ** 2))))
-    residuals = _residuals(fine, levels[at], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
+    stack_m = _stack_m(fine, levels[at], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
+    residuals = stack_m - np.nanmean(stack_m, axis=0)
     pattern = _pattern_m(fine)
     slopes, falloff = _pixels(camera)
     return {
@@ -98,13 +101,6 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
         "nearest_m": np.float32(optics.nearest_m),
         "farthest_m": np.float32(min(optics.farthest_m, 1e3)),
     }
-
-
-def _without_rounding(camera: AnyCamera) -> AnyCamera:
-    """Return the camera with an output in micrometres: rounding is the simulator's own last step."""
-    from scenes.sensor.calibration import with_number
-
-    return with_number(camera, "engine", "output_step_mm", 1e-3)
 
 
 def _stack_m(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int) -> np.ndarray:
@@ -129,11 +125,6 @@ def _before_plane(camera: AnyCamera, level: float, nearest_m: float, farthest_m:
     apart = np.abs(range_m[:, often] - middle)
     kept = apart < 8.0 * np.nanmedian(apart) / 0.6745
     return float(np.sqrt(np.mean(apart[kept] ** 2) * FRAMES / (FRAMES - 1))), float(there.mean())
-
-
-def _residuals(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int) -> np.ndarray:
-    range_m = _stack_m(camera, level, nearest_m, farthest_m, frames)
-    return np.asarray(range_m - np.nanmean(range_m, axis=0))
 
 
 def _pattern_m(camera: AnyCamera) -> np.ndarray:

@@ -13,15 +13,20 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.figure import Figure
+
     from detectors.flat_captures import FlatCapture, Separated
     from detectors.recordings import Recording
     from harness.vocabulary.geometry import Lens
+
+SHOWN_SIGMAS = 3.0
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
-    written = "the flat field; a .json and a .csv of its figures and a .png of the map are written beside it"
+    written = "the flat field; a .json of its figures and a .png of the map are written beside it"
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
@@ -47,8 +52,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
     from harness.inspection.told import print_warnings
+    from harness.report.blocks import save_png
     from harness.report.findings import plain_json
-    from harness.report.flat_field import histogram, save_flat_field_png, spectrum
     from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
     from harness.tables.text import show
     from harness.vocabulary.files import write_text
@@ -58,22 +63,31 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
     lens, captures = _captures(options)
     found = separated(captures, lens)
-    figures = list(figures_of(found))
-    noise = None if found.in_time is None else spectrum(found.in_time.half_m)
-    error_m = found.field.error_m
-    curves = {"histogram": histogram(error_m), "spectrum": spectrum(error_m), "noise_spectrum": noise}
+    answer, figures, error_m = _answer(found), list(figures_of(found)), found.field.error_m
     print_warnings(found.field.warnings)
-    print(_answer(found))
+    print(answer)
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
-    data, table, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".csv", ".png"))
+    data, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".png"))
     save_flat_field(options.out, found.field)
-    told = {"results_version": RESULTS_VERSION, "answer": _answer(found), "warnings": found.field.warnings}
-    told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures), **curves}
+    told = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": found.field.warnings}
+    told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
     write_text(data, plain_json({**told, "provenance": record(command)}))
-    write_text(table, FLAT_FIGURES.frame(figures).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
-    save_flat_field_png(picture, error_m, curves, _answer(found))
-    print(f"wrote {options.out}, {data.name}, {table.name}, {picture.name}")
+    save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
+    print(f"wrote {options.out}, {data.name}, {picture.name}")
     return 0
+
+
+def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
+    import numpy as np
+
+    from harness.vocabulary.geometry import MM
+
+    axes, limit = figure.subplots(), SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
+    shown = axes.imshow(error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    axes.set(xlabel="u, px", ylabel="v, px")
+    axes.grid(visible=False)
+    figure.colorbar(shown, ax=axes, extend="both").set_label("error of range, mm")
+    figure.suptitle(title, fontsize=10, parse_math=False)
 
 
 def _answer(found: Separated) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
+from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_paths
@@ -45,6 +45,11 @@ class Implant:
     shift_m: np.ndarray
     noise_m: np.ndarray
     lost: np.ndarray
+
+    @property
+    def depth_mm(self) -> float:
+        """The largest change of distance that the damage makes."""
+        return float(np.abs(self.shift_m).max()) / MM
 
     def put_into(self, frame: Frame, number: int, z_m: np.ndarray, reason: np.ndarray) -> None:
         """Change ``z_m`` and ``reason`` (H, W), copies of those of the recording's frame, in place. Of its pixels those
@@ -129,8 +134,9 @@ def implant_of(
     if same:
         return Implant(region, shift_m, noise_m, lost)
     # the recording was aligned to other pixels: each takes its value between those of the camera that it lies among
-    rays = _corners_m(board)
-    ends = lens.project(rays)
+    half = board.board.width_mm / 2 * MM
+    corners = np.array([(x, y, 0.0) for x in (-half, half) for y in (-half, half)])
+    ends = lens.project(transform_points(board.pose.T_camera_board, corners))
     (left, top), (right, bottom) = np.floor(ends.min(axis=0)).astype(int), np.ceil(ends.max(axis=0)).astype(int)
     onto = Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
     slopes = lens.region_slopes(onto)
@@ -160,9 +166,3 @@ def _near(unit: SimulatedUnit, board: custom.TargetConfig) -> np.ndarray:
     lens = unit.camera.nominal_lens
     reach_m = (unit.camera.optics.margin_px + BEYOND_PX) * float(centre[2]) / min(lens.fx, lens.fy)
     return np.asarray(np.linalg.norm(on_plane - centre, axis=-1) < damage.reach_mm * MM + reach_m)
-
-
-def _corners_m(board: custom.TargetConfig) -> np.ndarray:
-    half = board.board.width_mm / 2 * MM
-    corners = np.array([(x, y, 0.0, 1.0) for x in (-half, half) for y in (-half, half)])
-    return np.asarray((corners @ board.pose.T_camera_board.T)[:, :3])

@@ -236,7 +236,7 @@ def test_the_crop_decides_what_is_searched(capture: Path, tmp_path: Path, crop: 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script = ["--detector", "thesis", "--set", "variant=script"]
-    assert detect.main([str(capture), *script, "--average", "median", "--frames-report"]) == 0
+    assert detect.main([str(capture), *script, "--average", "median"]) == 0
     said = capsys.readouterr().out
     assert "threshold: 1.2 x" in said and "the detector's own" in said
     assert "frame depth/00002.png: 100.0 % valid, median distance 51" in said

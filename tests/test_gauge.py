@@ -11,11 +11,19 @@ import cv2
 import numpy as np
 import pytest
 
-from harness import detect, gauge, pod
+from harness import detect, gauge, pod, sweep
+from harness.evaluation.study.limit import limit_of
+from harness.evaluation.study.record import read_record
 from harness.inspection.gauge import Gauge, read_gauge
 from harness.report.gauge import MARGIN_MM, PAPER_MM, draw_board, template_pdf, tiles_of
 from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
+from scenes.optics import RenderConfig
+from scenes.render.cache import cached_view
+from scenes.sensor.camera import CameraConfig, camera_of, load_camera
+from scenes.sensor.source import SimulatedUnit
+from scenes.target import custom
 
+CAMERA = "azure_kinect_nfov"
 LENS = Lens(width=640, height=480, fx=700.0, fy=700.0, cx=320.3, cy=239.2)
 GIVEN = ["--diameters", "2:12", "--a50", "5", "--a90", "7", "--targets", "24"]
 DEPTH_M = 0.02
@@ -84,6 +92,21 @@ def test_tiles_cover_the_board_and_overlap(paper: str):
             assert any(left <= x <= left + room[0] and low <= y <= low + room[1] for left, low in places)
 
 
+def picture(truth: Gauge, place_mm: np.ndarray, hidden: tuple[int, ...] = ()) -> np.ndarray:
+    """The board's picture (h, w, 3) with its marks, whose pixels lie at places (h, w, 2) on it."""
+    (board,) = truth.boards
+    rgb = np.full((*place_mm.shape[:2], 3), 90, np.uint8)
+    rgb[(np.abs(place_mm) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)] = 215
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, truth.dictionary))
+    for mark in board.marks:
+        if mark.code not in hidden:
+            tag = cv2.aruco.generateImageMarker(known, mark.code, 8)
+            at = np.floor(((place_mm - [mark.x_mm, mark.y_mm]) * [1, -1] / mark.side_mm + 0.5) * 8).astype(int)
+            inside = ((at >= 0) & (at < 8)).all(axis=-1)
+            rgb[inside] = tag[at[inside][:, 1], at[inside][:, 0]][:, None] // 2 + 60
+    return rgb
+
+
 def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     """The drilled board as a camera without a model would see it: holes above a size are steps, with noise."""
     (board,) = truth.boards
@@ -100,15 +123,7 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     for hole in board.holes:
         if hole.diameter_mm > NEVER_FOUND_MM:
             z_m += DEPTH_M * (np.linalg.norm(place - [hole.x_mm, hole.y_mm], axis=-1) < hole.diameter_mm / 2)
-    rgb = np.full((*z_m.shape, 3), 90, np.uint8)
-    rgb[on_board] = 215
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, truth.dictionary))
-    for mark in board.marks:
-        if mark.code not in hidden:
-            tag = cv2.aruco.generateImageMarker(known, mark.code, 8)
-            at = np.floor(((place - [mark.x_mm, mark.y_mm]) * [1, -1] / mark.side_mm + 0.5) * 8).astype(int)
-            inside = ((at >= 0) & (at < 8)).all(axis=-1)
-            rgb[inside] = tag[at[inside][:, 1], at[inside][:, 0]][:, None] // 2 + 60
+    rgb = picture(truth, place, hidden)
     for name in ("depth", "color"):
         (folder / name).mkdir(parents=True)
     for number in range(3):
@@ -143,6 +158,69 @@ def test_a_capture_of_the_board_gives_hits_and_misses(made: Path, tmp_path: Path
     (tmp_path / "no.json").write_text('{"gauge_version": 1, "boards": []}')
     assert detect.main([str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
     assert "boards" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wrong(tmp_path: Path):
+    """The study simulates the camera with eight times the light of the real one; its own limit is too small. Holes of a
+    rendered gauge board, recorded by the real camera, correct it. The truth is the same study with the real camera."""
+    numbers = {"photons.signal_electrons": load_camera(CAMERA).photons.signal_electrons.value / 8}
+    experiment = Path(__file__).resolve().parents[1] / "experiments" / "detection_limit.yaml"
+    changes = ["source.target.distance_m=0.5", "detector.name=local", "detector.settings={}", "threshold={k: 6}"]
+    changes += ["study.boards=8", "study.hole_free_boards=1", "capture.frames=1", "source.target.room=null"]
+    changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
+    changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
+    given = [text for each in changes for text in ("--set", each)]
+    assert sweep.main([str(experiment), *given, "--out", str(tmp_path / "study")]) == 0
+    study = tmp_path / "study" / "detection_limit" / "latest"
+    simulated, real = (limit_of(one) for one in read_record(study).set_ups)
+    truth_mm = real.statement.a90
+    assert simulated.statement.bound.value < truth_mm
+
+    sizes = ["--diameters", "2:12", "--study", str(study), "--set-up", simulated.record.label, "--targets", "24"]
+    assert gauge.main([*sizes, "--out", str(tmp_path / "gauge")]) == 0
+    truth = read_gauge(tmp_path / "gauge" / "gauge.json")
+    (board,) = truth.boards
+    holes = tuple(
+        custom.HoleConfig(id=each.id, diameter_mm=each.diameter_mm, centre_mm=(each.x_mm, each.y_mm))
+        for each in board.holes
+    )
+    target = custom.TargetConfig(
+        board=custom.BoardConfig(
+            width_mm=board.width_mm, height_mm=board.height_mm, thickness_mm=12.7, shape=custom.FlatConfig()
+        ),
+        holes=holes,
+        backing=custom.BackingConfig(distance_mm=20.0),
+        material=custom.MaterialConfig(albedo_850=0.6, grain_contrast=0.0),
+        pose=custom.PoseConfig(distance_m=0.5, tilt_x_deg=5.0, tilt_y_deg=-4.0),
+    )
+    config = CameraConfig(name=CAMERA, numbers=numbers)
+    camera = camera_of(config)
+    view, _ = cached_view(target, camera.optics, RenderConfig(hole_noise_mm=0.3), tmp_path / "renders")
+    unit = SimulatedUnit(camera, config, view)
+    (frame,) = unit.capture(1, 5, "gauge").frames()
+    T, slopes = target.pose.T_camera_board, unit.view.slopes[unit.cut]
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    on_board = rays * ((T[:3, 3] @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
+    place_mm = transform_points(invert(T), on_board)[..., :2] / MM
+    whole, cut = camera.nominal_lens.whole, unit.region.within(camera.nominal_lens.whole)
+    depth, colour = np.zeros(whole.shape, np.uint16), np.full((*whole.shape, 3), 90, np.uint8)
+    depth[cut], colour[cut] = np.rint(np.nan_to_num(frame.z_m) / MM), picture(truth, place_mm)
+    for name, image in (("depth", depth), ("color", colour)):
+        (tmp_path / "seen" / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "seen" / name / "0.png"), image)
+    given = [str(tmp_path / "seen"), "--intrinsics", CAMERA, "--threshold", "6"]
+    given += ["--gauge", str(tmp_path / "gauge" / "gauge.json"), "--out", str(tmp_path / "found")]
+    assert detect.main(given) == 0
+    given = [str(tmp_path / "found" / "gauge.csv"), "--size", "diameter_mm", "--hit", "found", "--board", "board"]
+    given += ["--prior", str(study), "--set-up", simulated.record.label, "--out", str(tmp_path / "pod")]
+    assert pod.main(given) == 0
+    said = json.loads((tmp_path / "pod" / "mapod.json").read_text())
+    print(
+        simulated.statement.a90, simulated.statement.bound.value, truth_mm, said["a90_95"], said["p_simulation_right"]
+    )
+    assert said["a90_95"] >= truth_mm
+    assert said["a90_95"] < 2 * truth_mm
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     small = tmp_path / "small"
     small.mkdir()
     for number in range(4):
-        cv2.imwrite(str(small / f"{number}.png"), np.full((160, 200), 900, np.uint16))
+        cv2.imwrite(str(small / f"{number}.png"), np.full((160, 200), 900 + number % 2, np.uint16))
     told = refused(["--capture", str(small), "--intrinsics", str(lens)], capsys)
     assert "no simulated camera has 200 x 160 pixels" in told and "azure_kinect_nfov 640 x 576" in told
     told = refused(["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"], capsys)
@@ -134,9 +134,8 @@ def test_nothing_flat_is_refused(tmp_path, capsys):
     folder = tmp_path / "ball"
     folder.mkdir()
     for number in range(4):
-        cv2.imwrite(
-            str(folder / f"{number}.png"), np.where(np.hypot(u - 320, v - 288) < 120, ball, 0).astype(np.uint16)
-        )
+        image = np.where(np.hypot(u - 320, v - 288) < 120, ball + number % 2, 0).astype(np.uint16)
+        cv2.imwrite(str(folder / f"{number}.png"), image)
     options = ["--capture", str(folder), "--intrinsics", "azure_kinect_nfov", "--mask"]
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), (255 * (np.hypot(u - 320, v - 288) < 24)).astype(np.uint8))

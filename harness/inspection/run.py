@@ -219,8 +219,6 @@ def inspect(arguments: argparse.Namespace) -> int:
     views: list[View] = []
     choices: list[Choice | None] = []
     for name, recording, guess in zip(names, recordings, guesses, strict=False):
-        if arguments.frames_report:
-            told.print_frames(recording)
         views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):

@@ -51,14 +51,6 @@ def print_notes(notes: Iterable[str]) -> None:
 # ---- captures --------------------------------------------------------------------------------------------------------
 
 
-def print_frames(recording: Recording) -> None:
-    """Print every frame with its valid part and median distance."""
-    for frame in recording.frames():
-        valid = np.isfinite(frame.z_m)
-        median = mm(float(np.median(frame.z_m[valid]))) if valid.any() else "none"
-        print(f"frame {frame.name}: {100 * valid.mean():.1f} % valid, median distance {median}")
-
-
 def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str) -> None:
     """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), a line each."""
     height, width = cloud.valid.shape
