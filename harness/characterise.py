@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
-
-if TYPE_CHECKING:
-    pass
 
 CAMERA_FILE = "my_camera.yaml"
 
@@ -57,10 +52,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.own_camera.certificate import write_certificate
     from harness.own_camera.measure import characteristics, read_still
     from harness.own_camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
-    from harness.tables.characteristics import OWN_FIGURES
-    from harness.tables.text import show
-    from harness.vocabulary.files import write_text
-    from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.sensor.camera import load_camera
 
     if not 0 < options.albedo <= 1:
@@ -98,23 +89,19 @@ def main(options: argparse.Namespace, command: str) -> int:
         other = simulated(with_lens(known, captures[0].lens), found, options.albedo)
         sources[KNOWN] = characteristics(other, poses)
     rows = beside(found, twin, sources.get(KNOWN))
-    show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": known or ""})])
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     worst = max((abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"), default=0.0)
     answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %." if noise else ""
-    print(answer)
     page, title = options.out / "characterise.html", f"{options.title}, characterised"
-    write_page(page, sources, rows, title, answer, known or "", command)
+    facts = {"like": options.like, "camera_file": CAMERA_FILE}
+    write_page(page, sources, rows, title, answer, known or "", command, facts)
     if options.certificate:
         lens = captures[0].lens
         size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")
         about = {"unit": options.title, "mode": size, "firmware": "not recorded", "warm-up": "not stated"}
         about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
         write_certificate(options.out, found, about, poses, study, command)
-    origin = {"results_version": RESULTS_VERSION, **record(command), "warnings": found.doubts, "like": options.like}
-    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
-    print(f"wrote {page}, {CAMERA_FILE} and the tables")
     return 0
 
 

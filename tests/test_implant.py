@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from harness import export as exporting
 from harness import implant, sweep
+from harness.engine.implants import Judging, Scan, damages_placed
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record
+from harness.inspection.arguments import opened
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
 from scenes.closed_form import plane_view
 from scenes.implants import Implant, implant_of, local_board, side_mm, unit_config
@@ -19,7 +22,8 @@ from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
-from scenes.target import custom
+from scenes.target import custom, flaws
+from scenes.target.drawn import DrawnTargetConfig
 
 CAMERA = "azure_kinect_nfov"
 NOISE = CameraConfig(name=CAMERA, effects=NO_EFFECTS.model_copy(update={"noise": True, "multipath": True}))
@@ -27,21 +31,30 @@ REGION = Region(250, 330, 250, 360)
 FRAMES = 4
 
 
-def board(width_mm: float, pose: custom.PoseConfig) -> custom.TargetConfig:
-    """A plate with one hole off its centre, before a backing."""
+AT = {"id": 1, "centre_mm": (12.0, -6.0)}
+HOLE = {"holes": (custom.HoleConfig(diameter_mm=7.0, **AT),)}
+SLOT = {"flaws": (flaws.SlotConfig(kind="slot", length_mm=30.0, width_mm=6.0, angle_deg=25.0, depth_mm=5.0, **AT),)}
+BUMP = {"flaws": (flaws.PressedConfig(kind="pressed_bump", diameter_mm=25.0, depth_mm=3.0, **AT),)}
+
+
+def board(width_mm: float, pose: custom.PoseConfig, **damage: Any) -> custom.TargetConfig:
+    """A plate with one damage off its centre, before a backing."""
     return custom.TargetConfig(
         board=custom.BoardConfig(width_mm=width_mm, height_mm=width_mm, thickness_mm=12.7, shape=custom.FlatConfig()),
-        holes=(custom.HoleConfig(id=1, diameter_mm=7.0, centre_mm=(12.0, -6.0)),),
+        **damage,
         backing=custom.BackingConfig(distance_mm=20.0),
         material=custom.MaterialConfig(grain_contrast=0.0),
         pose=pose,
     )
 
 
-def test_an_implanted_hole_is_the_hole_that_the_camera_would_have_seen(tmp_path: Path):
-    """The whole board is rendered with its hole; the hole alone is put into frames of the same board without it."""
+@pytest.mark.parametrize(("damage", "most_mm"), [(HOLE, 8.0), (SLOT, 2.0), (BUMP, -2.0)], ids=["hole", "slot", "bump"])
+def test_implanted_damage_is_what_the_camera_would_have_seen(damage: dict, most_mm: float, tmp_path: Path):
+    """The whole board is rendered with its damage, which alone is put into frames of the same board without it."""
     camera = camera_of(NOISE)
-    target = board(90.0, custom.PoseConfig(distance_m=0.7, tilt_x_deg=12.0, tilt_y_deg=-7.0, offset_x_mm=20.0))
+    target = board(
+        90.0, custom.PoseConfig(distance_m=0.7, tilt_x_deg=12.0, tilt_y_deg=-7.0, offset_x_mm=20.0), **damage
+    )
     units = []
     for each in (target, target.hole_free()):
         view, _ = cached_view(each, camera.optics, RenderConfig(), tmp_path)
@@ -53,7 +66,8 @@ def test_an_implanted_hole_is_the_hole_that_the_camera_would_have_seen(tmp_path:
     T = target.pose.T_camera_board
     place = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)
-    alone = local_board(target, target.holes[0], place, T[:3, 2], side_mm(target.holes[0], 0.7, config))
+    (one,) = target.damages
+    alone = local_board(target, one, place, T[:3, 2], side_mm(one, 0.7, config))
     found = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
     assert same
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)
@@ -71,12 +85,42 @@ def test_an_implanted_hole_is_the_hole_that_the_camera_would_have_seen(tmp_path:
         depth_m = z_m / valid - np.nanmean(seen[:, *cut], axis=0)
         changed = np.abs(found.shift_m) > 1 * MM
         assert changed.sum() > 20
-        assert found.shift_m.max() > 8 * MM  # the backing, 33 mm behind the face, mixed with the rim
+        # of the hole the backing, 33 mm behind the face, mixed with the rim
+        assert found.depth_mm > abs(most_mm) and found.shift_m.sum() * most_mm > 0
         both = changed & (valid > FRAMES)
-        assert np.sqrt(np.nanmean(depth_m[both] ** 2)) < 0.05 * found.shift_m.max()
-        assert abs(np.nanmean(depth_m[both])) < 0.02 * found.shift_m.max()
+        assert np.sqrt(np.nanmean(depth_m[both] ** 2)) < 0.05 * found.depth_mm * MM + 0.1 * MM
+        assert abs(np.nanmean(depth_m[both])) < 0.02 * found.depth_mm * MM + 0.05 * MM
         lost = 1 - valid / len(bare)
         assert np.abs(lost - np.isnan(seen[:, *cut]).mean(axis=0))[found.shift_m != 0].mean() < 0.1
+
+
+@pytest.mark.parametrize(("radius_m", "said"), [(0.3, "the inner"), (None, "")])
+def test_a_rim_that_is_seen_more_steeply_is_told(radius_m: float | None, said: str, tmp_path: Path):
+    """A cylinder that is seen at up to 63 degrees, and a plane: damage keeps off both rims, and one of them matters."""
+    slope = np.broadcast_to((np.arange(200) - 99.5) / 400, (200, 200))
+    z_m = np.full((200, 200), 0.8)
+    if radius_m is not None:  # the nearer end of the ray in the circle about (0, 0.8 + radius)
+        middle = 0.8 + radius_m
+        z_m = (middle - np.sqrt(middle**2 - (1 + slope**2) * (middle**2 - radius_m**2))) / (1 + slope**2)
+    noise = np.random.default_rng(1).normal(scale=0.3 * MM, size=(6, 200, 200))
+    np.save(tmp_path / "part.npy", (z_m + noise).astype(np.float32))
+    (tmp_path / "lens.json").write_text('{"fx": 400, "fy": 400, "cx": 99.5, "cy": 99.5}')
+    settings = '{"crop":{"kind":"none"},"surface":{"shape":"auto"}}'
+    judging = Judging("local", settings, 0.015, 7.0, lambda cloud: (7.0, ()))
+    scan = Scan(opened([tmp_path / "part.npy"], str(tmp_path / "lens.json"), unit="m"), judging)
+    family = DrawnTargetConfig(
+        damage={"kind": "slot", "per_board": 4, "width_mm": (2, 6), "length_mm": (20, 25), "depth_mm": (2, 3)}
+    )
+    assert said in scan.left_out(family) and bool(scan.left_out(family)) == bool(said)
+    middle_deg = np.nanmax(np.where(scan.depth_px > 20, scan.angle_deg, np.nan))
+    assert (middle_deg > 25) == (radius_m is not None)
+    # a slot's own outline is its truth, and what lies within a margin of it is no intact surface
+    (site, *_) = [one for n in range(9) for one in [damages_placed(scan, family, CAMERA, "damaged", n)] if one.damages]
+    known = scan.known(scan.whole, site)
+    for damage in known.truth:
+        wide_m2 = scan.pitch_m**2 * len(known.outlines[damage.id])
+        assert wide_m2 == pytest.approx(damage.length_m * damage.width_m, rel=0.4)
+        assert not known.undamaged.ravel()[known.outlines[damage.id]].any()
 
 
 def recorded(folder: Path, frames: int = FRAMES) -> Path:

@@ -6,20 +6,16 @@ What is measured, and how it is simulated again, is as in `harness.characterise`
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
 from detectors.recordings.depth_images import read_picture
+from harness.inspection.told import print_notes, print_warnings
 from harness.own_camera.camera_file import camera_of_size, opened_as, simulated, with_lens
 from harness.own_camera.measure import characteristics, read_still
 from harness.own_camera.page import MEASURED, SIMULATED, beside, write_page
-from harness.tables.characteristics import OWN_FIGURES
-from harness.tables.text import show
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_text
-from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 
 def run_capture(options: argparse.Namespace, command: str) -> int:
@@ -39,19 +35,16 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
         fix = "check the lens (--intrinsics), or leave disturbing things out with --mask"
         raise UserError(f"{capture.name}: no flat surface in it", legal=legal, fix=fix)
+    print_notes(recording.notes)
+    print_warnings((*recording.warnings, *found.doubts))
     twin = characteristics(simulated(camera, found, options.albedo))
     rows = beside(found, twin, None)
-    show([OWN_FIGURES.grid(rows, terminal=True, heads={"known camera": ""})])
     ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
     answer = f"Temporal noise, simulated by measured: {ratios}. Albedo {options.albedo:g} is assumed."
     title = f"{capture.name} beside the simulated {camera.title}"
-    print(answer)
-    sources = {MEASURED: found, SIMULATED: twin}
-    write_page(options.out / "capture.html", sources, rows, title, answer, "", command)
     facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
-    origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": found.doubts}
-    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
-    print(f"wrote {options.out / 'capture.html'} and the tables")
+    sources = {MEASURED: found, SIMULATED: twin}
+    write_page(options.out / "capture.html", sources, rows, title, answer, "", command, facts)
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +14,10 @@ from harness.report.blocks import BLUE, GREY, ORANGE, command_of, figure, headin
 from harness.scorecard.bench import Reading
 from harness.tables.characteristics import OWN_CURVES, OWN_FIGURES, OwnFigure
 from harness.tables.schema import Estimate, write_table
+from harness.tables.text import show
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -113,15 +116,19 @@ def write_page(
     answer: str,
     known: str,
     command: str,
+    facts: Mapping[str, Any],
 ) -> None:
-    """Write a page, and the tables' files beside it. ``sources``: what was measured, simulated and, where there is one,
-    the ``known`` camera's by their names. Raises UserError where they cannot be written."""
+    """Print the figures; write a page, and beside it the tables' files and provenance.json with further ``facts``.
+    ``sources``: what was measured, simulated and, where there is one, the ``known`` camera's by their names. Raises
+    UserError where they cannot be written."""
     found, folder = sources[MEASURED], path.parent
+    heads = {"known camera": known, "its ratio": known and "its ratio"}
+    show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])
+    print(answer)
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, found, curves))
-    heads = {"known camera": known, "its ratio": "its ratio" if known else ""}
     body = [
         figure({"captures": drawn}, "captures", CAPTION),
         heading("Measured and simulated"),
@@ -133,6 +140,9 @@ def write_page(
         *command_of(command),
     ]
     write_text(path, page(title, answer, body, warnings=found.doubts))
+    origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": found.doubts}
+    write_text(folder / "provenance.json", json.dumps(origin, indent=2) + "\n")
+    print(f"wrote {path} and the tables")
 
 
 def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
