@@ -77,7 +77,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     found: Any = _stated(options) if options.prior is None else _corrected(options)
     alone, combined = (pod_parts, save_pod_png, pod_html), (mapod_parts, save_mapod_png, mapod_html)
-    parts, save_png, html = alone if options.prior is None else combined  # type: ignore[assignment]
+    parts, save_png, html = alone if options.prior is None else combined
     show(parts(found))
     data, picture, page = (options.out / name for name in (FILES if options.prior is None else MAPOD_FILES))
     told = {"results_version": RESULTS_VERSION, **found.to_data(), "command": command}
