@@ -31,8 +31,8 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 
 LOD_FRAMES = (1, 10, 50)
 PRINTED = Markup(
-    "<style>@page { margin: 14mm } @media print { body { font-size: 9pt } table { font-size: 7.6pt }"
-    " th, td { padding: 2px 5px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { font-size: 10.5pt }"
+    "<style>@page { margin: 14mm } @media print { body { font-size: 8pt; line-height: 1.25 } table { font-size: 7pt }"
+    " th, td { padding: 1px 4px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { font-size: 10.5pt }"
     " input { display: none } }</style>"
 )
 SHOWN_LIMITS = ("set-up", "a90/95 (mm)", "over boards (mm)", "a90 (mm)", "a50 (mm)", "calls/m² (95 %)", "found")
