@@ -21,7 +21,7 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_paths
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_paths, numbers_of_lens
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
@@ -68,8 +68,7 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     same = (facts.nominal_lens.width, facts.nominal_lens.height) == (lens.width, lens.height)
     numbers: dict[str, Any] = {"engine.output_step_mm": FINEST_STEP_MM}
     if same:
-        numbers |= {f"lens.{key}_px": getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
-        numbers |= {"lens.distortion": [*map(float, lens.distortion)]}
+        numbers |= numbers_of_lens(lens)
     known = number_paths(facts.to_data())
     effects = NO_EFFECTS.model_copy(
         update=dict.fromkeys(("noise", "multipath", "wiggling", "ambient", "saturation"), True)

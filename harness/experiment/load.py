@@ -16,14 +16,13 @@ from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera
+from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera, numbers_of_lens
 
 EXPERIMENT_VERSION = 1
 """Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
 STAMP_KIND = "experiment"
 RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
 """Devices on Windows: no folder of results can be called so there."""
-LENS_NUMBERS = {"lens.fx_px": "fx", "lens.fy_px": "fy", "lens.cx_px": "cx", "lens.cy_px": "cy"}
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
@@ -132,5 +131,4 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
                 legal=f"{nominal.width} x {nominal.height}, as {name} has",
                 fix="name a recording of the same camera in the same mode, or choose another source.camera.name",
             )
-    numbers: dict[str, Any] = {path: float(getattr(lens, key)) for path, key in LENS_NUMBERS.items()}
-    return {**numbers, "lens.distortion": [float(term) for term in lens.distortion]}
+    return numbers_of_lens(lens)

@@ -124,9 +124,7 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
     candidates = [
         {
             "number": n,
-            "distance_mm": each.distance_m / MM,
-            "nearest_mm": each.nearest_m / MM,
-            "farthest_mm": each.farthest_m / MM,
+            **{f"{name}_mm": getattr(each, f"{name}_m") / MM for name in ("distance", "nearest", "farthest")},
             "extent_mm": [side / MM for side in each.extent_m],
             "share_of_view": each.share,
             "tilt_deg": each.tilt_deg,

@@ -42,6 +42,7 @@ from scenes.sensor.camera import (
     guessed_precision,
     is_camera_path,
     load_camera,
+    numbers_of_lens,
     read_camera,
 )
 from scenes.sensor.empirical.facts import EmpiricalCamera
@@ -95,9 +96,7 @@ def with_lens(name: str, lens: Lens) -> AnyCamera:
             legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
             fix="name the camera that took it, or record the depth images themselves",
         )
-    numbers = {f"lens.{key}_px": getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
-    distortion = [*map(float, lens.distortion)]
-    return camera_of(CameraConfig(name=name, numbers={**numbers, "lens.distortion": distortion}))
+    return camera_of(CameraConfig(name=name, numbers=numbers_of_lens(lens)))
 
 
 class Stated(NamedTuple):

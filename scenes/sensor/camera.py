@@ -16,7 +16,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as, with_value_at
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import OtherLens
+from harness.vocabulary.geometry import Lens, OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -171,6 +171,12 @@ def guessed_precision(camera: AnyCamera) -> str:
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
     told = f"the precision of {camera.title} is not published: its noise is a guess"
     return f"{told}, which may be {low:.2g} to {high:.2g} times as much"
+
+
+def numbers_of_lens(lens: Lens) -> dict[str, Any]:
+    """Return the numbers of a camera's file (`CameraConfig.numbers`) that make a lens its own."""
+    numbers = {f"lens.{key}_px": float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")}
+    return {**numbers, "lens.distortion": [*map(float, lens.distortion)]}
 
 
 @lru_cache
