@@ -99,12 +99,9 @@ class Transfer:
         return self._logs(self.grid)
 
     def _logs(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        half = float(link_ppf(self.curve.link, np.array(0.5)))
+        half, scaled = float(link_ppf(self.curve.link, np.array(0.5))), np.log if self.curve.log_size else np.positive
         k, w = np.exp(nodes.T)[..., None]
-        if self.curve.log_size:
-            above = np.log(self.size / k) - np.log(self.curve.size_at(0.5))
-        else:
-            above = self.size / k - self.curve.size_at(0.5)
+        above = scaled(self.size / k) - scaled(self.curve.size_at(0.5))
         found, missed, _ = logs_of_link(self.curve.link, half + above / (self.curve.sigma * w))
         return found, missed
 
