@@ -53,14 +53,16 @@ def plane_view(
 
 def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.ndarray) -> NoiseFreeView:
     """Return what a depth image shows, sampled at pixel centres: ``z_m`` (h, w), NaN where there is nothing, and the
-    ``light`` (h, w) that comes back from each pixel, in a view's units. Direct light only; no pixel mixes surfaces."""
+    ``light`` (h, w) that comes back from each pixel, in a view's units. Both may be (k, h, w): parts of pixels
+    on different surfaces, of which the first of which counts as its range. Direct light only."""
     optics, slopes = camera.optics, camera.nominal_lens.region_slopes(region)
+    z_m, light = (each.reshape(-1, *region.shape) for each in (z_m, light))
     points = np.concatenate([slopes, np.ones((*region.shape, 1))], axis=-1) * z_m[..., None]
     path_m = np.nan_to_num(np.linalg.norm(points, axis=-1) + np.linalg.norm(optics.emitter_m - points, axis=-1))
-    amplitude = np.where(np.isfinite(z_m), np.nan_to_num(light), 0.0)
-    phasor = amplitude * np.exp(1j * wave_numbers(optics.frequencies_hz)[:, None, None] * path_m)
+    amplitude, waves = np.where(np.isfinite(z_m), np.nan_to_num(light), 0.0), wave_numbers(optics.frequencies_hz)
+    phasor = np.stack([(amplitude * np.exp(1j * wave * path_m)).sum(axis=0) for wave in waves])
     seen, coverage = np.zeros(region.shape, int), np.ones(region.shape)
-    return _view(optics, region, slopes, phasor, amplitude, points, seen, ("image",), coverage)
+    return _view(optics, region, slopes, phasor, amplitude.sum(axis=0), points[0], seen, ("image",), coverage)
 
 
 def layered_view(

@@ -253,14 +253,17 @@ def simulated(
 def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int, number: int) -> StillCapture:
     z_m, lens, config = capture.mean_m, camera.nominal_lens, UNIT.model_copy(update={"name": camera.name})
     if capture.planes:
-        labels, z_m = np.zeros(z_m.shape, int), np.full(z_m.shape, np.nan)
+        labels = np.zeros(z_m.shape, int)
         for place, (_, mask) in enumerate(capture.planes, start=1):
             labels[mask] = place
         distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
         labels = np.where(distance <= WIDEST_PX / 2, labels[tuple(nearest)], 0)
+        # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
+        halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
+        z_m = np.full(halves.shape, np.nan)
         for place, (plane, _) in enumerate(capture.planes, start=1):
-            z_m[labels == place] = plane.z_along_m(capture.slopes[labels == place])
-    light = albedo * capture.cosine / (z_m * capture.stretch) ** 2
+            z_m = np.where(halves == place, plane.z_along_m(capture.slopes), z_m)
+    light = albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
     unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
     if capture.amplitude is not None:
         plain = mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])
