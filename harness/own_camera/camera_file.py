@@ -246,7 +246,7 @@ def simulated(
 ) -> list[StillCapture]:
     """Return the captures as a unit of the camera would have taken them: the same surfaces, which the fitted planes
     stand for, as bright as recorded; with as many frames, or ``frames``. Not simulated: the surfaces' own relief, light
-    between them, and what lies beside them."""
+    between them, the emitter's shadow behind an edge, and what lies beside them."""
     return [_again(camera, one, albedo, frames or len(one.z_m), number) for number, one in enumerate(found.captures)]
 
 
