@@ -312,8 +312,8 @@ def _covariance(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:
     slopes = [(ceiling - floor) * density, (ceiling - floor) * density * data.z]
     slopes += [1.0 - hit] if floor > NEAR_EDGE else []
     slopes += [hit] if ceiling < 1.0 - NEAR_EDGE else []
-    design = np.column_stack(slopes)
-    return np.asarray(np.linalg.pinv(design.T @ (design / (p_hit * p_miss)[:, None]))[:2, :2])
+    design, weight = np.column_stack(slopes), (data.hits + data.misses) / (p_hit * p_miss)
+    return np.asarray(np.linalg.pinv(design.T @ (design * weight[:, None]))[:2, :2])
 
 
 def _checked(
