@@ -6,7 +6,7 @@ import cv2
 import numba
 import numpy as np
 
-from detectors.clusters import PLAIN
+from detectors.clusters import PLAIN, root_of
 
 
 def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -78,14 +78,6 @@ def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[
 
 
 @numba.njit(**PLAIN)
-def _root(parent: np.ndarray, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@numba.njit(**PLAIN)
 def _labelled(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Return the sets' numbers (h, w), 0 for none, in the order of their first pixels, by union and find."""
     h, w = nodes.shape
@@ -97,16 +89,16 @@ def _labelled(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndar
             here = i * w + j
             parent[here] = here
             if j and nodes[i, j - 1] and right[i, j - 1]:
-                parent[here] = here = _root(parent, here - 1)
+                parent[here] = here = root_of(parent, here - 1)
             if i and nodes[i - 1, j] and down[i - 1, j]:
-                above = _root(parent, i * w + j - w)
+                above = root_of(parent, i * w + j - w)
                 parent[max(above, here)] = here = min(above, here)
                 parent[i * w + j] = here
     count = 0
     for i in range(h):
         for j in range(w):
             if nodes[i, j]:
-                root = _root(parent, i * w + j)
+                root = root_of(parent, i * w + j)
                 if root == i * w + j:
                     count += 1
                     labels[i, j] = count

@@ -105,54 +105,56 @@ def pictures(patch: HolePatch, holes: np.ndarray) -> np.ndarray:
     """Return the residuals (m, h, w) of holes (m, 5), each (u, v, radius, depth, wall), without offset: depth along the
     optical axis, wall in 0..1; a disc where the depth is negative. The mouth is cut into strips along u, and each hole
     into layers: of each sight three of wall, and what is deeper."""
-    (g11, g12), (_, g22) = patch.metric_m2.tolist()
-    # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
-    height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
-    u, v, radius, depth, wall = holes.T[:, :, None, None]
-    cosine, drift_u, drift_v, shrink, beam_u, beam_v, emitter, share = patch.sights.T[:, :, None]
-    deepest = depth * cosine
-    length = np.where(depth > 0, wall * deepest, 0.0)
-    tube = length * NODES
-    end = np.where(NODES < 1.0, tube, np.maximum(deepest, 0.0))
-    weights = share / cosine * np.where(NODES < 1.0, length * WEIGHTS, deepest - length)
-    scale, lit, below = 1.0 / (1.0 + tube * shrink), end / (end + emitter), (end - tube) / (end - tube + emitter)
-    drift_u, drift_v, one = tube * drift_u * scale, tube * drift_v * scale, np.ones_like(scale)
-    lower = (drift_u - below * beam_u, drift_v - below * beam_v, scale)
-    circles = ((drift_u, drift_v, scale), (-lit * beam_u, -lit * beam_v, one), lower)
-    low = radius * (slant * height * MIDDLES - HALF_CHORDS * width)
-    high = radius * (slant * height * MIDDLES + HALF_CHORDS * width)
-    for circle in circles:
-        shift_u, shift_v, scale = (each.reshape(len(holes), -1, 1) for each in circle)
-        down = radius * height * MIDDLES - shift_v
-        half = width * np.sqrt(np.maximum((radius * scale) ** 2 - (down / height) ** 2, 0.0))
-        low, high = np.maximum(low, shift_u + slant * down - half), np.minimum(high, shift_u + slant * down + half)
-    edges = (v + radius * height * EDGES)[:, 0]
-    half_u, half_v = (0.5 * side for side in patch.blur_px)
-    return _painted(u + low, u + high, weights.reshape(len(holes), -1), edges, half_u, half_v, *patch.used.shape)
+    return _painted(holes, patch.sights, patch.metric_m2, *patch.blur_px, *patch.used.shape)
 
 
 @numba.njit(cache=True, nogil=True)
 def _painted(
-    low: np.ndarray,
-    high: np.ndarray,
-    weights: np.ndarray,
-    edges: np.ndarray,
-    half_u: float,
-    half_v: float,
-    h: int,
-    w: int,
+    holes: np.ndarray, sights: np.ndarray, metric: np.ndarray, blur_u: float, blur_v: float, h: int, w: int
 ) -> np.ndarray:
-    """Return images (m, h, w) of layers (m, l): strips from ``low`` to ``high`` (m, l, s) between ``edges``."""
-    images, across = np.zeros((len(low), h, w)), np.empty(w)
-    for n in range(len(low)):
-        for s in range(low.shape[2]):
-            bottom, top = edges[n, s], edges[n, s + 1]
+    g11, g12, g22 = metric[0, 0], metric[0, 1], metric[1, 1]
+    # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
+    height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
+    half_u, half_v = 0.5 * blur_u, 0.5 * blur_v
+    images, across = np.zeros((len(holes), h, w)), np.empty(w)
+    # of each layer its weight, and three circles that its light has passed: shift along u and v, and scale
+    layers, weights = np.empty((len(sights) * len(NODES), 3, 3)), np.empty(len(sights) * len(NODES))
+    for n in range(len(holes)):
+        u, v, radius, depth, wall = holes[n]
+        for k in range(len(weights)):
+            cosine, drift_u, drift_v, shrink, beam_u, beam_v, emitter, share = sights[k // len(NODES)]
+            node = k % len(NODES)
+            deepest = depth * cosine
+            length = wall * deepest if depth > 0 else 0.0
+            tube, is_wall = length * NODES[node], NODES[node] < 1.0
+            end = tube if is_wall else max(deepest, 0.0)
+            weights[k] = share / cosine * (length * WEIGHTS[node] if is_wall else deepest - length)
+            scale, lit, below = (
+                1.0 / (1.0 + tube * shrink),
+                end / (end + emitter),
+                (end - tube) / (end - tube + emitter),
+            )
+            shift_u, shift_v = tube * drift_u * scale, tube * drift_v * scale
+            layers[k, 0] = shift_u, shift_v, scale
+            layers[k, 1] = -lit * beam_u, -lit * beam_v, 1.0
+            layers[k, 2] = shift_u - below * beam_u, shift_v - below * beam_v, scale
+        for s in range(STRIPS):
+            bottom, top = v + radius * height * EDGES[s], v + radius * height * EDGES[s + 1]
+            down = radius * height * MIDDLES[s]
             across[:] = 0.0
-            for k in range(low.shape[1]):
-                start, end = low[n, k, s], high[n, k, s]
+            for k in range(len(weights)):
+                start, end = (
+                    slant * down - radius * HALF_CHORDS[s] * width,
+                    slant * down + radius * HALF_CHORDS[s] * width,
+                )
+                for shift_u, shift_v, scale in layers[k]:
+                    middle = shift_u + slant * (down - shift_v)
+                    half = width * math.sqrt(max((radius * scale) ** 2 - ((down - shift_v) / height) ** 2, 0.0))
+                    start, end = max(start, middle - half), min(end, middle + half)
+                start, end = u + start, u + end
                 if end > start:
                     for c in range(max(0, math.ceil(start - half_u)), min(w - 1, math.floor(end + half_u)) + 1):
-                        across[c] += weights[n, k] * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
+                        across[c] += weights[k] * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
             for r in range(max(0, math.ceil(bottom - half_v)), min(h - 1, math.floor(top + half_v)) + 1):
                 along = max(min(top, r + half_v) - max(bottom, r - half_v), 0.0) / (4.0 * half_u * half_v)
                 for c in range(w):
@@ -315,12 +317,13 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
     return along_u, along_v
 
 
+@numba.njit(cache=True, nogil=True)
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the thesis' size and centre (3,) of a cluster (n, 3), metres: mean of the distances between the extreme
     points in x and between those in y; mean of these four. Of equal extremes the first counts."""
     x, y = points_m[:, 0], points_m[:, 1]
-    west, east, north, south = points_m[[int(x.argmin()), int(x.argmax()), int(y.argmin()), int(y.argmax())]]
-    diameter = 0.5 * (float(np.linalg.norm(east - west)) + float(np.linalg.norm(south - north)))
+    west, east, north, south = points_m[x.argmin()], points_m[x.argmax()], points_m[y.argmin()], points_m[y.argmax()]
+    diameter = 0.5 * (np.sqrt(((east - west) ** 2).sum()) + np.sqrt(((south - north) ** 2).sum()))
     return diameter, (west + east + north + south) / 4.0
 
 
