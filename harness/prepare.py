@@ -22,7 +22,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from detectors.mapping.settings import FusedMerge, GridMerge
     from detectors.marks.mark import MarkSet
     from detectors.registration.register import register
-    from detectors.registration.settings import CpdRegistration, PlainRegistration
+    from detectors.registration.settings import PlainRegistration
     from detectors.views import PreparedView, View
     from harness.engine.trial import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
@@ -54,10 +54,9 @@ def main(options: argparse.Namespace, command: str) -> int:
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
                 detector.measure(cloud, evidence, detection)
-    print("compiling registration and maps ..", flush=True)  # one small view stands for two
+    print("compiling maps ..", flush=True)  # one small view stands for two
     nothing = MarkSet((), np.zeros(0, np.int64))
     views = [PreparedView(View(name, cloud, np.eye(4)), cloud.valid, nothing) for name in ("first", "second")]
-    register(views, CpdRegistration(points="target", max_iterations=2))
     registrations = register(views, PlainRegistration(method="nominal"))
     merge(views, registrations, GridMerge())
     merged = merge(views, registrations, FusedMerge()).cloud

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from board_views import board_view, pose, target_error_m, usual_error, views
-from scipy.stats import chi2
 
 from detectors.marks.mark import MarkSet
 from detectors.registration.by_marks import register_jointly
@@ -86,9 +85,3 @@ def test_points_count_as_fewer_than_they_are():
     # two views' noise, three unknowns of which each is known to sigma / sqrt(n)
     least, most = (np.sqrt(2 * 3) * 1e-3 / np.sqrt(pixels / share) for share in (5, 50))
     assert least < across < 3 * most
-
-
-def test_the_gate_of_marks_is_the_quantile_it_says():
-    from detectors.registration.by_marks import MARK_GATE
-
-    assert chi2.sf(MARK_GATE, 3) == pytest.approx(1e-3, rel=0.02)

@@ -206,8 +206,7 @@ def fuse(
     x, y = grid.places()
     z = surface.evaluate(x, y)
     # the product of the gradient with a small displacement is the change of height along z
-    by_x, by_y = surface.evaluate(x + grid.step, y) - z, surface.evaluate(x, y + grid.step) - z
-    gradient = np.stack([-by_x / grid.step, -by_y / grid.step, np.ones_like(z)], axis=-1)
+    gradient = surface.gradients(x, y, grid.step)
     points = np.stack([x, y, z], axis=-1)
 
     observed, repeated = [], True
@@ -330,7 +329,8 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
 def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if it comes from the
     sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise
-    of a correlation camera falls as 1 / amplitude: Lange and Seitz 2001), or without amplitude the range to the fourth.
+    of a correlation camera falls as 1 / amplitude: Lange and Seitz 2001), or the range to the fourth where a tenth of
+    the points has no amplitude.
     A sample variance of ten frames is off by a factor of two; as a weight it would favour pixels quiet by chance.
     ``deviation_m`` (h, w): z less the view's own smooth surface; where there is one frame only, its squares stand in
     for the variances, so the fixed pattern counts as noise. Not modelled: noise that frames share (slow drift),
@@ -338,7 +338,12 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
     from scipy.optimize import nnls
     from scipy.stats import chi2
 
-    q = _regressor(cloud)
+    q, valid = (cloud.points_m**2).sum(axis=-1) ** 2, cloud.valid
+    if cloud.amplitude is not None:
+        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
+        if known.sum() >= 0.9 * valid.sum():
+            q = 1.0 / np.where(known, cloud.amplitude, np.nan) ** 2
+            q[valid & ~known] = np.median(q[known])
     used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
     repeated = bool(used.sum() >= PER_BIN)
     if repeated:
@@ -367,15 +372,3 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
         left = rounding_left_m2(cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.maximum(frame / cloud.count + left, LEAST_M2), repeated
-
-
-def _regressor(cloud: Cloud) -> np.ndarray:
-    """(h, w) q: 1 / amplitude^2, or range^4 where a tenth of the points has no amplitude."""
-    valid = cloud.valid
-    if cloud.amplitude is not None:
-        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
-        if known.sum() >= 0.9 * valid.sum():
-            with np.errstate(divide="ignore", invalid="ignore"):
-                q = 1.0 / cloud.amplitude**2
-            return np.where(known, q, np.where(valid, np.median(q[known]), np.nan))
-    return np.asarray((cloud.points_m**2).sum(axis=-1) ** 2)

@@ -127,9 +127,7 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
     T_reference_map = T_reference_map_of(views[0])
     surface = common_surface(views, T_reference_map)
     x, y, _ = transform_points(invert(T_reference_map), points_m).T
-    by_x = (surface.evaluate(x + pitch_m, y) - surface.evaluate(x - pitch_m, y)) / (2 * pitch_m)
-    by_y = (surface.evaluate(x, y + pitch_m) - surface.evaluate(x, y - pitch_m)) / (2 * pitch_m)
-    face = np.column_stack([-by_x, -by_y, np.ones_like(x)])
+    face = surface.gradients(x, y, pitch_m)
     face /= np.linalg.norm(face, axis=1, keepdims=True)
     turned = normals @ T_reference_map[:3, :3]
     along: np.ndarray = np.abs(np.einsum("ni,ni->n", turned, face))
@@ -200,7 +198,22 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
     """Merge the views whose registration did not fail to one cloud; works for a single view too. Raises UserError where
     nothing is left to merge, or the settings ask for too many cells."""
     began = time.perf_counter()
-    chosen, left_out = _choose(views, registrations)
+    chosen, left_out = list[ChosenView](), tuple[str, ...]()
+    for prepared, registration in zip(views, registrations, strict=True):
+        cloud, name = prepared.view.cloud, prepared.view.name
+        view = ChosenView(name, cloud, prepared.inside & cloud.valid, registration)
+        if registration.failure:
+            left_out += (f"{name} left out: {registration.failure}",)
+        elif not view.inside.any():
+            left_out += (f"{name} left out: none of its points belong to the target",)
+        else:
+            chosen.append(view)
+    if not chosen:
+        raise UserError(
+            f"no view is left to merge: {'; '.join(left_out)}",
+            legal="at least one view that is registered and holds points of the target",
+            fix="mend the views or their crop, or choose another way to register",
+        )
     T_reference_cloud, surface_map, notes = np.eye(4), None, tuple[str, ...]()
     if isinstance(config, GridMerge):
         cloud = _on_grid(chosen, config.step_mm * MM)
@@ -211,29 +224,6 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
         cloud, notes = integrate(chosen, None if config.voxel_mm is None else config.voxel_mm * MM)
     used = tuple(view.name for view in chosen)
     return Merged(cloud, T_reference_cloud, used, time.perf_counter() - began, left_out + notes, surface_map)
-
-
-def _choose(
-    views: Sequence[PreparedView], registrations: Sequence[Registration]
-) -> tuple[tuple[ChosenView, ...], tuple[str, ...]]:
-    """The views whose registration did not fail and that hold points of the target, and a note on each other."""
-    kept, notes = [], []
-    for prepared, registration in zip(views, registrations, strict=True):
-        cloud, name = prepared.view.cloud, prepared.view.name
-        view = ChosenView(name, cloud, prepared.inside & cloud.valid, registration)
-        if registration.failure:
-            notes.append(f"{name} left out: {registration.failure}")
-        elif not view.inside.any():
-            notes.append(f"{name} left out: none of its points belong to the target")
-        else:
-            kept.append(view)
-    if not kept:
-        raise UserError(
-            f"no view is left to merge: {'; '.join(notes)}",
-            legal="at least one view that is registered and holds points of the target",
-            fix="mend the views or their crop, or choose another way to register",
-        )
-    return tuple(kept), tuple(notes)
 
 
 def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:

@@ -16,6 +16,8 @@ import numpy as np
 
 from detectors.clusters import euclidean_clusters
 from detectors.masks import grown, parts_with, shrunk
+from detectors.noise import sigma_of
+from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
 FALSE_RATE = 1e-5
@@ -24,7 +26,7 @@ a hundred (Laplace) times as many: no mark, because a mark has nine that touch."
 DEGREE = 2
 """Degree of the polynomial: one lamp's fall-off, or two lamps of different colour, bend once over a board."""
 SAMPLE, STEPS, CORE = 4096, 6, 0.6
-"""Pixels of the fit, its steps of reweighting, and the share of the pixels that the scatter rests on."""
+"""Pixels of the fit, the steps of the scatter, and the share of the pixels that it rests on."""
 CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
 """Variance of the innermost `CORE` of a Gaussian in one and two dimensions."""
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
@@ -55,16 +57,27 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
     (n,) their variance from the whole counts, which dark pixels have more of: whatever noise the counts have is taken
     to grow as it does. ``xy`` (n, 2): any smooth co-ordinates."""
     stride = max(1, len(features) // SAMPLE)
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    x, y = ((xy - (low + high) / 2) / np.maximum((high - low) / 2, 1e-12)).T
-    basis = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
-    backdrop = basis @ _smooth(basis[::stride], features[::stride])
-    offset = features - backdrop
+    (x, y), (some_x, some_y) = xy.T, xy[::stride].T
+    smooth = SurfaceConfig(degree=DEGREE, method="lts")  # marks may cover a quarter, all at one end
+    offset = np.stack([f - fit_surface(some_x, some_y, f[::stride], smooth).evaluate(x, y) for f in features.T], axis=1)
     darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
-    scatter = _scatter((offset / darkness[:, None])[::stride]) + np.median(rounding) * np.eye(features.shape[1])
+    apart, p = (offset / darkness[:, None])[::stride], features.shape[1]
+    # the covariance (p, p) of the bulk about the backdrop, as of a Gaussian whose innermost part it is
+    scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
+    for _ in range(STEPS):
+        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
+        core = apart[square <= np.quantile(square, CORE)]
+        scatter = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
+    scatter += np.median(rounding) * np.eye(p)
     contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
     distance = contrast / darkness
-    return contrast, distance / _threshold(distance[::stride], features.shape[1])
+    # a Weibull tail through the quantiles `TAIL`, between a Gaussian's (shape 2 in two dimensions) and an exponential
+    # one (shape 1), and never below the Gaussian's
+    middle, outer = np.quantile(distance[::stride], TAIL)
+    logs = [-np.log(1.0 - share) for share in TAIL]
+    shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
+    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / float(np.clip(shape, 1.0, 2.0)))
+    return contrast, distance / max(tail, GAUSSIAN_LIMITS[p])
 
 
 def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
@@ -76,42 +89,6 @@ def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((side, side), np.uint8))
     kept: np.ndarray = chosen & (beyond > 0.5 * greatest)
     return kept
-
-
-def _smooth(basis: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """Coefficients (terms, p) by iterated bisquare weights from the median, one weight a pixel."""
-    coefficients = np.zeros((basis.shape[1], features.shape[1]))
-    coefficients[0] = np.median(features, axis=0)
-    for _ in range(STEPS):
-        residuals = features - basis @ coefficients
-        scale = np.maximum(np.median(np.abs(residuals), axis=0) / 0.6745, 1e-4)
-        square = ((residuals / (4.685 * scale)) ** 2).max(axis=1)
-        weight = np.where(square < 1.0, (1.0 - square) ** 2, 0.0)
-        gram = (basis * weight[:, None]).T @ basis
-        coefficients = np.linalg.lstsq(gram, (basis * weight[:, None]).T @ features, rcond=1e-9)[0]
-    return coefficients
-
-
-def _scatter(apart: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) of the bulk about the backdrop, as of a Gaussian whose innermost part it is."""
-    p = apart.shape[1]
-    covariance = np.diag(np.maximum(np.median(np.abs(apart), axis=0) / 0.6745, 1e-6) ** 2)
-    for _ in range(STEPS):
-        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(covariance), apart)
-        core = apart[square <= np.quantile(square, CORE)]
-        covariance = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
-    return covariance
-
-
-def _threshold(distance: np.ndarray, p: int) -> float:
-    """The distance that `FALSE_RATE` of the target's own pixels exceed: a Weibull tail through the quantiles `TAIL`,
-    between a Gaussian's (shape 2 in two dimensions) and an exponential one (shape 1), and never below the
-    Gaussian's."""
-    middle, outer = np.quantile(distance, TAIL)
-    logs = [-np.log(1.0 - share) for share in TAIL]
-    shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
-    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / float(np.clip(shape, 1.0, 2.0)))
-    return float(max(tail, GAUSSIAN_LIMITS[p]))
 
 
 LEAST_PIXELS, MOST_BLOBS = 9, 200
@@ -129,11 +106,7 @@ CUT_SHARE = 0.05
 """Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
 GAP_SPACINGS = 2.2
 """Steps between points of one mark in a cloud without a grid: neighbours along a diagonal (1.4), and one missing."""
-HIGHEST = 6
-REST = np.pi**2 / 6 / (1.0 / np.arange(1, HIGHEST + 1) ** 2).sum()
-"""Highest frequency along each axis, and what makes up for the higher ones of an edge along the grid (1 / k^2 each)."""
-STEP = 1e-5
-"""Difference in frequency by which a transform is differentiated: good to 1e-6 for regions of 100 pixels across."""
+SHIFTS = 12  # of the lattice along each axis, over which the error of a centroid is averaged
 RECTANGULAR = 0.85
 """Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
 SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
@@ -196,22 +169,17 @@ def _window(
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
     ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
-    alone = ring.sum() < LEAST_PIXELS
-    rgb = cloud.rgb[cut].astype(float)
-    usual, other, strays = np.median(rgb[target], axis=0), np.zeros(3), 0.0
-    if not alone:
-        rgb = _evenly_lit(rgb, ring, group)
-        usual = other = np.median(rgb[ring], axis=0)
+    if ring.sum() < LEAST_PIXELS:  # nothing of the target's own colour is seen around it
+        return np.zeros(0), lambda mixed: None
+    rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
+    other = np.median(rgb[ring], axis=0)
     span = np.median(rgb[core], axis=0) - other
     share = (rgb - other) @ span / max(float(span @ span), 1e-12)
-    if alone:
-        share = group.astype(float)
-    else:
-        # neighbours share their colour in a camera's mosaic and in JPEG: independent pixels that would average alike
-        strays = float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2))))
-        # the threshold that found the group knows the target's colour only, and leaves gaps where contrast is low: the
-        # connected pixels more of the group's colour than not, as far as the surroundings reach
-        group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
+    # neighbours share their colour in a camera's mosaic and in JPEG: independent pixels that would average alike
+    strays = float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2))))
+    # the threshold that found the group knows the target's colour only, and leaves gaps where contrast is low: the
+    # connected pixels more of the group's colour than not, as far as the surroundings reach
+    group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
     rim = grown(group, 1) & ~_eroded(group) & target
 
     def settled(mixed: bool) -> Blob | None:
@@ -229,9 +197,7 @@ def _window(
         on = around & alike & ~target
         last_row, last_column = inside.shape[0] - 1 - row, inside.shape[1] - 1 - column
         doubt = ""
-        if alone:
-            doubt = "nothing of the target's own colour is seen around it"
-        elif on.sum() > max(2.0, CUT_SHARE * around.sum()):
+        if on.sum() > max(2.0, CUT_SHARE * around.sum()):
             by_crop = (on & cloud.valid[cut]).sum() > on.sum() / 2
             doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
         elif u.min() == -column or v.min() == -row or u.max() == last_column or v.max() == last_row:
@@ -245,7 +211,7 @@ def _window(
         else:
             covariance = region_covariance_px2(grid)
         own, around = ((v + row) * inside.shape[1] + u + column for v, u in ((used_v, used_u), np.nonzero(target)))
-        contrast = _contrast(other + span, usual)
+        contrast = _contrast(other + span, other)
         return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
 
     return share[rim], settled
@@ -300,25 +266,22 @@ def _in_space(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Bl
 
 
 def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
-    """Return the covariance (..., 2, 2) of the centroid of the lattice points within polygons (..., n, 2), vertices in
-    order: the lattice's own error, with sharp edges and no noise, to first order. Over random shifts of the lattice the
-    error of the sum of f(x) = x - c over the points within has, by Poisson's summation formula, the sum of |F(k)|^2
-    over all integer frequencies k but 0 as its variance, F being the Fourier transform of f over the region (Kendall
-    1948)."""
-    x = polygon_px.astype(np.float64)
-    area, centre = _area_and_centre(x)
-    steps = np.arange(-HIGHEST, HIGHEST + 1)
-    k = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    # either of k and -k
-    k = k[len(k) // 2 + 1 :].astype(np.float64)
-    ahead, behind = (
-        np.stack([_transform(x - centre[..., None, :], k + side * shift) for shift in STEP * np.eye(2)], axis=-1)
-        for side in (1.0, -1.0)
-    )
-    # the integral of x exp(-2 pi i k.x) is i / (2 pi) times the gradient of the plain transform
-    moments = (ahead - behind) / (4.0 * np.pi * STEP)
-    square = np.einsum("...ki,...kj->...ij", moments, moments.conj()).real
-    return np.asarray(2.0 * REST * square / area[..., None, None] ** 2)
+    """Return the covariance (2, 2) of the centroid of the lattice points within convex polygons (..., n, 2), vertices
+    in order, over all shifts of the lattice and all polygons: the lattice's own error, with sharp edges and no
+    noise."""
+    centred = polygon_px - _area_and_centre(polygon_px)[1][..., None, :]
+    shift = (np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1).reshape(-1, 2) + 0.5) / SHIFTS
+    # polygons by shifts, then the lattice's rows, then edges
+    x, y = np.moveaxis(centred.reshape(-1, 1, 1, *centred.shape[-2:]) + shift[:, None, None], -1, 0)
+    row = np.arange(np.floor(y.min()), np.ceil(y.max()) + 1)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = (row - y) / (np.roll(y, -1, axis=-1) - y)
+        crossed = np.where((part >= 0) & (part <= 1), x + part * (np.roll(x, -1, axis=-1) - x), np.nan)
+    first, last = np.ceil(np.fmin.reduce(crossed, axis=-1)), np.floor(np.fmax.reduce(crossed, axis=-1))
+    number = np.nan_to_num(np.maximum(last - first + 1, 0))
+    sums = np.stack([np.nan_to_num(number * (first + last) / 2), number * row[:, 0]], axis=-1).sum(axis=-2)
+    error = (sums / number.sum(axis=-1, keepdims=True) - shift).reshape(-1, 2)
+    return np.asarray(error.T @ error / len(error))
 
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
@@ -344,7 +307,7 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     cosine, sine = np.cos(TURNS / extent.max()), np.sin(TURNS / extent.max())
     axes = np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), -1, 0)
     outlines = ((outline - middle) * sizes[:, None, None, :]) @ axes
-    return np.asarray(centroid_covariance_px2(outlines).mean(axis=(0, 1)))
+    return centroid_covariance_px2(outlines)
 
 
 def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -353,13 +316,3 @@ def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
     area = cross.sum(axis=-1) / 2
     return area, ((x + following) * cross[..., None]).sum(axis=-2) / (6 * area[..., None])
-
-
-def _transform(x: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Integral (..., k) of exp(-2 pi i k.x) over polygons (..., n, 2), with the sign of their orientation, for
-    frequencies (k, 2) but 0: by the divergence theorem a sum over the edges."""
-    edge = np.roll(x, -1, axis=-2) - x
-    outward = np.stack([edge[..., 1], -edge[..., 0]], axis=-1)
-    phase, along = (k @ np.swapaxes(each, -1, -2) for each in (edge, x + edge / 2))
-    flow = (k @ np.swapaxes(outward, -1, -2)) * np.exp(-2j * np.pi * along) * np.sinc(phase)
-    return np.asarray(flow.sum(axis=-1) / (-2j * np.pi * (k**2).sum(axis=1)))

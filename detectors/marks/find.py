@@ -18,10 +18,12 @@ import numpy as np
 from detectors.average import CORRELATED_PIXELS
 from detectors.marks.blobs import Blob, above_half, chromaticity, find_blobs, lightness, stand_out
 from detectors.marks.mark import LEAST_MARKS, CodedMarks, ColourMarks, Mark, MarkSet, RedMarks, problem_of
+from detectors.noise import median_of, sigma_of
+from detectors.surface import SurfaceConfig, fit_surface
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 PATCH_POINTS = 512
-LAR_STEPS, BISQUARE_STEPS = 5, 3
 LEAST_SCALE_M = 1e-6
 
 
@@ -93,30 +95,18 @@ class Spot:
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of most of some points (n, 3): least absolute residuals, then bisquare. None where they are too few
-    or on a line. Up to a third of them may lie off it."""
-    points = points_m[:: max(1, len(points_m) // PATCH_POINTS)]
-    if len(points) < 6:
+    """Fit the plane of most of some points (n, 3) by least absolute residuals. None where they are too few or on a
+    line. Up to a third of them may lie off it."""
+    x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
+    try:
+        plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
+    except UserError:
         return None
-    middle = np.median(points, axis=0)
-    basis = np.column_stack([points[:, :2] - middle[:2], np.ones(len(points))])
-    z = points[:, 2] - middle[2]
-    if np.linalg.matrix_rank(basis[:, :2], tol=1e-9) < 2:
-        return None
-    weight = np.ones(len(points))
-    for step in range(LAR_STEPS + BISQUARE_STEPS + 1):
-        weighted = basis * weight[:, None]
-        solved = np.linalg.solve(weighted.T @ basis, weighted.T @ z)
-        size = np.abs(z - basis @ solved)
-        scale = max(float(np.median(size)) / 0.6745, LEAST_SCALE_M)
-        if step < LAR_STEPS:
-            weight = 1.0 / np.maximum(size, 0.1 * scale)
-        else:
-            weight = np.maximum(1.0 - (size / (4.685 * scale)) ** 2, 0.0) ** 2
-    a, b, c = solved.tolist()
-    # the median of all sizes counts the points off the plane too
-    sigma = float(np.sqrt(np.mean(size[size <= 3.0 * scale] ** 2)))
-    return Patch(a, b, middle[2] + c - a * middle[0] - b * middle[1], max(sigma, LEAST_SCALE_M))
+    level, at_x, at_y = plane.evaluate(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).tolist()
+    # what lies off the plane on one side only has shifted it, but not turned it
+    off = z - plane.evaluate(x, y)
+    off = off[np.abs(off - median_of(off)) <= 3.0 * max(sigma_of(off - median_of(off)), LEAST_SCALE_M)]
+    return Patch(at_x - level, at_y - level, level + float(off.mean()), max(float(off.std()), LEAST_SCALE_M))
 
 
 def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
@@ -126,8 +116,8 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     own = weights > 0.5
     # the mean height of those points within four scales of the median
     height = patch.above_m(points[own])
-    middle = float(np.median(height))
-    scale = max(float(np.median(np.abs(height - middle))) / 0.6745, LEAST_SCALE_M)
+    middle = median_of(height)
+    scale = max(sigma_of(height - middle), LEAST_SCALE_M)
     kept = height[np.abs(height - middle) <= 4.0 * scale]
     behind, sigma = float(kept.mean()), float(max(kept.std(), scale))
     settled = replace(patch, offset_m=patch.offset_m + behind, sigma_m=sigma)

@@ -34,11 +34,8 @@ LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
     "BYTES before the first frame"
 )
-NAMES_BESIDE_OBJECTS = ("Location", "Color", "depth", "depthImage", "points", "xyz")
-"""Variables that are read from a .mat file that also holds a MATLAB object."""
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 ArraysLoader = Callable[[Path], Mapping[str, np.ndarray]]
 """Loads a file's arrays by name; the only array of a file without names is called ""."""
@@ -66,37 +63,23 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file."""
     import scipy.io
 
-    with path.open("rb") as file:
-        head = file.read(520)
-    if HDF5_SIGNATURE in (head[:8], head[512:520]) or b"MATLAB 7.3" in head[:116]:
-        fix = "save it with '-v7' in place of '-v7.3', for a cloud: " + EXPORT
-        raise UserError(f"{path}: is a -v7.3 file (HDF5)", legal=LEGAL_MAT, fix=fix)
-    with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, "save it again with '-v7'"):
+    fix = f"save it with '-v7', not '-v7.3', and of a cloud pc its arrays: {EXPORT}"
+    with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
             # cells and structs hold no frames, and nested deeply enough they end the process without a word
             flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
-        except TypeError:
-            # SciPy cannot list a file that holds an object; it calls the object itself "None"
-            flat = [*NAMES_BESIDE_OBJECTS, "None"]
+        except TypeError as error:
+            raise ValueError("it holds a MATLAB object, which cannot be read outside MATLAB") from error
         loaded = scipy.io.loadmat(path, variable_names=flat)
-        loaded = {name: value for name, value in loaded.items() if isinstance(value, np.ndarray)}
     arrays = {}
     for name, value in loaded.items():
-        # MATLAB's scalars are 1 x 1 arrays; text, cells, structs and objects have other kinds.
-        if value.dtype.kind in "iuf" and value.size > 1:
+        # MATLAB's scalars are 1 x 1 arrays; text has another kind
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size > 1:
             stacked_last = value.ndim == 4 and value.shape[2] == 3 and value.shape[3] != 3
             arrays[name] = np.moveaxis(value, -1, 0) if stacked_last else value
-    if arrays:
-        return arrays
-    for value in loaded.values():
-        if isinstance(value, scipy.io.matlab.MatlabOpaque):
-            what, kind = (bytes(value[key][0]).decode("latin1") for key in ("s0", "s2"))
-            raise UserError(
-                f"{path}: the variable {what} is a MATLAB object ({kind}), which cannot be read outside MATLAB",
-                legal=LEGAL_MAT,
-                fix=f"in MATLAB, with the cloud named pc: {EXPORT}",
-            )
-    raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=f"in MATLAB: {EXPORT}")
+    if not arrays:
+        raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=fix)
+    return arrays
 
 
 SENSOR_SIZES = (
@@ -207,17 +190,16 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
         hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
         lens, files = lens_for(str(path), asked, width, height, beside=[path.parent], hint=hint)
     scale_m = asked.scale_m or default_metres(distances.dtype)
-    read = partial(_frames, path, load, asked, scale_m)
+
+    def read() -> Iterator[Frame]:
+        # ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole
+        distances, *beside, _ = _stack(path, load, asked)
+        for i, stored in enumerate(distances):
+            rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
+            yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
+
     is_whole = distances.dtype.kind in "iu"
     return Recording.begun(path.name, read, scale_m, is_whole, files=(path, *files), lens=lens, organised=organised)
-
-
-def _frames(path: Path, load: ArraysLoader, asked: Asked, scale_m: float) -> Iterator[Frame]:
-    """Yield the frames of one file. ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole."""
-    distances, *beside, _ = _stack(path, load, asked)
-    for i, stored in enumerate(distances):
-        rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
-        yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
 
 
 def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
@@ -229,16 +211,17 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     has_points, shape, organised = _axes(name, array.shape, asked.lens)
     refuse_pixels(name, shape[2], shape[1])
     beside = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
-    rgb = next((beside[key] for key in COLOUR_NAMES if key in beside), None)
-    if rgb is not None and rgb.size == 3 * math.prod(shape):
+
+    def named(names: Sequence[str], size: int) -> np.ndarray | None:
+        found = next((beside[key] for key in names if key in beside), None)
+        return found if found is not None and found.size == size else None
+
+    rgb, amplitude = named(COLOUR_NAMES, 3 * math.prod(shape)), named(AMPLITUDE_NAMES, math.prod(shape))
+    if rgb is not None:
         if rgb.dtype.kind == "f":
             rgb = np.nan_to_num(np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255))
         rgb = rgb.astype(np.uint8).reshape(*shape, 3)
-    else:
-        rgb = None
-    amplitude = next((beside[key] for key in AMPLITUDE_NAMES if key in beside), None)
-    fits = amplitude is not None and amplitude.size == math.prod(shape)
-    amplitude = amplitude.reshape(shape).astype(np.float32) if amplitude is not None and fits else None
+    amplitude = None if amplitude is None else amplitude.reshape(shape).astype(np.float32)
     return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised
 
 

@@ -8,11 +8,11 @@ that lens are used: a pixel's ray is then the same in all frames, not rounded an
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,22 +39,17 @@ MAX_MESSAGE_BYTES = 2**28  # 256 MiB: a cloud of four million points with 64 byt
 
 @dataclass(frozen=True)
 class Bag:
-    """The bag that ``path`` names. ``files`` hold the messages, in order; ``packed``: each message is compressed by
-    itself (zstd)."""
+    """The bag that ``path`` names. ``files`` hold the messages, in order."""
 
     path: Path
     files: tuple[Path, ...]
     metadata: Path | None = None
-    packed: bool = False
 
     @cached_property
     def topics(self) -> dict[str, str]:
         """Return topic to message type, sorted; of a topic with several types the last."""
-        found: dict[str, str] = {}
-        for file in self.files:
-            with _opened(file) as reader:
-                found |= {connection.topic: connection.msgtype for connection in reader.connections}
-        return dict(sorted(found.items()))
+        with self._opened() as reader:
+            return dict(sorted((connection.topic, connection.msgtype) for connection in reader.connections))
 
     def first(self, topic: str) -> Any:
         """Return the first message of a topic, None where it has none."""
@@ -65,32 +60,42 @@ class Bag:
         UserError where a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
         from rosbags.typesys import Stores, get_typestore
 
-        if sys.version_info >= (3, 14):
-            from compression import zstd
-        else:
-            from backports import zstd
+        types = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_JAZZY)
+        decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
+        with self._opened() as reader:
+            wanted = [connection for connection in reader.connections if connection.topic == topic]
+            found = reader.messages(wanted) if wanted else iter(())
+            for number in count():
+                name = f"{self.path.name} {topic} message {number}"
+                with self._readable():
+                    item = next(found, None)
+                    if item is None:
+                        break
+                    if len(item[2]) > MAX_MESSAGE_BYTES:
+                        most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
+                        raise UserError(f"{name}: has more than {most}", legal=f"messages up to {most}")
+                    message = decode(item[2], item[0].msgtype)
+                yield name, message
 
-        number = 0
-        for file in self.files:
-            is_ros1 = file.suffix.lower() == ROS1_SUFFIX
-            types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-            decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-            with _opened(file) as reader:
-                wanted = [connection for connection in reader.connections if connection.topic == topic]
-                found = reader.messages(wanted) if wanted else iter(())
-                while True:
-                    name = f"{self.path.name} {topic} message {number}"
-                    with _readable(file):
-                        item = next(found, None)
-                        if item is None:
-                            break
-                        content = zstd.decompress(item[2]) if self.packed else item[2]
-                        if len(content) > MAX_MESSAGE_BYTES:
-                            most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
-                            raise UserError(f"{name}: has more than {most}", legal=f"messages up to {most}")
-                        message = decode(content, item[0].msgtype)
-                    yield name, message
-                    number += 1
+    @property
+    def _is_ros1(self) -> bool:
+        return self.path.suffix.lower() == ROS1_SUFFIX
+
+    def _readable(self) -> AbstractContextManager[None]:
+        mend = f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
+        what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is no bag"
+        return damage_told(what, LEGAL_BAG, f"copy it again; of a recording that was cut off: {mend}")
+
+    @contextmanager
+    def _opened(self) -> Iterator[Reader | Ros1Reader]:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader
+
+        with self._readable():
+            reader = Ros1Reader(self.path) if self._is_ros1 else Reader(self.path)
+            reader.open()
+        with closing(reader):
+            yield reader
 
 
 def is_bag(path: Path) -> bool:
@@ -130,29 +135,11 @@ def find_bag(path: Path) -> Bag:
     if absent or not files:
         what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is not there, or of no kind that is read"
         raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
-    return Bag(path, files, metadata, packed=mode == "message")
+    return Bag(path, files, metadata)
 
 
 def _holds_messages(path: Path) -> bool:
     return path.name.lower().removesuffix(".zstd").endswith(BAG_SUFFIXES)
-
-
-def _readable(file: Path) -> AbstractContextManager[None]:
-    mend = f"rosbag reindex {file}" if file.suffix.lower() == ROS1_SUFFIX else "ros2 bag reindex, or mcap recover"
-    what = f"{file}: is truncated or damaged, or is no bag"
-    return damage_told(what, LEGAL_BAG, f"copy it again; of a recording that was cut off: {mend}")
-
-
-@contextmanager
-def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
-    from rosbags.rosbag1 import Reader as Ros1Reader
-    from rosbags.rosbag2 import Reader
-
-    with _readable(file):
-        reader = Ros1Reader(file) if file.suffix.lower() == ROS1_SUFFIX else Reader(file)
-        reader.open()
-    with closing(reader):
-        yield reader
 
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"

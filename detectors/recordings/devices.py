@@ -261,15 +261,14 @@ def open_stray(folder: Path, asked: Asked) -> Recording:
     # x y z, then the quaternion
     poses = _table(odometry)[:, 2:9] if odometry.is_file() else np.zeros((0, 7))
     files = (path for path in (*depths, *confidences, matrix, odometry) if path and path.is_file())
-    read = partial(_stray_frames, depths, confidences, scale_m)
+
+    def read() -> Iterator[Frame]:
+        for depth, confidence in zip(depths, confidences, strict=True):
+            sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
+            yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
+
     motion, writer = (poses[:, :3], poses[:, 3:], odometry.name), "Stray Scanner, which writes millimetres"
     return _recording(folder, asked, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer)
-
-
-def _stray_frames(depths: tuple[Path, ...], confidences: tuple[Path | None, ...], scale_m: float) -> Iterator[Frame]:
-    for depth, confidence in zip(depths, confidences, strict=True):
-        sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
-        yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
 
 
 def _table(path: Path) -> np.ndarray:
@@ -299,18 +298,17 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
     refuse_pixels(str(path), width, height)
     scale_m = asked.scale_m or UNITS_M["m"]
     scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))
-    read = partial(_r3d_frames, path, (width, height), scale_m)
+
+    def read() -> Iterator[Frame]:
+        with _archive(path) as archive:
+            for name in _depth_names(archive):
+                beside = f"{name.removesuffix('.depth')}.conf"
+                sure = _plane(path, archive, beside, "u1", (width, height)) if beside in archive.namelist() else None
+                stored = _plane(path, archive, name, "<f4", (width, height))
+                yield _frame(f"{path.name} {name}", stored, sure, scale_m)
+
     motion, writer = (poses[:, 4:], poses[:, :4], "its metadata"), "Record3D, which writes metres"
     return _recording(path, asked, read, (width, height), scaled_lens, (path,), motion, scale_m, writer)
-
-
-def _r3d_frames(path: Path, size: tuple[int, int], scale_m: float) -> Iterator[Frame]:
-    """Yield the frames of one .r3d, ``size`` (width, height), each unpacked when it is reached."""
-    with _archive(path) as archive:
-        for name in _depth_names(archive):
-            beside = f"{name.removesuffix('.depth')}.conf"
-            sure = _plane(path, archive, beside, "u1", size) if beside in archive.namelist() else None
-            yield _frame(f"{path.name} {name}", _plane(path, archive, name, "<f4", size), sure, scale_m)
 
 
 def _archive(path: Path) -> zipfile.ZipFile:

@@ -224,13 +224,11 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return fx, fy, cx, cy from whichever of the known forms the file has."""
     if all(key in data for key in ("fx", "fy", "cx", "cy")):
         return tuple(_number(path, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
-    if "intrinsic_matrix" in data:  # Open3D: column by column
-        m = _numbers(path, "intrinsic_matrix", data["intrinsic_matrix"], 9)
-        return m[0], m[4], m[6], m[7]
-    for key in ("camera_matrix", "K", "k"):  # OpenCV and ROS: row by row
+    # Open3D's matrix stands column by column, OpenCV's and ROS' row by row
+    for key in ("intrinsic_matrix", "camera_matrix", "K", "k"):
         if key in data:
             m = _numbers(path, key, data[key], 9)
-            return m[0], m[4], m[2], m[5]
+            return (m[0], m[4], m[6], m[7]) if key == "intrinsic_matrix" else (m[0], m[4], m[2], m[5])
     keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
     raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
 

@@ -122,8 +122,6 @@ DEGREE = 3
 TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
 """Chebyshev orders in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
 POSE_TERMS = 3
-MARK_GATE = 16.3
-"""Chi-square limit of a mark's position, three degrees of freedom: a true mark is missed once in a thousand."""
 
 
 @dataclass(frozen=True)
@@ -233,8 +231,13 @@ def _adjust(
 ) -> list[registered.Registration]:
     """Registrations of views 1.. adjusted from those by their marks, none of which failed."""
     T_reference = [np.eye(4), *(found.T_reference_view for found in by_marks)]
-    data = [_view_data(view, views[0], T) for view, T in zip(views, T_reference, strict=True)]
-    T_surface_reference = _surface_frame(views[0])
+    data = [_view_data(view, views[0]) for view in views]
+    # the frame of the surface z(x, y): z along its mean normal, towards the camera
+    sampling, T_surface_reference = registered.sampling_of(views[0]), np.eye(4)
+    along = np.array([1.0, 0.0, 0.0]) - sampling.normal[0] * sampling.normal
+    along /= np.linalg.norm(along)
+    T_surface_reference[:3, :3] = np.stack([along, np.cross(sampling.normal, along), sampling.normal])
+    T_surface_reference[:3, 3] = -T_surface_reference[:3, :3] @ sampling.centre_m
     T = np.stack([T_surface_reference @ each for each in T_reference])
     half_m = np.maximum(np.abs(transform_points(T[0], views[0].points_m)[:, :2]).max(axis=0), 1e-6)
     x, y, z = np.concatenate([transform_points(T[v], each.points_m) for v, each in enumerate(data)]).T
@@ -283,35 +286,12 @@ def _adjust(
     return adjusted
 
 
-def _surface_frame(reference: PreparedView) -> np.ndarray:
-    """(4, 4) from the reference to the frame of the surface z(x, y): z along its mean normal, towards the camera."""
-    sampling = registered.sampling_of(reference)
-    z = sampling.normal
-    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    T[:3, 3] = -T[:3, :3] @ sampling.centre_m
-    return T
-
-
-def _view_data(view: PreparedView, reference: PreparedView, T_reference_view: np.ndarray) -> ViewData:
-    """The data of a view; its marks are those of the reference that ``T_reference_view`` brings them to, once each."""
+def _view_data(view: PreparedView, reference: PreparedView) -> ViewData:
+    """The data of a view."""
     points = registered.thinned(view.points_m)
     noise = max(registered.sampling_of(view).noise_m, 1e-9)
     inflation = max(len(points) / registered.independent(int(view.inside.sum())), 1.0)
-    turn = T_reference_view[:3, :3]
-    fits = []
-    for i, mark in enumerate(view.marks.trusted):
-        for j, other in enumerate(reference.marks.trusted):
-            apart = transform_points(T_reference_view, mark.centre_m) - other.centre_m
-            spread = turn @ mark.covariance_m2 @ turn.T + other.covariance_m2 + 2 * SHARED_M**2 * np.eye(3)
-            chi2 = float(apart @ np.linalg.solve(spread, apart))
-            if mark.code == other.code and chi2 <= MARK_GATE:
-                fits.append((chi2, i, j))
-    label: dict[int, int] = {}
-    for _, i, j in sorted(fits):
-        if i not in label and j not in label.values():
-            label[i] = j
-    marks = tuple((view.marks.trusted[i], label[i]) for i in sorted(label))
+    ours, theirs = (reference.marks.trusted,) * 2 if view is reference else _matched(reference, view)[:2]
+    label = {id(mark): number for number, mark in enumerate(reference.marks.trusted)}
+    marks = tuple((their, label[id(our)]) for our, their in zip(ours, theirs, strict=True))
     return ViewData(points, marks, noise, noise * float(np.sqrt(inflation)))

@@ -17,11 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import factorial
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 
 from detectors.average import CORRELATED_PIXELS
@@ -31,7 +29,7 @@ from detectors.registration import registered
 from detectors.registration.settings import CpdRegistration, IcpRegistration
 from detectors.surface import SurfaceConfig, fit_surface
 from detectors.views import PreparedView
-from harness.vocabulary.geometry import MM, Lens, Region, transform_points
+from harness.vocabulary.geometry import MM, Lens, transform_points
 
 GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
 """Usual error of a nominal pose; first pairs may lie twice as far apart as it moves the outermost point."""
@@ -173,11 +171,7 @@ def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, 
     target, (px, py, _) = reference.points_m, fixed_m.T
     x, y, z = target.T
     surface = fit_surface(x, y, z, SurfaceConfig(method="bisquare", degree=3 if len(target) >= 100 else 1))
-    slopes = [
-        (surface.evaluate(px + dx, py + dy) - surface.evaluate(px - dx, py - dy)) / (2 * SLOPE_STEP_M)
-        for dx, dy in ((SLOPE_STEP_M, 0.0), (0.0, SLOPE_STEP_M))
-    ]
-    smooth = np.stack([*slopes, -np.ones(len(px))], axis=1)
+    smooth = -surface.gradients(px, py, SLOPE_STEP_M)
     smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
     count = min(CORRELATED_PIXELS, len(target))
     local = registered.local_normals(target[cKDTree(target).query(fixed_m, k=count)[1]].reshape(len(fixed_m), count, 3))
@@ -191,12 +185,7 @@ def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, 
 
 LEAST_VARIANCE = 10 * float(np.finfo(np.float64).eps)
 """Variance in squared normalised units at which the clouds coincide (the authors' own criterion)."""
-# reductions may be reordered, which is what lets them run in parallel lanes; always the same way on one machine
-FAST: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
-EXPONENTIAL = tuple(1.0 / factorial(k) for k in range(13, -1, -1))
-"""exp(x) = exp(x / 64)^64: a series to degree 13 sees -1 to 0 only, without branches, so that it runs in lanes."""
-LEAST_EXPONENT, GREATEST_EXPONENT = -64.0, 700.0
-"""Weights below exp(-64) of the nearest component's are negligible; beyond exp(700) of it all is an outlier."""
+PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 
 @dataclass(frozen=True)
@@ -323,46 +312,20 @@ def posterior_moments(
     fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the Gaussians' factor.
     ``background``: the uniform component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n.
     The nearest component's weight is divided out, so that nothing underflows at w = 0."""
-    sums, objective = _expectation(fixed, np.ascontiguousarray(moving.T), variance, background)
-    return sums[:, [0, 1, 2, 3, 1, 4, 5, 6, 2, 5, 7, 8, 3, 6, 8, 9]].reshape(-1, 4, 4), objective
+    from scipy.spatial.distance import cdist
 
-
-@numba.njit(**FAST)
-def _expectation(fixed: np.ndarray, moving: np.ndarray, variance: float, background: float) -> tuple[np.ndarray, float]:
-    """Upper triangles (n, 10) of the moments, one row of posteriors at a time; ``moving`` (3, m)."""
-    count, half = moving.shape[1], 0.5 / variance
-    sums, weight = np.empty((len(fixed), 10)), np.empty(count)
-    objective = 0.0
-    for i in range(len(fixed)):
-        x, y, z = fixed[i]
-        least = np.inf
-        for m in range(count):
-            d = (x - moving[0, m]) ** 2 + (y - moving[1, m]) ** 2 + (z - moving[2, m]) ** 2
-            weight[m] = d
-            least = min(least, d)
-        total = 0.0
-        for m in range(count):
-            u = max((least - weight[m]) * half, LEAST_EXPONENT) / 64.0
-            e = 0.0
-            for c in EXPONENTIAL:
-                e = e * u + c
-            for _ in range(6):
-                e = e * e
-            weight[m] = e
-            total += weight[m]
-        xx = xy = xz = sx = yy = yz = sy = zz = sz = 0.0
-        for m in range(count):
-            e, p, q, r = weight[m], moving[0, m], moving[1, m], moving[2, m]
-            xx, xy, xz, sx = xx + e * p * p, xy + e * p * q, xz + e * p * r, sx + e * p
-            yy, yz, sy, zz, sz = yy + e * q * q, yz + e * q * r, sy + e * q, zz + e * r * r, sz + e * r
-        exponent = least * half
-        full = total
-        if background > 0.0:
-            full += background * np.exp(min(exponent, GREATEST_EXPONENT))
-        sums[i] = np.array([xx, xy, xz, sx, yy, yz, sy, zz, sz, total]) / full
-        far = background > 0.0 and exponent > GREATEST_EXPONENT
-        objective -= np.log(background) if far else np.log(full) - exponent
-    return sums, objective
+    places = np.column_stack([moving, np.ones(len(moving))])
+    products = np.einsum("mi,mj->mij", places, places).reshape(-1, 16)
+    moments, objective = [], 0.0
+    for part in np.array_split(fixed, 1 + len(fixed) * len(moving) // PAIRS_AT_ONCE):
+        exponents = cdist(part, moving, "sqeuclidean") / (-2.0 * variance)
+        greatest = exponents.max(axis=1, keepdims=True)
+        weights = np.exp(exponents - greatest)
+        with np.errstate(divide="ignore", over="ignore"):
+            full = np.logaddexp(np.log(weights.sum(axis=1)), np.log(background) - greatest[:, 0])
+            moments.append(weights @ products / np.exp(full)[:, None])
+        objective -= float((full + greatest[:, 0]).sum())
+    return np.concatenate(moments).reshape(-1, 4, 4), objective
 
 
 DEPTH_DIFFERENCE_M = 0.03
@@ -375,8 +338,14 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     (Open3D says so, or less than a tenth of the target's pixels pair) is a failure, and so is every view after it.
     ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
     T_reference_view, lost, found = np.eye(4), "", []
-    canvas = _canvas_of(views)
-    lens = canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy
+    # one pinhole for all: the first lens's focal lengths, and room for every target's points
+    first = views[0].view.cloud.lens
+    assert first is not None
+    places = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (first.fx, first.fy)
+    low = np.floor(places.min(axis=0)) - 1
+    width, height = (np.ceil(places.max(axis=0)) + 2 - low).astype(int).tolist()
+    lens = width, height, first.fx, first.fy, -float(low[0]), -float(low[1])
+    canvas = Lens(*lens)
     with open3d_on_one_thread() as o3d:
         methods, camera = o3d.pipelines.odometry, o3d.camera.PinholeCameraIntrinsic(*lens)
         option = methods.OdometryOption(depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3)
@@ -400,23 +369,12 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     return found
 
 
-def _canvas_of(views: Sequence[PreparedView]) -> Lens:
-    """One pinhole for all: the first lens's focal lengths, and room for every target's points."""
-    lens = views[0].view.cloud.lens
-    assert lens is not None
-    slopes = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views])
-    focal = np.array([lens.fx, lens.fy])
-    low = np.floor((slopes * focal).min(axis=0)) - 1
-    width, height = (np.ceil((slopes * focal).max(axis=0)) + 2 - low).astype(int)
-    return Lens(int(width), int(height), lens.fx, lens.fy, -float(low[0]), -float(low[1]))
-
-
 def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
     """The view's target as Open3D's intensity and depth on the canvas, both without distortion."""
     cloud = view.view.cloud
     lens = cloud.lens
     assert lens is not None and cloud.rgb is not None
-    slopes = canvas.region_slopes(Region(0, canvas.height, 0, canvas.width))
+    slopes = canvas.region_slopes(canvas.whole)
     pixels = lens.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1))
     u, v = (pixels - [cloud.region.col0, cloud.region.row0]).astype(np.float32).transpose(2, 0, 1)
     z = np.where(view.inside, cloud.points_m[..., 2], 0.0).astype(np.float32)

@@ -118,23 +118,18 @@ def judge(
     if elsewhere:
         return replace(judged, failure=elsewhere)
     within, across = registered.predicted_error_m(judged, points, ours.normal)
-    undetermined, apart = _undetermined(float(np.hypot(within, across)), ours.pitch_m), _apart(agreement)
+    error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * ours.pitch_m, BLUR_M)
+    undetermined, apart = "", _apart(agreement)
+    if error_m > limit_m:
+        undetermined = (
+            "not determined: the points let the target slide or turn (they lie on a line, or on a surface that slides"
+            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the map (up"
+            f" to {limit_m / MM:.1f} mm are merged)"
+        )
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
     return replace(judged, failure=failure) if failure else _widened(judged, ours.normal, within, across, agreement)
-
-
-def _undetermined(error_m: float, pitch_m: float) -> str:
-    """Return the reason why the points do not determine the pose; empty where they do, or the error is not known."""
-    limit = max(UNDETERMINED_PITCHES * pitch_m, BLUR_M)
-    if not error_m > limit:
-        return ""
-    return (
-        "not determined: the points let the target slide or turn (they lie on a line, or on a surface that slides in"
-        f" itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the map (up to"
-        f" {limit / MM:.1f} mm are merged)"
-    )
 
 
 def _jump(registration: registered.Registration, reference: PreparedView, view: PreparedView) -> str:
