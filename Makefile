@@ -28,8 +28,7 @@ check: .venv/.ready
 	$(BIN)/python -m harness.check experiments/regression.yaml
 
 benchmarks: .venv/.ready
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-only -o python_files='bench_*.py' -o addopts=''
-	$(BIN)/python tests/benchmarks/trials.py --peers
+	$(BIN)/python tests/benchmarks/performance.py
 
 # Recordings of many kinds of scene with known truth, answered by the default command: right, warned or wrong.
 strangers: .venv/.ready
