@@ -258,8 +258,10 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
             labels[mask] = place
         distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
         labels = np.where(distance <= WIDEST_PX / 2, labels[tuple(nearest)], 0)
-        # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
-        halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
+        halves = labels[None]
+        if not isinstance(camera, EmpiricalCamera):  # whose edges are steps between pixels
+            # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
+            halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
         z_m = np.full(halves.shape, np.nan)
         for place, (plane, _) in enumerate(capture.planes, start=1):
             z_m = np.where(halves == place, plane.z_along_m(capture.slopes), z_m)
