@@ -92,9 +92,10 @@ def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(t
 
 def point_with(**threshold: object) -> Point:
     calibrate = SimpleNamespace(**{"repeats": None, "false_calls_per_m2": None, **threshold})
-    return cast(
-        "Point", SimpleNamespace(config=SimpleNamespace(threshold=SimpleNamespace(k=None, calibrate=calibrate)))
-    )
+    board = SimpleNamespace(width_mm=400.0, height_mm=300.0)
+    target = SimpleNamespace(declare=lambda: SimpleNamespace(board=board))
+    threshold, source = SimpleNamespace(k=None, calibrate=calibrate), SimpleNamespace(target=target)
+    return cast("Point", SimpleNamespace(config=SimpleNamespace(threshold=threshold, simulated=source)))
 
 
 def test_a_study_s_threshold_is_set_by_the_wanted_rate():
@@ -106,6 +107,8 @@ def test_a_study_s_threshold_is_set_by_the_wanted_rate():
     assert threshold_of(point_with(repeats=39), []) is None
     with pytest.raises(UserError, match="too few"):
         threshold_of(point_with(false_calls_per_m2=0.1), quiet)
+    with pytest.raises(UserError, match=r"sees nothing of the board here but 0\.83 % of its face"):
+        threshold_of(point_with(false_calls_per_m2=1.0), [(1.0, 0.001)] * 39)
 
 
 def test_each_board_has_its_own_noise_and_its_own_errors_of_nominal_poses(tmp_path):
@@ -153,7 +156,7 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
     record = record_of(experiment, plan, tables_of(records_of(tmp_path, outcome), experiment), failed, provenance)
     (one,) = record.set_ups
     assert one.axes == {"source.camera.unit_seed": 1} and one.failed == 0 and len(one.inspected.hit) == 20
-    (said,) = without_limit(experiment.points, failed, record.set_ups)
+    (said,) = without_limit(experiment.points, outcome, failed, record.set_ups)
     assert said.startswith("no limit for source.camera.unit_seed=2: the camera sees nothing of the board here")
     assert "leaves none of the cloud's points" in said
 

@@ -30,9 +30,11 @@ from harness.evaluation.intervals import threshold_for_rate
 from harness.experiment.schema import Point
 from harness.vocabulary.errors import DiskFull, UserError
 from harness.vocabulary.files import write_bytes
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
+NOTHING = 0.1  # share of a board's face that is judged, up to which a camera that allows no threshold sees nothing
 AGREES = 1e-3
 """Relative difference up to which two thresholds count as equal: a tenth or less of the standard error that a threshold
 from some twenty boards has, and a thousand times what unlike processors were seen to differ by."""
@@ -133,7 +135,15 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
     if not areas_m2.mean() > 0:
         message = f"the detector {point.config.detector.name!r} gave no score to any pixel of the hole-free boards"
         raise UserError(message, fix="check its crop against the boards' poses")
-    return threshold_for_rate(thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2).value
+    try:
+        return threshold_for_rate(thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2).value
+    except UserError as error:
+        board = point.config.simulated.target.declare().board
+        seen = float(areas_m2.mean()) / (board.width_mm * board.height_mm * MM**2)
+        if seen > NOTHING:
+            raise
+        message = f"the camera sees nothing of the board here but {100 * seen:.2g} % of its face"
+        raise UserError(f"{message}, too little for a threshold") from error
 
 
 # ---------------------------------------------------------------- the run

@@ -134,7 +134,7 @@ def _write_study(
     study = record_of(experiment, plan, tables, failed, provenance)
     if not study.set_ups:
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
-    provenance["warnings"] += without_limit(experiment.points, failed, study.set_ups)
+    provenance["warnings"] += without_limit(experiment.points, outcome, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
     # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
     targets = [point.config.simulated.target for point in experiment.points]
@@ -382,15 +382,17 @@ def failures_by_point(
 
 
 def without_limit(
-    points: Iterable[Point], failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
+    points: Iterable[Point], outcome: Outcome, failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, with their commonest failure."""
     known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
+    by_name = {failure.what: failure for failure in outcome.failures}
     for point in points:
         if (point.variant, point.config.capture.frames) not in known:
             own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
             causes = Counter(one.in_short for one in own).most_common(1)
-            why = causes[0][0] if causes else "its trials did not end, see the failures"
+            threshold = by_name.get(f"threshold of {point.label}")
+            why = causes[0][0] if causes else threshold.in_short if threshold else "its trials did not end"
             if own and all(one.state == "failed" and not one.is_bug for one in own):
                 why = f"the camera sees nothing of the board here that could be judged ({why})"
             said.setdefault(why, []).append(point.label)
