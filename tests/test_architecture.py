@@ -52,6 +52,7 @@ PROGRAMS = [
     "pod",
     "design",
     "efficiency",
+    "coverage",
     "compare",
     "check",
     "ls",

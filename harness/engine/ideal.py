@@ -65,7 +65,7 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
 def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
     """Return a damaged board as the ideal observer sees it, by the numbers of frames that the points ask for."""
     set_up = load_set_up(batch.set_ups[0])
-    clear_z_m = _noise_free_z_m(set_up)
+    clear_z_m = noise_free_z_m(set_up)
     intact = set_up.intact & np.isfinite(clear_z_m)
     rows, columns = np.nonzero(set_up.on_board)
     cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
@@ -98,8 +98,8 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     return views
 
 
-def _noise_free_z_m(set_up: SetUp) -> np.ndarray:
-    """(h, w): what the camera shows without noise, unit errors and rounding; NaN where it shows nothing."""
+def noise_free_z_m(set_up: SetUp) -> np.ndarray:
+    """Return (h, w) what the camera shows without noise, unit errors and rounding; NaN where it shows nothing."""
     config = set_up.unit.config
     kept = {name: getattr(config.effects, name) for name in ("multipath", "wiggling", "ambient", "saturation")}
     clear = dict.fromkeys(EffectsConfig.model_fields, False) | kept

@@ -45,7 +45,8 @@ class Circle3d:
 class Scene3d:
     """The cloud that is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN where not judged;
     ``view_of`` (n,) index into ``view_names``, -1 of several; ``detected`` (n,) bool. ``frame``: "board" (x right, y
-    up, z to the viewer) or "camera" (x right, y down, z away). ``facts``: (name, value) beside the picture."""
+    up, z to the viewer) or "camera" (x right, y down, z away). ``facts``: (name, value) beside the picture. ``rgb``
+    is of what ``shown`` says, explained by ``key``: (words, colour)."""
 
     points_mm: np.ndarray
     frame: Literal["board", "camera"]
@@ -56,6 +57,8 @@ class Scene3d:
     detected: np.ndarray | None = None
     circles: tuple[Circle3d, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
+    shown: str = "camera's colours"
+    key: tuple[tuple[str, str], ...] = ()
 
 
 def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:
@@ -116,6 +119,8 @@ def packed(scene: Scene3d) -> dict[str, Any]:
         "several": SEVERAL,
         "mark": DAMAGE,
         "frame": scene.frame,
+        "shown": scene.shown,
+        "key": scene.key,
         "rgb": None if scene.rgb is None else _base64(scene.rgb[kept], "<u1"),
         "residual": residual,
         "view": view,

@@ -33,6 +33,7 @@ CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
 COMPARISON_PAGE = Output("compare.html", "the same as a page", of="check")
 EFFICIENCY_PAGE = Output("efficiency.html", "detectors beside the ideal observer", of="efficiency")
+COVERAGE_PAGE = Output("coverage.html", "a part that turns, coloured by the damage that is found", of="coverage")
 ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
 ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
 FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
@@ -46,7 +47,7 @@ GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "ca
 CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
 FILES = (
     REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
-    ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
+    COVERAGE_PAGE, ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
 )  # fmt: skip
 JOURNAL = "journal"
 LATEST = "latest"
@@ -56,6 +57,7 @@ LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
 def outputs() -> Iterator[Output]:
     """Yield every file, those of tables included."""
     from harness.tables.atlas import ATLAS
+    from harness.tables.coverage import COVERAGE_TABLES
     from harness.tables.efficiency import EFFICIENCY_TABLES
     from harness.tables.study import STUDY_TABLES
     from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
@@ -67,6 +69,7 @@ def outputs() -> Iterator[Output]:
         (STUDY_TABLES, "study"),
         (EFFICIENCY_TABLES, "efficiency"),
         ((ATLAS,), "atlas"),
+        (COVERAGE_TABLES, "coverage"),
     ):
         for table in tables:
             for name in table.files:

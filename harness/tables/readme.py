@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from harness.tables.coverage import COVERAGE_TABLES
 from harness.tables.efficiency import EFFICIENCY_TABLES
 from harness.tables.limits import SCORES
 from harness.tables.outputs import FILES, JOURNAL, LATEST
@@ -35,6 +36,7 @@ GROUPS = {
     "capture": "An experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
     "check": "`harness.check`, too",
     "efficiency": "`harness.efficiency`, too",
+    "coverage": "`harness.coverage`",
 }
 
 
@@ -54,6 +56,7 @@ def _lines() -> Iterator[str]:
     yield from _tables("Summaries of an experiment that is no study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
+    yield from _tables("Coverage of a part (`harness.coverage`)", COVERAGE_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
     yield from _tables("Anomaly maps on a data set (`harness.score`)", (SCORES,))
     yield from _tables("Real captures", (POINTS_OF_CAPTURES, FINDINGS_OF_CAPTURE))

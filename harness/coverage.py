@@ -1,0 +1,187 @@
+"""``python -m harness.coverage EXPERIMENT``: where on a part the camera is blind, and which poses see most of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.program import program, whole_number
+
+if TYPE_CHECKING:
+    from harness.engine.coverage import Pose, Survey
+
+TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)
+"""Tilts about x and about y among which poses are suggested, and among which a goal is sought."""
+GOAL_DISTANCES = (0.7, 1.0, 1.4)
+"""Distances, over the experiment's own, at which a goal is sought."""
+MOST_POSES, MOVE_S = 6, 10.0
+"""Poses of one way to a goal at most, and seconds to move the camera between two of them."""
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod: a study of drawn damage")
+    change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    pose = "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; may be repeated"
+    add("--pose", action="append", type=_pose, metavar="M,DEG,DEG", help=f"{pose} (default: the experiment's, frontal)")
+    add("--size", metavar="LENGTH", help="the wanted size, as 5mm (default: the largest of the experiment)")
+    grid = f"tilts of {TILTS_DEG[0]:g} to {TILTS_DEG[-1]:g}° about x and about y in steps of 20°, not both at the ends"
+    best = f"add the best N poses, one after another, of {grid}"
+    add("--suggest", type=whole_number(20), default=0, metavar="N", help=best)
+    goal = (
+        "seek the least time of capture that finds this size on the wanted share: all set-ups of the experiment, at "
+        f"{', '.join(f'{one:g}' for one in GOAL_DISTANCES)} of its distance, tilts of -30, 0 and 30°, up to "
+        f"{MOST_POSES} poses with {MOVE_S:g} s between them"
+    )
+    add("--goal", metavar="LENGTH", help=goal)
+    add("--share", type=float, default=0.9, help="of the face, for --goal (default: 0.9)")
+    add("--out", type=Path, metavar="DIR", help="default: results/coverage/ and the experiment's name")
+    results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
+    add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
+    add("--jobs", type=whole_number(256), default=2, metavar="N", help="processes (default: 2)")
+    add("--serial", action="store_true", help="run everything in this process, for a debugger")
+
+
+def _pose(text: str) -> Pose:
+    try:
+        distance_m, tilt_x, tilt_y = map(float, text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not DISTANCE,TILT,TILT, such as 0.7,20,0") from error
+    if not (0.1 <= distance_m <= 10 and abs(tilt_x) <= 60 and abs(tilt_y) <= 60):
+        raise argparse.ArgumentTypeError(f"{text!r}: 0.1 to 10 m, tilts of -60 to 60 degrees")
+    return distance_m, tilt_x, tilt_y
+
+
+@program(
+    _options,
+    "State the smallest damage that is found nine times in ten at each place of a part, from the noise, angle, "
+    "distance and missing returns there, and the share of the part on which a wanted size is found. Writes a page with "
+    "the part to turn, and tables.",
+    epilog="example: python -m harness.coverage pipe --size 3mm --suggest 3",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Returns 0 (also where a goal is not reached), 2 on a mistake of the user, 130 after Ctrl-C."""
+    from harness.ask import length_m
+    from harness.engine.coverage import declared, survey
+    from harness.engine.tables import write_tables
+    from harness.engine.work import EngineOptions, engine_of, locked
+    from harness.experiment.load import load_experiment, resolved_yaml
+    from harness.report.coverage import answer, coverage_html, scene_of, warnings_of
+    from harness.tables.coverage import COVERAGE, GOALS, POSES
+    from harness.tables.outputs import COVERAGE_PAGE, EXPERIMENT
+    from harness.tables.text import show
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+    from scenes.render.cache import in_use
+
+    experiment = load_experiment(options.experiment, options.overrides)
+    name = experiment.config.name
+    if options.goal and (options.size or options.suggest or options.pose):
+        raise UserError("--goal seeks the poses for its own size", fix="leave out --size, --suggest and --pose")
+    if not 0 < options.share <= 1:
+        raise UserError(f"--share {options.share:g}", legal="a share above 0, up to 1")
+    if len(experiment.points) > 1 and not options.goal:
+        said = f"{name}: has {len(experiment.points)} set-ups, and coverage is of one; --goal compares them"
+        raise UserError(said, fix="choose one by --set, such as sweep={} and the values of its axes")
+    asked = options.goal or options.size
+    size_mm = length_m("--goal" if options.goal else "--size", asked) / MM if asked else None
+    given, further = _poses(options, declared(experiment.config)[1].distance_m)
+    folder, cache = options.out or options.results / "coverage" / name, options.results / ".cache" / "renders"
+    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
+    engine = engine_of(EngineOptions(jobs=options.jobs, serial=options.serial), {experiment.config.detector.name})
+    with in_use(cache), locked(folder), engine:
+        surveys = survey(experiment, [*given, *further], cache, folder, engine)
+    one, goals = surveys[0], []
+    if options.goal:
+        ways = (way for one in surveys for way in _ways(one, one.found.wanted_mm(size_mm), options.share))
+        goals = sorted(
+            ways, key=lambda way: (not way["reached"], way["capture_s"] if way["reached"] else -way["total_share"])
+        )
+        one = goals[0]["survey"]
+    wanted = one.found.wanted_mm(size_mm)
+    poses = goals[0]["rows"] if goals else _rows(one, list(one.seen), wanted, len(given), options.suggest)
+    if not poses:
+        raise UserError(f"{name}: damage of {wanted:.3g} mm is found nowhere, in no pose", fix="ask for a larger size")
+    limits_mm = np.stack([row["limits_mm"] for row in poses])
+    best, patches = limits_mm.argmin(axis=0), one.patches
+    facts = np.stack(
+        [[seen.deviation_m, seen.cosine, seen.range_m] for seen in (one.seen[row["pose"]] for row in poses)]
+    )
+    columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm.min(axis=0), best + 1]
+    noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
+    columns += [noise_m / MM, np.degrees(np.arccos(cosine)), range_m]
+    names = [column.name for column in COVERAGE.columns]
+    rows = {COVERAGE: [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]}
+    rows |= {POSES: poses, GOALS: goals}
+    provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
+    provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
+    write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
+    said, warnings = (
+        answer(one.found, patches, limits_mm.min(axis=0), wanted, len(poses)),
+        warnings_of(one.found, one.seen),
+    )
+    if goals:
+        word = "Cheapest" if goals[0]["reached"] else "The goal is not reached; nearest"
+        said = f"{word}: {goals[0]['camera']}, {goals[0]['frames']} frames, {goals[0]['distance_m']:g} m. {said}"
+    config, scene = one.point.config, scene_of(patches, limits_mm.min(axis=0), one.found)
+    camera, frames = config.simulated.camera, config.capture.frames
+    detector = f"the detector {config.detector.name} at a threshold of {one.task.threshold:.3g}"
+    first = f"Simulated, for unit {camera.unit_seed} of {camera.name}, {frames} frames, {detector}. {one.found.said}"
+    write_text(folder / COVERAGE_PAGE.name, coverage_html(name, said, first, scene, poses, goals, warnings, command))
+    grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
+    show([said, first, *(f"warning: {text}" for text in warnings), *grids])
+    print(f"page: {folder / COVERAGE_PAGE.name}")
+    return 0
+
+
+def _poses(options: argparse.Namespace, own_m: float) -> tuple[list[Pose], list[Pose]]:
+    """The poses given, and those among which to choose."""
+    if options.goal:
+        distances, tilts = [round(own_m * part, 4) for part in GOAL_DISTANCES], GOAL_TILTS_DEG
+        return [], list(product(distances, tilts, tilts))
+    given = list(dict.fromkeys(options.pose or [(own_m, 0.0, 0.0)]))
+    grid = [pose for pose in product([given[0][0]], TILTS_DEG, TILTS_DEG) if min(abs(pose[1]), abs(pose[2])) < 40]
+    return given, [pose for pose in grid if pose not in given] if options.suggest else []
+
+
+def _rows(one: Survey, poses: list[Pose], size_mm: float, given: int, further: int) -> list[dict[str, Any]]:
+    """Rows of the poses given and of those added to them, in turn."""
+    from harness.evaluation.coverage import in_turn
+
+    limits_mm, rows = [one.found.limits_mm(one.seen[pose]) for pose in poses], list[dict[str, Any]]()
+    for which, gain, total in in_turn(one.patches, [each <= size_mm for each in limits_mm], given, further):
+        row = {"number": len(rows) + 1, "pose": poses[which], "limits_mm": limits_mm[which]}
+        row |= dict(zip(("distance_m", "tilt_x_deg", "tilt_y_deg"), poses[which], strict=True))
+        row |= {"alone_share": one.patches.share(limits_mm[which] <= size_mm), "gain_share": gain, "total_share": total}
+        rows.append(row)
+    return rows
+
+
+def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
+    """The fewest poses of a set-up at each distance, taken greedily, that reach the share, or all that it may have."""
+    from scenes.sensor.camera import camera_of
+
+    ways, config = [], one.point.config
+    camera, frames = camera_of(config.simulated.camera), config.capture.frames
+    for distance_m in dict.fromkeys(pose[0] for pose in one.seen):
+        rows = _rows(one, [pose for pose in one.seen if pose[0] == distance_m], size_mm, 0, MOST_POSES)
+        rows = rows[: next((row["number"] for row in rows if row["total_share"] >= share), len(rows))]
+        covered = rows[-1]["total_share"] if rows else 0.0
+        seconds = len(rows) * frames / camera.unit.frames_per_second.value + max(len(rows) - 1, 0) * MOVE_S
+        tilts = "; ".join(f"{row['tilt_x_deg']:g}, {row['tilt_y_deg']:g}" for row in rows)
+        way = {"set_up": one.point.label, "camera": camera.name, "frames": frames, "distance_m": distance_m}
+        way |= {"poses": len(rows), "tilts": tilts, "total_share": covered, "capture_s": seconds}
+        ways.append({**way, "reached": covered >= share, "rows": rows, "survey": one})
+    return ways
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""A part before a camera, patch by patch: what noise it has there, how strong damage shows, and how often it is found.
+
+Noise at a place is what the detector's residual on the undamaged part has about it: noise of the average, the unit's
+pattern, and what the fitted surface cannot follow. A damage's strength is d' of the ideal observer on it at a noise of
+1 m, from the difference of noise-free views with and without it. Strength and hits are learnt on boards of the family
+in random poses as wide as those that are asked for. Not modelled: an unknown surface in the strength, light that other
+parts throw back, information in missing returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from harness.engine.estimate import progress_display
+from harness.engine.ideal import REACH_PX, noise_free_z_m
+from harness.engine.journal import Journal
+from harness.engine.judge import detector_of
+from harness.engine.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
+from harness.engine.run import carried_out, render_missing, run_plan
+from harness.engine.setup import load_set_up
+from harness.engine.trial import PointTask, TrialTask, cloud_of
+from harness.engine.work import Job, JobEngine
+from harness.evaluation.coverage import Damages, Findable, Patches, Seen, findable
+from harness.evaluation.study.ideal import LONGEST_LAG_PX, NoiseSums, noise_sums, responses
+from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
+from scenes.target.custom import BoardConfig, PoseConfig
+from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.truth import Damage, face_of
+
+BOARDS, LOOKS = 40, 3
+"""Damaged boards on which strength and hits are learnt, and averages in which each is inspected."""
+STEEPEST_DEG = 60.0
+"""Tilt about either axis of these boards, at most."""
+DRAWS, AROUND_PX, NEAR_PX = 4, 31, 15
+"""Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
+the unit's pattern; and of that in which missing pixels count."""
+MOST_PATCHES = 3000
+SAME_MM = 1e-6
+"""Sizes that differ by less are one: then the size of damage is its depth."""
+ON_FACE_M = 5 * MM
+"""A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope."""
+
+Pose = tuple[float, float, float]
+"""Distance in metres, tilts of the part about its x and y in degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A set-up before a part: its ``task`` with the threshold, what it finds, and how it has ``seen`` the patches in
+    each pose."""
+
+    point: Point
+    task: PointTask
+    patches: Patches
+    found: Findable
+    seen: dict[Pose, Seen]
+
+
+def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine) -> list[Survey]:
+    """Return a survey for each set-up of an experiment. Views and trials that are there already, in ``cache``
+    and ``folder``, are not made again. Raises UserError where a point has no threshold, and as `declared` and
+    `findable` do."""
+    plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
+    journal, rows = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[bool]]()
+    with progress_display() as report:
+        outcome = run_plan(plan, journal, engine, report)
+    for entry in map(journal.read, outcome.finished):
+        for row in (entry.record or {}).get("holes", ()) if entry else ():
+            place = (row["variant"], row["frames"], row["board"], row["hole"])
+            rows.setdefault(place, []).append(bool(row["detected"] or row["no_return"]))
+    surveys = []
+    for group in plan.groups:
+        source, family = declared(group.points[0].config)
+        patches = patches_of(family.board)
+        target, wholes = family.drawn("hole_free", 0), [_bare(batch) for batch in group.then]
+        configs = [PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y) for distance_m, x, y in poses]
+        placed = (target.model_copy(update={"pose": one}) for one in configs)
+        views = [batch_of(one, "hole_free", source, cache, 0) for one in placed]
+        if lost := render_missing((job for batch in (*wholes, *views) for job in batch.renders), engine):
+            raise UserError(f"a view could not be rendered: {lost[0].in_short}")
+        for point in group.points:
+            if point.digest not in outcome.thresholds:
+                why = next((one.in_short for one in outcome.failures), "no hole-free run ended")
+                raise UserError(f"{point.label or point.variant} has no threshold: {why}")
+            task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
+            boards = _each(_board_learnt, zip(group.then, wholes, strict=True), (task, group.seed), engine)
+            damages = _damages([one for one in boards if one is not None], point, rows)
+            blind = np.full(len(patches.areas_m2), np.inf)
+            seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
+            seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
+            named = dict(zip(poses, seen, strict=True))
+            surveys.append(Survey(point, task, patches, findable(damages), named))
+    return surveys
+
+
+def patches_of(board: BoardConfig) -> Patches:
+    """Return the face of a board in about `MOST_PATCHES` patches, square in plan."""
+    sides_m = np.array([board.width_mm, board.height_mm]) * MM
+    counts = np.maximum(np.rint(sides_m / np.sqrt(sides_m.prod() / MOST_PATCHES)), 2).astype(int)
+    x, y = ((np.arange(n) + 0.5) * side / n - side / 2 for n, side in zip(counts.tolist(), sides_m, strict=True))
+    face = face_of(board)
+    points = face.point(*np.meshgrid(x, y)).reshape(-1, 3)
+    points = points[np.isfinite(points[:, 2])]
+    normals = face.axis(points[:, 0], points[:, 1])
+    kept = normals[:, 2] > 0
+    return Patches(points[kept], normals[kept], sides_m.prod() / counts.prod() / normals[kept, 2])
+
+
+def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
+    """Return the source and the family of boards. Raises UserError where there is no study of these in single views."""
+    source = config.simulated
+    if isinstance(source.target, DrawnTargetConfig) and config.study is not None and source.views is None:
+        return source, source.target
+    fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
+    raise UserError(f"{config.name}: is no study of drawn damage, each seen in a single view", fix=fix)
+
+
+def _widened(group: Group, poses: Sequence[Pose]) -> Group:
+    """The group with damaged boards in poses that reach as far as those given, and as the face is bent."""
+    source, family = declared(group.points[0].config)
+    bent_deg = float(np.degrees(np.arccos(patches_of(family.board).normals[:, 2].min())))
+    tilt_deg = min(family.tilt_deg + bent_deg + max(max(abs(x), abs(y)) for _, x, y in poses), STEEPEST_DEG)
+    near_m, far_m = (end(distance_m for distance_m, _, _ in poses) for end in (min, max))
+    jitter_mm = family.distance_jitter_mm + (far_m - near_m) / 2 / MM
+    wide = {"tilt_deg": tilt_deg, "distance_m": (near_m + far_m) / 2, "distance_jitter_mm": jitter_mm}
+    family, cache = family.model_copy(update=wide), group.then[0].renders[0].folder
+    then = tuple(batch_of(family.drawn("damaged", n), "damaged", source, cache, n) for n in range(BOARDS))
+    often = [replace(one, config=one.config.model_copy(update={"repeats": LOOKS})) for one in group.points]
+    return replace(group, points=tuple(often), then=then)
+
+
+def _bare(batch: Batch) -> Batch:
+    """A damaged batch's board without its damage."""
+    (job,), (ref,) = batch.renders, batch.set_ups
+    job = replace(job, target=job.target.hole_free())
+    ref = replace(ref, view_path=str(job.path), damaged=False)
+    return replace(batch, role="hole_free", renders=(job,), set_ups=(ref,))
+
+
+def _each(
+    act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
+) -> list[Any]:
+    """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
+    jobs = [
+        Job(str(n), "trials", act, (*some, *further), tuple(path for batch in some for path in batch.paths))
+        for n, some in enumerate(asked)
+    ]
+    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
+    return [end.result() if end.state == "done" or end.is_bug else None for end in (ends[job.name] for job in jobs)]
+
+
+def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int, int, str], Sequence[bool]]) -> Damages:
+    """The damages of boards (`_board_learnt`) that were inspected, their strengths by the noise of all boards."""
+    if not boards:
+        raise UserError(f"{point.label or point.variant}: no damaged board was judged", fix="check the detector's crop")
+    sums, facts = reduce(add, (noise for _, _, noise in boards)), []
+    for number, damages, _ in boards:
+        for damage, signal_m, seen in damages:
+            hits = looks.get((point.variant, point.config.capture.frames, number, str(damage.id)), ())
+            square = responses(signal_m, sums)[LONGEST_LAG_PX, LONGEST_LAG_PX] if signal_m.any() else 0.0
+            sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
+            facts.append((*sizes_mm, *seen, max(float(square), 0.0) ** 0.5, sum(hits), len(hits)))
+    plan_mm, depth_mm, *seen, strength, found, inspections = np.array(facts).T
+    by_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
+    named = ("depth", depth_mm) if by_depth else (damage.size_of, plan_mm)
+    return Damages(*named, Seen(*seen), strength, found, inspections)
+
+
+def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The detector's residuals (k, h, w) on averages of a hole-free board, where judged (k, h, w), and the deviation
+    (h, w) about each pixel: larger where some averages are not judged, infinite where most are not."""
+    fields = []
+    for repeat in range(DRAWS):
+        task = TrialTask(batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board)
+        evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(cloud_of(task, point))
+        fields.append(np.where(np.isfinite(evidence.score), evidence.residual_m, np.nan))
+    known = np.isfinite(fields)
+    noise_m = np.where(known, fields, 0.0)
+    square, count = (ndimage.uniform_filter(one.mean(axis=0), AROUND_PX) for one in (noise_m**2, known * 1.0))
+    share = ndimage.uniform_filter(known.mean(axis=0), NEAR_PX)
+    judged = (known.mean(axis=0) >= 0.5) & (square > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return noise_m, known, np.where(judged, np.sqrt(square / count / share), np.inf)
+
+
+def _board_learnt(
+    batch: Batch, whole: Batch, point: PointTask, seed: int
+) -> tuple[int, list[tuple[Damage, np.ndarray, tuple[float, float, float]]], NoiseSums]:
+    """A damaged board's number, its damages with their signatures (cut-outs, metres) and how each is seen, and the
+    noise of the board without them."""
+    set_up, intact = (load_set_up(one.set_ups[0]) for one in (batch, whole))
+    noise_m, known, deviation_m = _residuals(whole, point, seed)
+    change_m = np.nan_to_num(noise_free_z_m(set_up) - noise_free_z_m(intact))
+    x_m, y_m = np.moveaxis(set_up.board_xy_m, -1, 0)
+    found = []
+    for damage in set_up.truth:
+        near = damage.within(x_m, y_m, REACH_PX * max(set_up.pitch_mm) * MM)
+        rows, columns = np.nonzero(near)
+        signal_m = np.where(near, change_m, 0.0)[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        range_m = float(np.linalg.norm(damage.centre_camera_m))
+        cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
+        about_m = float(np.median(deviation_m.ravel()[set_up.outlines[damage.id]]))
+        found.append((damage, signal_m, (about_m, cosine, range_m)))
+    return batch.board or 0, found, noise_sums(noise_m / deviation_m, known & np.isfinite(deviation_m))
+
+
+def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
+    """How the patches of an undamaged part are seen and judged."""
+    set_up = load_set_up(view.set_ups[0])
+    _, _, deviation_m = _residuals(view, point, seed)
+    there = transform_points(set_up.T_camera_board, patches.points_m)
+    range_m = np.linalg.norm(there, axis=1)
+    cosine = -(rotate_vectors(set_up.T_camera_board, patches.normals) * there).sum(axis=1) / range_m
+    region, camera = set_up.unit.region, set_up.unit.camera
+    lens = camera.nominal_lens
+    u, v = np.rint(lens.project(there)).astype(int).T - [[region.col0], [region.row0]]
+    seen = camera.images(there) & (cosine > 0) & (u >= 0) & (v >= 0) & (u < region.shape[1]) & (v < region.shape[0])
+    u, v = np.where(seen, u, 0), np.where(seen, v, 0)
+    # what stands before a patch has another z
+    slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
+    reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
+    seen &= np.abs(set_up.seen_z_m[v, u] - there[:, 2]) < reach_m
+    return Seen(np.where(seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)
