@@ -18,8 +18,8 @@ FINEST = 2048
 RAYS_AT_ONCE = 1 << 22
 """Sub-rays cast at once: 4 million take 0.6 GB."""
 KINK_M, BENT_M = 2e-5, 2e-6
-"""Where a pixel's corners leave the plane at its centre by more than the first it has an edge in it, such as that of a
-strip of tape; up to the second its light follows from that plane, without casting sub-rays."""
+"""A pixel whose corners leave the plane at its centre by more than the first has an edge in it, such as that of a strip
+of tape; up to the second its light follows from that plane, without casting sub-rays."""
 UNSURE_M = 1e-4
 """Pixels whose direct light may be wrong by more are divided once more."""
 UNEVEN = 0.2
