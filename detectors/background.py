@@ -137,7 +137,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     if config.shape in STATED:
         name, fit = _stated(points, config, central)
     else:
-        shape = _chosen(cells, config)
+        _, start = _stated(points[:: max(1, len(points) // 8192)], SurfaceConfig(degree=2, method="bisquare"))
+        shape = _chosen(cells.refreshed(points[:, 2] - start(points), start), config)
         for _ in range(2):
             cells = cells.refreshed(points[:, 2] - shape.fit(points), shape.fit)
             shape = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
@@ -195,7 +196,7 @@ def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> 
 
 
 def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
-    """Return the cells of points (n, 3) of a cloud; None where they fill too few."""
+    """Return the cells of points (n, 3) of a cloud, not yet `refreshed`; None where they fill too few."""
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
     central = cloud.projection == "central" and float(points[:, 2].min()) > 0
@@ -216,14 +217,11 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     number[held] = np.arange(len(held))
     of = number[keys]
     row, column = np.divmod(held, columns)
-    middle = np.stack([np.bincount(keys, each)[held] / counts[held] for each in (x, y)], axis=1)
-    _, start = _stated(points[:: max(1, len(points) // 8192)], SurfaceConfig(degree=2, method="bisquare"))
+    x, y, z = (np.bincount(keys, each)[held] / counts[held] for each in (x, y, points[:, 2]))
     side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
-    z = _group_medians(points[:, 2], of, len(held))[0]
-    first = np.column_stack([middle * (z[:, None] if central else 1.0), z])
+    rays = np.column_stack([x, y]) * (z[:, None] if central else 1.0)
     weights, none = np.minimum(counts[held] / wanted, 1.0), np.zeros(len(held))
-    cells = _Cells(first, weights, none, 0.0, of, row, column, side, side_m, central)
-    return cells.refreshed(points[:, 2] - start(points), start)
+    return _Cells(np.column_stack([rays, z]), weights, none, 0.0, of, row, column, side, side_m, central)
 
 
 @numba.njit(cache=True, nogil=True)

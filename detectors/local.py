@@ -14,15 +14,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numba
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.background import background
-from detectors.clusters import PLAIN
+from detectors.background import Background, background
+from detectors.clusters import PLAIN, root_of
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, measure_detection
@@ -47,8 +47,6 @@ the same for the local level and for surroundings, which damage must not draw.""
 STRONG = 4.0
 """Pixels with such scores are kept out of surroundings and noise; from there to twice as much, by and by, out of the
 wider means of other pixels too."""
-GATE_SHARE, GATE_SIGMAS = 0.5, 1.5
-"""Share of a wider filter's signal that narrower ones must confirm, and the noise that is granted to them."""
 WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
 """Half of the window of the local noise: so many times the filter's half-width, and pixels at least: some 200
 independent means, which give a standard deviation to 8 %; samples from its middle to its edge, as neighbours in a mean
@@ -86,45 +84,60 @@ class LocalEvidence(Evidence):
     cell: np.ndarray = None  # type: ignore[assignment]
 
 
+class Picture(NamedTuple):
+    """What `LocalDetector.scored` judges: the surface, each point's cell (h, w) as in `LocalEvidence`, and
+    ``residuals``, its arguments."""
+
+    ground: Background
+    cell: np.ndarray
+    residuals: tuple[np.ndarray, np.ndarray, tuple[float, float]]
+
+
 class LocalDetector:
     """Filters of several widths against their surroundings, on the scale of the local noise; findings are peaks."""
 
     settings_type: ClassVar[type[LocalConfig]] = LocalConfig
     name = "local"
-    version = 2
+    version = 3
 
     def __init__(self, settings: LocalConfig) -> None:
         self.settings = settings
 
-    def analyse(self, cloud: Cloud) -> LocalEvidence:
-        """Score every pixel of the crop. Raises UserError on an empty crop and where no surface can be fitted."""
+    def picture(self, cloud: Cloud, pixels: int = 1) -> Picture:
+        """Return the residuals of the crop on a grid, of an organised cloud the means over squares of so many
+        ``pixels`` a side. Raises UserError on an empty crop and where no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
         ground = background(cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
         # the points are filtered on a grid: the cloud's own, cut to its judged part, or a raster where it has none
         if cloud.organised:
             rows, columns = np.nonzero(judged)
-            rows, columns = rows - rows.min(), columns - columns.min()
+            rows, columns = (rows - rows.min()) // pixels, (columns - columns.min()) // pixels
         else:
             _, rows, columns, _ = raster(cloud.points_m[judged], cloud)
         shape = int(rows.max()) + 1, int(columns.max()) + 1
-        place = rows * shape[1] + columns
+        cell = np.full(mask.shape, -1, dtype=np.int64)
+        cell[judged] = place = rows * shape[1] + columns
         share = _shares(cloud, judged, ground.residual_m)
         weights = np.bincount(place, share, shape[0] * shape[1])
-        typical = 1.0 if cloud.organised else median_of(weights[weights > 0])
+        typical = 1.0 if cloud.organised and pixels == 1 else median_of(weights[weights > 0])
         share, weights = share / typical, (weights / typical).reshape(shape).astype(np.float32)
         sums = np.bincount(place, share * ground.residual_m[judged], weights.size).reshape(shape)
-        rounding_m2 = rounding_variances(cloud, judged)
-        signed, typical_m, unit = self.scored(sums / np.maximum(weights, 1e-12), weights, rounding_m2)
-        cell = np.full(mask.shape, -1, dtype=np.int64)
-        cell[judged] = place
-        scores = on_grid(signed.ravel()[place], judged)
+        residuals = sums / np.maximum(weights, 1e-12), weights, rounding_variances(cloud, judged)
+        return Picture(ground, cell, residuals)
+
+    def analyse(self, cloud: Cloud) -> LocalEvidence:
+        """Score every pixel of the crop. Raises UserError on an empty crop and where no surface can be fitted."""
+        ground, cell, residuals = self.picture(cloud)
+        signed, typical_m, unit = self.scored(*residuals)
+        judged = cell >= 0
+        scores = on_grid(signed.ravel()[cell[judged]], judged)
         return LocalEvidence(
             score=np.abs(scores),
             residual_m=ground.residual_m,
             surface_z_m=ground.surface_z_m,
             scale_m=typical_m,
-            notes={**ground.notes, "surface": ground.description, "points": len(rows)},
+            notes={**ground.notes, "surface": ground.description, "points": int(judged.sum())},
             warnings=(ground.warning,) if ground.warning else (),
             behind=scores > 0,
             unit=unit,
@@ -202,8 +215,7 @@ def _scored(
     ``rounding_m2``: variances that rounding leaves, as `detectors.noise.rounding_variances` has them.
 
     From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
-    wider ones of other pixels, over which it would spread; a strong pixel takes no part in surroundings and noise. A
-    sure pixel's score still grows with the width, where narrower means confirm it (`_strongest`).
+    wider ones, over which it would spread; a strong pixel takes no part in surroundings and noise.
     """
     seen = weights > 0
     # in units of the typical pixel's noise: single precision is then enough
@@ -226,7 +238,7 @@ def _scored(
 
     best = np.zeros(seen.shape, np.float32)
     sure, quiet = np.zeros_like(best), np.ones_like(best)
-    typical_m, kept = 0.0, []
+    typical_m = 0.0
     for half, wide in zip(HALF_WIDTHS[:count], HALF_WIDTHS[SURROUNDINGS:], strict=False):
         width = 2 * half + 1
         # a tent's mean of white noise has 4/9 of the variance of a square's
@@ -244,13 +256,7 @@ def _scored(
         typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
         best = np.where((sure < 1.0) & (np.abs(score) > np.abs(best)), score, best)
         sure = np.maximum(sure, np.clip(np.abs(best) / STRONG - 1.0, 0.0, 1.0))
-        mean, covered = _mean(clipped, weights, half)
-        kept.append((mean, around, sigma / np.sqrt(np.maximum(_worth(weights, covered, half), FAINT))))
-    means, surroundings, deviations = (np.stack(images) for images in zip(*kept, strict=True))
-    grown = np.zeros_like(best)
-    grown[sure > 0] = _strongest(*(each[:, sure > 0] for each in (means, surroundings, deviations)))
-    signed = np.where(grown * np.sign(best) > np.abs(best), best + sure * (grown - best), best)
-    return signed.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
+    return best.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
 
 
 def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
@@ -295,10 +301,9 @@ def local_sigma(
         return np.asarray(np.round(moved + 0.5 * (length - 1)).astype(np.int64))
 
     rows, columns = (nodes_of(length) for length in values.shape)
-    sizes = np.abs(values).astype(np.float32)
-    nodes = _local_medians(sizes, rows, columns, half, max(1, half // samples)) / 0.6745
+    nodes = _local_medians(values, rows, columns, half, max(1, half // samples)) / 0.6745
     known = np.isfinite(nodes)
-    finite = nodes[known] if known.any() else sizes[np.isfinite(sizes)] / 0.6745
+    finite = nodes[known] if known.any() else np.abs(values[np.isfinite(values)]) / 0.6745
     everywhere = median_of(finite) if len(finite) else floor
     nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)
     h, w = values.shape
@@ -308,12 +313,12 @@ def local_sigma(
 
 @numba.njit(**PLAIN)
 def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, half: int, stride: int) -> np.ndarray:
-    """Return the medians (r, c) of the finite values (h, w) in windows of 2 ``half`` + 1 pixels about the nodes, every
-    ``stride``-th along both axes."""
+    """Return the medians (r, c) of the finite values' (h, w) sizes in windows of 2 ``half`` + 1 pixels about the nodes,
+    every ``stride``-th along both axes."""
     h, w = values.shape
     medians = np.full((len(rows), len(columns)), np.nan)
     side = 2 * (half // stride) + 1
-    held = np.empty(side * side, values.dtype)
+    held = np.empty(side * side, np.float32)
     reach = half // stride * stride
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
@@ -322,36 +327,11 @@ def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, ha
                 if 0 <= y < h:
                     for x in range(column - reach, column + reach + 1, stride):
                         if 0 <= x < w and np.isfinite(values[y, x]):
-                            held[n] = values[y, x]
+                            held[n] = abs(values[y, x])
                             n += 1
             if n >= LEAST_SAMPLES:
                 medians[i, j] = np.median(held[:n])
     return medians
-
-
-def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Return the largest (n,) (mean - around) / deviation in size, with its sign, over filters (k, n) from narrow to
-    wide; 0 where no filter has its say. A wide filter, which reaches over what lies beside it, has its full say only
-    where all narrower means depart from the same surroundings by `GATE_SHARE` of what its own does, less `GATE_SIGMAS`
-    of their deviations; and none where one departs by half as much."""
-    best = np.zeros(means.shape[1], np.float32)
-    for k in range(len(means)):
-        signal = means[k] - around[k]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            confirmed = (means[:k] - around[k]) / signal + GATE_SIGMAS * deviation[:k] / np.abs(signal)
-            say = np.maximum(2.0 * confirmed / GATE_SHARE - 1.0, 0.0).min(axis=0, initial=1.0)
-            score = signal / deviation[k] * say
-            best = np.where(np.abs(score) > np.abs(best), score, best)
-    return best
-
-
-@numba.njit(**PLAIN)
-def _root_of(parents: np.ndarray, i: int) -> int:
-    """Return the root of the set that holds ``i``, each member pointing to a parent (Tarjan 1975)."""
-    while parents[i] != i:
-        parents[i] = parents[parents[i]]
-        i = parents[i]
-    return i
 
 
 @numba.njit(**PLAIN)
@@ -374,7 +354,7 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
             for x in range(max(column - 1, 0), min(column + 2, w)):
                 neighbour = place[y * w + x]
                 if neighbour >= 0 and neighbour != n and (flat[y * w + x] > 0) == (flat[pixel] > 0):
-                    met[count] = _root_of(parents, neighbour)
+                    met[count] = root_of(parents, neighbour)
                     count += 1
         if count == 0:
             continue
@@ -387,5 +367,5 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
             if other != highest and (height > saddle * top or top - height < prominence):
                 parents[other] = highest
     for n in range(len(order)):
-        parents[n] = _root_of(parents, n)
+        parents[n] = root_of(parents, n)
     return parents

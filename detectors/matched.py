@@ -27,25 +27,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
 
 import cv2
 import numba
 import numpy as np
 import scipy.fft
-from pydantic import model_validator
 
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, local_sigma
+from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, Picture, local_sigma
 from detectors.masks import grown
 from detectors.missing import missing_evidence
+from detectors.noise import median_of
 from detectors.whitening import (
     ALL_RADII_PX,
     CONVERGED,
+    FIRST_SLOT,
     GRID,
     LONGEST_LAG_PX,
     ROUGHLY_CONVERGED,
+    WINDOW,
     coarse,
     grid_of,
     halved,
@@ -62,14 +63,16 @@ WINDOW_RADII, LEAST_WINDOW = 6, 32
 SCATTER_SAMPLES = 7
 """Samples from a window's middle to its edge: scores, which templates correlate, tell no more."""
 LEAST_SEEN = 0.5
+SHORT_PX = 13
+"""Width over which noise is compared from place to place: what is wider counts there as much as elsewhere."""
 QUIET_SIGMAS = 4.0
 """Pixels beyond it, and their neighbours, do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations beyond which no single pixel counts for more: a flying pixel alone is no finding."""
+"""Deviations beyond its neighbours' median where no pixel counts for more: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
-ROUGHLY = (0, 2, 4, 6, 9, 11, 13)
+ROUGHLY = (0, 2, 4, 5, 9, 11)
 """Templates that tell what stands out strongly."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
@@ -84,22 +87,11 @@ TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
 
-class MatchedConfig(LocalConfig):
-    """The settings of `local`, but for ``surface``: the thesis' polynomial, unless ``shape: auto`` asks for a chosen
-    shape, whose uncertain long waves count as noise here."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _chosen_shape(cls, data: Any) -> Any:
-        return data
-
-
 class MatchedDetector(LocalDetector):
     """A bank of matched filters on noise that the capture itself whitens; findings are peaks."""
 
-    settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 5
+    version = 6
 
     def __init__(self, settings: LocalConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
@@ -116,6 +108,11 @@ class MatchedDetector(LocalDetector):
         score, signed, there = np.sqrt(evidence.score**2 + lost), evidence.signed.copy(), evidence.cell >= 0
         signed.ravel()[evidence.cell[there]] = np.copysign(score[there], signed.ravel()[evidence.cell[there]])
         return replace(evidence, score=score, signed=signed)
+
+    def picture(self, cloud: Cloud, pixels: int = 1) -> Picture:
+        """Return the residuals on a grid in which noise reaches no farther than through a camera's own window: depth
+        that was upsampled is no sharper than its camera's pixels."""
+        return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / len(WINDOW))))
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
@@ -141,30 +138,13 @@ class MatchedDetector(LocalDetector):
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals, in squared deviations of the noise round about, by
         lag."""
-        learner = _Learner(self.settings)
-        for cloud in hole_free:
-            learner.analyse(cloud)
-        return {"covariance": np.mean(learner.seen, axis=0)} if learner.seen else {}
+        pictures = (self.picture(cloud) for cloud in hole_free)
+        seen = [_covariance(*_in_deviations(*one.residuals)[::2]) for one in pictures]
+        return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
         """Return the detector that whitens by the learned covariance instead of the capture's own."""
         return type(self)(self.settings, learned.get("covariance"))
-
-
-class _Learner(MatchedDetector):
-    """Keeps the covariance of each cloud that it analyses."""
-
-    def __init__(self, settings: LocalConfig) -> None:
-        super().__init__(settings)
-        self.seen: list[np.ndarray] = []
-
-    def scored(
-        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
-    ) -> tuple[np.ndarray, float, str]:
-        """Return scores of 0."""
-        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
-        self.seen.append(_covariance(values, known))
-        return np.zeros(values.shape), float(np.median(unit_m[known])), ""
 
 
 def _in_deviations(
@@ -174,9 +154,14 @@ def _in_deviations(
     what they share along the outline; that unit (r, c) in metres; and (r, c) bool, what is known."""
     known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
-    values = np.where(known, residual_m * np.sqrt(weights), np.nan)
-    unit_m = np.maximum(local_sigma(values, floor=floor_m), floor_m)
-    return _without_rim(np.where(known, values / unit_m, 0.0), known), unit_m, known
+    values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
+    # what is wider than a filter's window, objects and the surface's misfit, is no noise of pixels
+    side = (SHORT_PX, SHORT_PX)
+    around = (cv2.blur(each, side, borderType=cv2.BORDER_REFLECT) for each in (values, known.astype(np.float32)))
+    short = np.where(known, values - next(around) / np.maximum(next(around), 1e-6), np.nan)
+    share = median_of(np.abs(short[known])) / max(median_of(np.abs(values[known])), 1e-12)
+    unit_m = np.maximum(local_sigma(short) / max(share, 1e-3), floor_m)
+    return _without_rim(values / unit_m, known), unit_m, known
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -192,41 +177,47 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
     grid = grid_of(noise.shape)
     covariance = _covariance(noise, known) if covariance is None else covariance
     power, worth_of = spectrum(covariance, grid), worths(spectrum(covariance, (GRID, GRID)))
-    clipped = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS)
+    level = cv2.medianBlur(noise, 3)
+    clipped = np.clip(noise, np.minimum(level, 0.0) - CLIP_SIGMAS, np.maximum(level, 0.0) + CLIP_SIGMAS)
 
     # what stands out strongly: its pixels count as unknown for the rest
     roughly = inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED)
-    rough = scipy.fft.rfft2(roughly, grid)
-    size, by = np.zeros_like(noise), np.zeros(noise.shape, np.int64)
+    rough, every = scipy.fft.rfft2(roughly, grid), np.ones_like(noise)
+    size, by = np.zeros_like(noise), np.zeros(noise.shape, np.uint8)
     for k in ROUGHLY:
-        _keep_stronger(size, by, response(rough, k, noise.shape) * np.float32(worth_of[k].energy ** -0.5), k)
+        score = response(rough, k, noise.shape) * np.float32(worth_of[k].energy ** -0.5)
+        _keep_stronger(size, by, score, every, k)
     core, taken, taken_by = _cores(np.abs(size), by, noise, known)
     seen = known & ~grown(core, MARGIN_PX)
 
     rest = np.where(seen, clipped, np.float32(0.0))
     whole = scipy.fft.rfft2(inverse_times(rest, seen, power, grid, CONVERGED, roughly), grid)
     weighed = whole, halved(whole)
-    there, divisors = [seen.astype(np.float32)], np.ones(len(ALL_RADII_PX))
+    there, divisors = [seen.astype(np.float32)], np.ones(len(ALL_RADII_PX), np.float32)
     even = np.pad(seen, ((0, seen.shape[0] % 2), (0, seen.shape[1] % 2)))
     there.append(cv2.resize(even.astype(np.float32), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     # what light and flying pixels leave along outlines looks like a slot
-    inner = cv2.resize(_depth_px(even), None, fx=0.5, fy=0.5) > RIM_PX
-    (signed, by), slots = best = [(np.zeros_like(each), np.zeros(each.shape, np.int64)) for each in there]
+    off_rim = there[1] * (cv2.resize(_depth_px(even), None, fx=0.5, fy=0.5) > RIM_PX)
+    best = [(np.zeros_like(each), np.zeros(each.shape, np.uint8)) for each in there]
     for k, worth in enumerate(worth_of):
         step = coarse(k)
         share = cv2.blur(there[step], worth.sides, borderType=cv2.BORDER_CONSTANT)
         score = response(weighed[step], k, noise.shape)
-        _normalise(score, share, inner if step else there[0], worth.energy)
+        _normalise(score, share, off_rim if k >= FIRST_SLOT else there[step], worth.energy)
         # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
         window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW) / (1 + step))
-        scatter = np.maximum(local_sigma(score, window, 1.0, SCATTER_SAMPLES), 1.0)
+        scatter = local_sigma(score, window, 1.0, SCATTER_SAMPLES)
         if ALL_RADII_PX[k] <= TAIL_PX:
-            scatter *= _tail(np.nan_to_num(score / scatter)[seen])
+            scatter *= _tail(np.nan_to_num(score[seen] / scatter[seen]))
         divisors[k] = np.median(scatter[::4, ::4])
-        _keep_stronger(*best[step], score / scatter, k)
+        _keep_stronger(*best[step], score, scatter, k)
+    (signed, by), (wide, wide_by) = best
+    h, w = seen.shape
+    wide = cv2.resize(wide, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:h, :w]
+    wide_by = np.repeat(np.repeat(wide_by, 2, axis=0), 2, axis=1)[:h, :w]
+    wider = np.abs(wide) > np.abs(signed)
+    signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
     _fill_discs(signed, np.asarray(ALL_RADII_PX, np.float32)[by])
-    slot = cv2.resize(slots[0], None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[: seen.shape[0], : seen.shape[1]]
-    signed = np.where(np.abs(slot) > np.abs(signed), slot, signed)
     signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
     return signed.astype(np.float64), worth_of[0].energy ** -0.5
 
@@ -243,12 +234,14 @@ def _normalise(score: np.ndarray, share: np.ndarray, there: np.ndarray, energy: 
 
 
 @numba.njit(**PLAIN)
-def _keep_stronger(signed: np.ndarray, by: np.ndarray, score: np.ndarray, number: int) -> None:
-    """Keep of each pixel's scores (r, c) the larger in size, and the ``number`` of its template."""
+def _keep_stronger(signed: np.ndarray, by: np.ndarray, score: np.ndarray, over: np.ndarray, number: int) -> None:
+    """Keep of each pixel's scores (r, c) and a score ``over`` (r, c) the larger in size, and that template's
+    ``number``."""
     for i in range(score.shape[0]):
         for j in range(score.shape[1]):
-            if abs(score[i, j]) > abs(signed[i, j]):
-                signed[i, j], by[i, j] = score[i, j], number
+            one = score[i, j] / over[i, j]
+            if abs(one) > abs(signed[i, j]):
+                signed[i, j], by[i, j] = one, number
 
 
 def _tail(scores: np.ndarray) -> float:
@@ -285,7 +278,7 @@ def _cores(
     that two holes that touch keep two peaks, and higher where the loud pixels' median exceeds the clipped size; and
     these templates (r, c)."""
     peaks = (size > STRONG) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
-    core, signed, found_by = np.zeros(size.shape, bool), np.zeros(size.shape), np.zeros(size.shape, np.int64)
+    core, signed, found_by = np.zeros(size.shape, bool), np.zeros(size.shape), np.zeros(size.shape, np.uint8)
     if not peaks.any():
         return core, signed, found_by
     loud = known & (np.abs(noise) > LOUD_SIGMAS)
@@ -294,7 +287,7 @@ def _cores(
     count, parts, stats, _ = cv2.connectedComponentsWithStats(
         cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
     )
-    score, template = np.zeros(count), np.zeros(count, np.int64)
+    score, template = np.zeros(count), np.zeros(count, np.uint8)
     for row, column in np.argwhere(peaks):
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
             least = LOUD_SHARE * np.pi * ALL_RADII_PX[by[row, column]] ** 2
@@ -304,12 +297,11 @@ def _cores(
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
-        sizes, heights = np.abs(noise[cut][part]), smooth[cut][part].astype(np.float64)
-        louder = max(float(np.median(sizes[sizes > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
+        heights = smooth[cut][part].astype(np.float64)
         # quiet pixels between loud ones are no finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
-        signed[cut][part] = score[number] * louder * heights / np.abs(heights).max()
+        signed[cut][part] = score[number] * heights / np.abs(heights).max()
         core[cut] |= part
         found_by[cut][part] = template[number]
     return core, signed, found_by

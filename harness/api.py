@@ -38,6 +38,7 @@ from harness.engine.work import EngineOptions
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
+from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.run import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
@@ -119,7 +120,7 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
     return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
 
 
-def detect(cloud: Cloud, detector: str = "local", threshold: float | None = None, **settings: Any) -> Judged:
+def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any) -> Judged:
     """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
     ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
     ``settings``: the detector's. Raises UserError where the cloud cannot be judged.

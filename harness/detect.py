@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP, MARKS, MERGES, METHODS
+from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP, MARKS, MERGES, METHODS
 from harness.vocabulary.program import program, whole_number
 
 
@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--crop", default="auto", metavar="KIND", help=crop)
     target = "with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
-    add("--detector", default="local", help="detector's name (default: local)")
+    add("--detector", default=DEFAULT_DETECTOR, help=f"detector's name (default: {DEFAULT_DETECTOR})")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     mesh = (

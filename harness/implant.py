@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.inspection.arguments import DEFAULT_FALSE_CALLS, LEGAL_CROP
+from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
@@ -43,7 +43,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    add("--detector", default="local", help="detector's name (default: local)")
+    add("--detector", default=DEFAULT_DETECTOR, help=f"detector's name (default: {DEFAULT_DETECTOR})")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
     add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}")
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")

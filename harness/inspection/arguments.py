@@ -25,6 +25,7 @@ MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
+DEFAULT_DETECTOR = "matched"
 PREFIX = "mapping."
 """Start of the --set keys that concern the way from views to one cloud; all others are the detector's."""
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop", "variant")
