@@ -47,6 +47,8 @@ the same for the local level and for surroundings, which damage must not draw.""
 STRONG = 4.0
 """Pixels with such scores are kept out of surroundings and noise; from there to twice as much, by and by, out of the
 wider means of other pixels too."""
+GATE_SHARE, GATE_SIGMAS = 0.5, 1.5
+"""Share of a wider filter's signal that narrower ones must confirm, and the noise that is granted to them."""
 WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
 """Half of the window of the local noise: so many times the filter's half-width, and pixels at least: some 200
 independent means, which give a standard deviation to 8 %; samples from its middle to its edge, as neighbours in a mean
@@ -98,7 +100,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[LocalConfig]] = LocalConfig
     name = "local"
-    version = 3
+    version = 2
 
     def __init__(self, settings: LocalConfig) -> None:
         self.settings = settings
@@ -215,7 +217,8 @@ def _scored(
     ``rounding_m2``: variances that rounding leaves, as `detectors.noise.rounding_variances` has them.
 
     From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
-    wider ones, over which it would spread; a strong pixel takes no part in surroundings and noise.
+    wider ones of other pixels, over which it would spread; a strong pixel takes no part in surroundings and noise. A
+    sure pixel's score still grows with the width, where narrower means confirm it (`_strongest`).
     """
     seen = weights > 0
     # in units of the typical pixel's noise: single precision is then enough
@@ -238,7 +241,7 @@ def _scored(
 
     best = np.zeros(seen.shape, np.float32)
     sure, quiet = np.zeros_like(best), np.ones_like(best)
-    typical_m = 0.0
+    typical_m, kept = 0.0, []
     for half, wide in zip(HALF_WIDTHS[:count], HALF_WIDTHS[SURROUNDINGS:], strict=False):
         width = 2 * half + 1
         # a tent's mean of white noise has 4/9 of the variance of a square's
@@ -256,7 +259,13 @@ def _scored(
         typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
         best = np.where((sure < 1.0) & (np.abs(score) > np.abs(best)), score, best)
         sure = np.maximum(sure, np.clip(np.abs(best) / STRONG - 1.0, 0.0, 1.0))
-    return best.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
+        mean, covered = _mean(clipped, weights, half)
+        kept.append((mean, around, sigma / np.sqrt(np.maximum(_worth(weights, covered, half), FAINT))))
+    means, surroundings, deviations = (np.stack(images) for images in zip(*kept, strict=True))
+    grown = np.zeros_like(best)
+    grown[sure > 0] = _strongest(*(each[:, sure > 0] for each in (means, surroundings, deviations)))
+    signed = np.where(grown * np.sign(best) > np.abs(best), best + sure * (grown - best), best)
+    return signed.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
 
 
 def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
@@ -332,6 +341,22 @@ def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, ha
             if n >= LEAST_SAMPLES:
                 medians[i, j] = np.median(held[:n])
     return medians
+
+
+def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Return the largest (n,) (mean - around) / deviation in size, with its sign, over filters (k, n) from narrow to
+    wide; 0 where no filter has its say. A wide filter, which reaches over what lies beside it, has its full say only
+    where all narrower means depart from the same surroundings by `GATE_SHARE` of what its own does, less `GATE_SIGMAS`
+    of their deviations; and none where one departs by half as much."""
+    best = np.zeros(means.shape[1], np.float32)
+    for k in range(len(means)):
+        signal = means[k] - around[k]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            confirmed = (means[:k] - around[k]) / signal + GATE_SIGMAS * deviation[:k] / np.abs(signal)
+            say = np.maximum(2.0 * confirmed / GATE_SHARE - 1.0, 0.0).min(axis=0, initial=1.0)
+            score = signal / deviation[k] * say
+            best = np.where(np.abs(score) > np.abs(best), score, best)
+    return best
 
 
 @numba.njit(**PLAIN)

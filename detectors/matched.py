@@ -13,7 +13,8 @@ part of the covariance, and counts as little as its power demands.
 
 What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter
 sees the shoulder of a neighbour's hole. What pixels along the target's outline share is subtracted: what lies behind
-the edge, and light from beside, have a part in them.
+the edge, and light from beside, have a part in them. Depth that was upsampled, so that its noise reaches beyond a
+camera's window, is judged on squares of pixels in which it does not.
 
 Not modelled: slots that no template fits, but for what they have in common with one; slots within `RIM_PX` of outlines
 and of what was taken out; templates' distortion where a surface is steep; missing returns but for the few that are no
@@ -27,11 +28,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import cv2
 import numba
 import numpy as np
 import scipy.fft
+from pydantic import model_validator
 
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
@@ -68,7 +71,7 @@ SHORT_PX = 13
 QUIET_SIGMAS = 4.0
 """Pixels beyond it, and their neighbours, do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations beyond its neighbours' median where no pixel counts for more: a flying pixel alone is no finding."""
+"""Deviations beyond which no single pixel counts for more: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
@@ -87,9 +90,20 @@ TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
 
+class MatchedConfig(LocalConfig):
+    """The settings of `local`, but for ``surface``: the thesis' polynomial, unless ``shape: auto`` asks for a chosen
+    shape, whose uncertain long waves count as noise here."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _chosen_shape(cls, data: Any) -> Any:
+        return data
+
+
 class MatchedDetector(LocalDetector):
     """A bank of matched filters on noise that the capture itself whitens; findings are peaks."""
 
+    settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
     version = 6
 
@@ -177,8 +191,7 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
     grid = grid_of(noise.shape)
     covariance = _covariance(noise, known) if covariance is None else covariance
     power, worth_of = spectrum(covariance, grid), worths(spectrum(covariance, (GRID, GRID)))
-    level = cv2.medianBlur(noise, 3)
-    clipped = np.clip(noise, np.minimum(level, 0.0) - CLIP_SIGMAS, np.maximum(level, 0.0) + CLIP_SIGMAS)
+    clipped = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS)
 
     # what stands out strongly: its pixels count as unknown for the rest
     roughly = inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED)
@@ -209,7 +222,7 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
         scatter = local_sigma(score, window, 1.0, SCATTER_SAMPLES)
         if ALL_RADII_PX[k] <= TAIL_PX:
             scatter *= _tail(np.nan_to_num(score[seen] / scatter[seen]))
-        divisors[k] = np.median(scatter[::4, ::4])
+        divisors[k] = scatter.mean()
         _keep_stronger(*best[step], score, scatter, k)
     (signed, by), (wide, wide_by) = best
     h, w = seen.shape
@@ -297,11 +310,12 @@ def _cores(
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
-        heights = smooth[cut][part].astype(np.float64)
+        sizes, heights = np.abs(noise[cut][part]), smooth[cut][part].astype(np.float64)
+        louder = max(float(np.median(sizes[sizes > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
         # quiet pixels between loud ones are no finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
-        signed[cut][part] = score[number] * heights / np.abs(heights).max()
+        signed[cut][part] = score[number] * louder * heights / np.abs(heights).max()
         core[cut] |= part
         found_by[cut][part] = template[number]
     return core, signed, found_by

@@ -123,7 +123,8 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
 def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any) -> Judged:
     """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
     ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
-    ``settings``: the detector's. Raises UserError where the cloud cannot be judged.
+    ``settings``: the detector's; the default one's surface has a shape chosen by evidence, unless they state it.
+    Raises UserError where the cloud cannot be judged.
 
     >>> tofpod.detect(cloud, "thesis", threshold=-1)
     Traceback (most recent call last):
@@ -132,7 +133,8 @@ def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | No
     """
     if threshold is not None and not 0 < threshold < float("inf"):
         raise UserError(f"threshold {threshold:g}", legal="a number above 0")
-    finder = load_detector(detector, settings)
+    chosen = {"surface": {"shape": "auto"}} if detector == DEFAULT_DETECTOR else {}
+    finder = load_detector(detector, chosen | settings)
     evidence = analysed(finder, cloud)
     asked = argparse.Namespace(threshold=threshold, quiet_capture=None, false_calls=None)
     used, _, evidence = threshold_of(asked, finder, cloud, evidence, lambda: (float("nan"), ""))

@@ -356,7 +356,7 @@ def test_the_drilled_plate_as_it_stands(shared_data: Path, tmp_path: Path, capsy
     said = capsys.readouterr().out
     assert "17 frames averaged" in said and "left out: depth/00003.png: the whole range jumps" in said
     assert "from this capture's own null: 1.0 false calls expected" in said and "cannot set its own" not in said
-    assert "the local noise of means over 3 to " in said and "own deviation" not in said
+    assert "the deviation of matched filters on whitened noise" in said and "own deviation" not in said
     findings = rows_of(tmp_path / "findings.csv")
     # The object on the plate stands 30 mm before the surface, and is a bump.
     assert any(row["kind"] == "bump" and float(row["depth_mm"]) < -10 for row in findings)

@@ -115,7 +115,7 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     # the fused map states each cell's deviation, and the text says so; the ring is named like its row, in the page too
     (cell_mm,) = re.findall(r"cells of ([0-9.]+) mm", said)
     assert facts["merged"]["cell_mm"] == pytest.approx(float(cell_mm), rel=0.01)
-    assert "one unit of score is the local noise of means over" in said and " u cell " in said
+    assert "one unit of score is the deviation of matched filters" in said and " u cell " in said
     assert f'"1: {found["diameter_mm"]:.1f}"' in (out / "view3d.html").read_text()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -207,12 +208,15 @@ MOUTHS_PX = np.array([MOUTHS_U, MOUTHS_V]).T
 def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> None:
     """A metal plate with holes of 5 mm at 0.25 m, with tags and an object on it, seen by an Azure Kinect."""
     from detectors.average import AverageConfig, average
+    from detectors.noise import REACH_FRAMES, noise_reach_px
     from detectors.recordings import open_capture
 
     folder = shared_data / "azure_drilled_board"
     if not folder.is_dir():
         pytest.skip("the capture of the drilled plate is not here")
-    cloud = average(open_capture([folder]), AverageConfig())
+    recording = open_capture([folder])
+    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES)))
+    cloud = replace(average(recording, AverageConfig()), noise_reach_px=reach_px)
     detector = type(detector)(LocalConfig.from_data({}))
     evidence = detector.analyse(cloud)
     holes = [
