@@ -83,6 +83,9 @@ ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
 RIM_PX = 6
 """Depth of the target's rim: the camera's window and lens reach so far over its edge."""
+LOBE_SHARE = 0.5
+"""A score so much smaller than one of the other sign within `RIM_PX` is the lobe that whitening leaves beside
+damage."""
 WIDE_PX = 6.0
 """Radius from which on noise may break a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
@@ -232,7 +235,10 @@ def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None)
     signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
     _fill_discs(signed, np.asarray(ALL_RADII_PX, np.float32)[by])
     signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
-    return signed.astype(np.float64), worth_of[0].energy ** -0.5
+    near = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    behind, before = (cv2.dilate(np.maximum(each, 0.0), near) for each in (signed, -signed))
+    lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
+    return np.where(lobe, 0.0, signed).astype(np.float64), worth_of[0].energy ** -0.5
 
 
 @numba.njit(**PLAIN)
