@@ -265,9 +265,8 @@ def direct_light(
         albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
         textured = central.surface[here] == lit.textured
         texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
-        uv_of = np.zeros((2, 4)) if lit.uv_of is None else lit.uv_of
         normal, plain = central.normal[here].astype(float), np.where(textured, -1.0, albedo)
-        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, uv_of, to_light, to_face)
+        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, to_light, to_face)
         to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
         phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies_hz)
         intensity[here] = to_light[0]

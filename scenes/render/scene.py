@@ -120,7 +120,8 @@ class LitScene:
     soft-edged cone. Mitsuba supplies the rays' hits alone: one shape without materials needs no virtual calls, so that
     all scenes share their compiled kernels. By triangle stand ``surface_of`` (index into ``parts``), ``normal_of`` and
     ``on_face``; by surface ``albedos`` and, where any is glossy, ``gloss``: share and exponent of the lobes. The part
-    ``textured`` has ``texture`` at ``uv_of`` (2, 4), affine in place; None where all are plain."""
+    ``textured`` has ``texture`` at ``uv_of`` (2, 4), affine in place; -1, None and zeros where all are plain.
+    ``uv_factors``: the same as data, not as constants of a kernel, which would be compiled anew for each board."""
 
     mi: Any
     scene: Any
@@ -135,7 +136,8 @@ class LitScene:
     gloss: tuple[Any, Any] | None
     textured: int
     texture: Any
-    uv_of: np.ndarray | None
+    uv_of: np.ndarray
+    uv_factors: list[Any]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -158,7 +160,7 @@ class LitScene:
 
     def uv(self, place: Any) -> Any:
         """Return where the texture stands at places of the part that has one."""
-        (ux, uy, uz, u0), (vx, vy, vz, v0) = np.zeros((2, 4)) if self.uv_of is None else self.uv_of.tolist()
+        ux, uy, uz, u0, vx, vy, vz, v0 = self.uv_factors
         x, y, z = place.x, place.y, place.z
         return self.mi.Point2f(ux * x + uy * y + uz * z + u0, vx * x + vy * y + vz * z + v0)
 
@@ -231,7 +233,7 @@ def lit_scene(
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
     textured = next((k for k, part in enumerate(parts) if part.texture_850 is not None), -1)
-    texture = uv_of = None
+    texture, uv_of = None, np.zeros((2, 4))
     if textured >= 0:
         part: Any = parts[textured]
         image = mi.TensorXf(np.ascontiguousarray(part.texture_850[..., None], np.float32))
@@ -256,4 +258,5 @@ def lit_scene(
         textured=textured,
         texture=texture,
         uv_of=uv_of,
+        uv_factors=[dr.opaque(mi.Float, float(each)) for each in uv_of.ravel()],
     )

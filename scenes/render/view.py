@@ -92,10 +92,12 @@ def gather_at_points(
     shares[chosen] += OFTEN * cells / chosen.size
     table, density = mi.UInt32(chosen.astype(np.uint32)), mi.Float(shares.astype(np.float32))
 
+    count = dr.opaque(mi.UInt32, chosen.size)
+
     def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         often = u1 < OFTEN
-        number = dr.select(often, u1 * (chosen.size / OFTEN), (u1 - OFTEN) * (cells / (1 - OFTEN)))
-        whole = dr.minimum(mi.UInt32(number), dr.select(often, mi.UInt32(chosen.size - 1), mi.UInt32(cells - 1)))
+        number = dr.select(often, u1 * mi.Float(count) / OFTEN, (u1 - OFTEN) * (cells / (1 - OFTEN)))
+        whole = dr.minimum(mi.UInt32(number), dr.select(often, count - 1, mi.UInt32(cells - 1)))
         cell = dr.select(often, dr.gather(mi.UInt32, table, whole, often), whole)
         u1 = (mi.Float(cell % CELLS) + dr.minimum(number - mi.Float(whole), 1.0)) / CELLS
         u2 = (mi.Float(cell // CELLS) + u2) / CELLS
@@ -156,16 +158,18 @@ def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
     return np.ascontiguousarray(points, np.float32).ravel()
 
 
-def _towards(lit: LitScene, bright: np.ndarray, place: Any, normal: Any, turned: Any, u1: Any, u2: Any) -> Any:
+def _towards(
+    lit: LitScene, bright: tuple[Any, Any, Any], place: Any, normal: Any, turned: Any, u1: Any, u2: Any
+) -> Any:
     """Return a direction from a surface and its weight, drawn evenly by its cosine (``turned``: one drawn so) or, from
     before the rectangle ``bright``, with a chance of a half towards an even point of it: a mixture of both densities
     (Veach and Guibas' balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2`` in 0..1."""
     import drjit as dr
 
     mi = lit.mi
-    axis_x, axis_y, middle = (mi.Vector3f(*bright[:3, k].tolist()) for k in (0, 1, 3))
-    half = [float(np.linalg.norm(bright[:3, k])) for k in (0, 1)]
-    out = mi.Vector3f(*np.cross(bright[:3, 0] / half[0], bright[:3, 1] / half[1]).tolist())
+    axis_x, axis_y, middle = bright
+    half = [dr.norm(axis) for axis in (axis_x, axis_y)]
+    out = dr.normalize(dr.cross(axis_x, axis_y))
     from_middle = mi.Vector3f(place) - middle
     before = dr.dot(from_middle, out) > 0
     chosen = before & (u1 < 0.5)
@@ -204,6 +208,11 @@ def _gather(
     lines, per_batch = len(work.frequencies_hz), np.maximum(samples // BATCHES, 1)
     dimensions, longest = START_DIMENSIONS + PER_VERTEX * (bounces + 1), int(per_batch.max())
     table = mi.Float(_sobol(dimensions, longest, seed))
+    # what differs from board to board is data and no constant of the kernel, which would be compiled anew for each
+    batch_points = dr.opaque(mi.UInt32, longest)
+    aim: Any = None
+    if bright is not None:
+        aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
     # lanes for so many paths a batch at each place, and where those of each place and batch begin
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
@@ -219,7 +228,7 @@ def _gather(
         rotation_of = batch + BATCHES * (0 if on_surface else place)
 
         def uniform(sample: Any, dimension: Any) -> Any:
-            u = dr.gather(mi.Float, table, (batch * longest + first + sample) * dimensions + dimension)
+            u = dr.gather(mi.Float, table, (batch * batch_points + first + sample) * dimensions + dimension)
             u += mi.sample_tea_float32(rotation_of, dimension + seed * 1024, 4)
             return u - dr.floor(u)
 
@@ -245,11 +254,11 @@ def _gather(
             dimension = START_DIMENSIONS + PER_VERTEX * vertex
             u1, u2 = uniform(sample, dimension), uniform(sample, dimension + 1)
             direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
-            if bright is not None:
+            if aim is not None:
                 # the half of the square that the other choice leaves is a square too
                 wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
                 spread = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
-                aimed, weight = _towards(lit, bright, hit.place, normal, spread, u1, u2)
+                aimed, weight = _towards(lit, aim, hit.place, normal, spread, u1, u2)
                 direction = dr.select(fresh, aimed, direction)
                 throughput = throughput * dr.select(fresh, weight, 1)
             throughput = throughput * lit.reflected(hit, direction)
