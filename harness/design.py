@@ -26,9 +26,7 @@ FURTHEST = 2.0
 """Times the largest size inspected: a90 beyond it is no plan's guess."""
 LEAST_SHARE = 0.1
 """Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0."""
-REPEATED = 8
-"""Targets of the repeats check: a single board of holes."""
-OWNERS = {"set_up": "study", "repeated_targets": "repeats", "board_m2": "false_calls_per_m2"}
+OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}
 """Options that mean nothing without another."""
 
 
@@ -50,9 +48,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--confidence", type=float, default=0.95, help="the 95 of a90/95 (default: 0.95)")
     add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
     add("--seed", type=int, default=1, help="of the simulated studies (default: 1)")
-    put = parser.add_argument_group("what repeats are worth").add_argument
-    put("--repeats", type=int, metavar="N", help="show the limit of this many repeats, right and wrong")
-    put("--repeated-targets", type=int, metavar="N", help=f"of so many targets (default: {REPEATED})")
     put = parser.add_argument_group("hole-free boards").add_argument
     put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: how much has to be inspected for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
@@ -168,7 +163,6 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
     """Refuse what would fail after minutes, or give nonsense."""
     (low, high), a50 = guess.sizes, guess.curve.size_at(0.5)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
-    fewest = min(2 if options.repeats is None else options.repeats, options.repeated_targets or REPEATED)
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
@@ -178,7 +172,6 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
         (0 < options.pod < 1, f"--pod {options.pod:g}", "0 < pod < 1"),
         (0.5 < options.confidence < 1, f"--confidence {options.confidence:g}", "0.5 < confidence < 1"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
-        (fewest >= 2, "--repeats: nothing is repeated", "two repeats of two targets at least"),
     )
     for holds, said, legal in rules:
         if not holds:
@@ -199,15 +192,11 @@ def _designed(options: argparse.Namespace, guess: GuessedCurve) -> StudyDesign:
     asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
     area = guess.board_m2 if options.board_m2 is None else options.board_m2
     wanted = options.false_calls_per_m2
-    repeats: tuple[plan.RepeatedStudies, ...] = ()
     # Its mistakes come before the simulation's minute; `_check` has asked for the area.
     free = plan.hole_free(wanted, area or 0.0, options.confidence) if wanted is not None else None
     plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, **asked)
     recommended = plan.recommend(plans, options.goal)
-    if options.repeats:
-        holes = options.repeated_targets or REPEATED
-        repeats = plan.repeated_studies(guess.curve, holes, options.repeats, guess.sizes, **asked)
-    unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, repeats, free)
+    unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, free)
     return StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
 
 

@@ -1,4 +1,4 @@
-"""The program `python -m harness.design`, and what it stands on: guessed curves, recommendations, repeats, areas."""
+"""The program `python -m harness.design`, and what it stands on: guessed curves, recommendations, areas."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from harness.design import FILES, main
 from harness.evaluation.intervals import false_call_rate, threshold_for_rate
@@ -23,10 +22,7 @@ from harness.evaluation.pod.design import (
     design,
     hole_free,
     recommend,
-    repeated_studies,
-    repeats_are_not_targets,
 )
-from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.vocabulary.errors import UserError
@@ -67,6 +63,9 @@ def test_logit_by_hand() -> None:
     assert (GUESS.mu, GUESS.sigma) == pytest.approx((5.0, 2.0 / np.log(9.0)))
 
 
+# ---- what is recommended ---------------------------------------------------------------------------------------------
+
+
 def plans(*told: tuple[int, str, float]) -> list[StudyPlan]:
     """(targets, placement, 90 % quantile)."""
     first = StudyPlan(60, "uniform", 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0), ())
@@ -90,30 +89,6 @@ def test_concentrates_only_where_it_is_worth_it() -> None:
     assert recommend(far).plan.placement == "concentrated"
     endless = plans((60, "uniform", np.inf), (60, "concentrated", np.inf))
     assert recommend(endless, 8.0).plan.placement == "uniform"
-
-
-# ---- repeats ---------------------------------------------------------------------------------------------------------
-
-
-def test_repeats_make_the_wrong_limit_too_small_and_the_right_one_not() -> None:
-    """40 studies of 8 targets with 20 repeats. Half the luck the target's own: the wrong limit, were it one, would be
-    too small in 5 % of studies; as often as seen it would be with probability < 1e-4. Without own luck it is a limit:
-    at most the 99.9 % quantile. The right one is in every case."""
-    none, half = repeated_studies(GUESS, 8, 20, (2, 12), shares=(0.0, 0.5), studies=40, seed=3)
-    for row in (none, half):
-        assert 40 * row.right_too_small <= stats.binom.ppf(0.999, 40, 0.05)
-        assert row.right > row.wrong
-        assert "160 inspections of 8 targets are 8 targets" in row.text
-    assert 40 * none.wrong_too_small <= stats.binom.ppf(0.999, 40, 0.05)
-    assert stats.binom.sf(40 * half.wrong_too_small - 1, 40, 0.05) < 1e-4
-
-
-def test_the_wrong_limit_is_that_of_rows_without_names() -> None:
-    """Also where hits and misses do not overlap, and a penalty takes the place of the likelihood."""
-    size, hit = np.repeat(np.arange(3.0, 11.0), 10), np.repeat([0, 0, 0, 1, 1, 1, 1, 1], 10)
-    right, wrong = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 10))
-    assert fit_hit_miss(size, hit).method == "Firth"
-    assert right.value > wrong.value == bound(fit_hit_miss(size, hit)).value
 
 
 # ---- hole-free boards ------------------------------------------------------------------------------------------------
@@ -167,11 +142,11 @@ def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixtu
 
 
 def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    others = ["--repeats", "5", "--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
+    others = ["--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
     assert main([*TOLD, *FEW, "--studies", "10", *others]) == 0
     printed = capsys.readouterr().out
-    assert "5 repeats of 8 targets are 8 targets" in printed
-    assert "WRONG: a90/95 (furlong)" in printed
+    assert "are worth 8 targets" in printed
+    assert "a90/95 (furlong)" in printed
     assert "needs 4 hole-free boards of 0.25 m2" in printed
     assert "no false call on 2.996 m2, which is 12 other boards" in printed
     assert printed.rstrip().splitlines()[-1].startswith("Make 60 targets, ")
@@ -205,7 +180,8 @@ def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.Captur
 
 def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--study", str(study), "--set-up", "50 frames", "--studies", "10", "--targets", "60"]
-    said = answered(capsys, *asked, "--false-calls-per-m2", "1")
+    more = ["--false-calls-per-m2", "1"]
+    said = answered(capsys, *asked, *more)
     record = study_record(Study(set_ups=(SetUp(frames=1), SetUp(frames=50, a50_mm=4.0)), boards=30)).set_ups[1]
     limit = limit_of(record)
     assert said["guess"]["a50"] == pytest.approx(limit.a50_mm, rel=1e-12)
@@ -233,7 +209,6 @@ def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str])
         ([*TOLD, "--confidence", "0.4"], "0.5 < confidence < 1"),
         ([*TOLD, "--goal", "6.5"], "not above the guess's own 7"),
         ([*TOLD, "--set-up", "main"], "--set-up belongs to --study"),
-        ([*TOLD, "--repeats", "1"], "nothing is repeated"),
         ([*TOLD, "--false-calls-per-m2", "1"], "needs --board-m2"),
         ([*TOLD, "--false-calls-per-m2", "-1", "--board-m2", "1"], "both above 0"),
         (["--study", "nowhere", "--a50", "5"], "leave one out: --a50 or --study"),

@@ -1,4 +1,4 @@
-"""False calls against exact laws and by simulation; planning a study; repeats beside targets."""
+"""False calls against exact laws and by simulation; planning a study."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from harness.evaluation.intervals import (
     threshold_for_rate,
 )
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import design, place_sizes, repeats_are_not_targets
-from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.pod.design import design, place_sizes
 from harness.vocabulary.errors import UserError
 
 GUESS = PodCurve("logit", False, 10.0, 2.0, np.zeros((2, 2)))
@@ -95,13 +94,6 @@ def test_studies_far_from_the_rise_demonstrate_nothing() -> None:
     plan = design(GUESS, (20,), (30, 60), placements=("uniform",), studies=20)[0]
     assert plan.bound == np.inf and plan.demonstrated < 0.5
     assert any("outside the range" in note for note in plan.notes)
-
-
-def test_fifty_repeats_of_eight_holes_are_eight_targets() -> None:
-    size = np.repeat(2.5 * np.arange(1, 9), 50)
-    hit = np.random.default_rng(5).random(400) < GUESS.pod(size)
-    right, wrong = repeats_are_not_targets(size, hit, np.repeat(np.arange(8), 50))
-    assert fit_hit_miss(size, hit).curve.size_at(0.9) < wrong.value < right.value
 
 
 def test_mistakes_of_the_user() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -44,7 +44,6 @@ class StudyDesign:
     plans: tuple[planned.StudyPlan, ...]
     recommended: planned.Recommendation
     goal: float | None
-    repeats: tuple[planned.RepeatedStudies, ...]
     hole_free: planned.HoleFree | None
 
     @property
@@ -68,7 +67,7 @@ class StudyDesign:
 
 
 def design_html(design: StudyDesign, command: str) -> str:
-    """The page as text: answer, figure, plans and sizes, repeats, hole-free area; it needs no network."""
+    """The page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
     caption = (
         f"Left: the {design.limit_name} that simulated studies demonstrate, with the guess's own size, below which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended number of targets."
@@ -86,9 +85,6 @@ def design_html(design: StudyDesign, command: str) -> str:
         body.append(
             blocks.fold(name, blocks.tag("pre", " ".join(f"{size:.4g}" for size in plan.sizes)), is_open=chosen)
         )
-    if design.repeats:
-        grid, said = _repeats(design)
-        body += [blocks.heading("Repeats are not targets"), grid.html(), blocks.note(said)]
     body += [
         blocks.heading("Where nothing is"),
         blocks.bullets(hole_free_lines(design)),
@@ -106,9 +102,6 @@ def design_parts(design: StudyDesign) -> list[str | Grid]:
     sizes = wrap(" ".join(f"{size:.4g}" for size in design.recommended.plan.sizes), WIDE)
     parts: list[str | Grid] = [f"guess: {guess_text(design)}", "", plans_grid(design), *wrap(MEDIANS, WIDE), ""]
     parts += [f"sizes of the recommended plan (*){design.in_unit}:", *sizes]
-    if design.repeats:
-        grid, said = _repeats(design)
-        parts += ["", grid, *wrap(said, WIDE)]
     parts += ["", *(f"where nothing is: {line}" for line in hole_free_lines(design))]
     return [*parts, "", *(f"note: {line}" for line in notes(design)), "", answer(design)]
 
@@ -135,65 +128,31 @@ def guess_text(design: StudyDesign) -> str:
     return f"{sizes} ({guess.link}, {'ln size' if guess.log_size else 'size'}); {design.origin}"
 
 
-class Planned(NamedTuple):
-    """A row of the table of plans."""
-
-    plan: planned.StudyPlan
-    chosen: bool
-
-
 def _size(value: float) -> str:
     return f"{value:#.4g}".rstrip(".") if np.isfinite(value) else "none"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
 
 
 PLANS = Table(
     "plans",
     "one row per number of targets and placement",
     (
-        Column("", "targets", lambda row: f"{'* ' if row.chosen else ''}{row.plan.targets}"),
-        Column("", "sizes", lambda row: PLACED[row.plan.placement]),
-        Column("", "limit", "plan.bound", text=_size, tone=lambda row: "key" if row.chosen else ""),
-        Column("", "10 %", "plan.low", text=_size),
-        Column("", "90 %", "plan.high", text=_size),
-        Column("", "demonstrated", "plan.demonstrated", text=_percent),
+        Column("", "targets", lambda row: f"{'* ' * row[1]}{row[0].targets}"),
+        Column("", "sizes", lambda row: PLACED[row[0].placement]),
+        Column("", "limit", lambda row: row[0].bound, text=_size, tone=lambda row: "key" if row[1] else ""),
+        Column("", "10 %", lambda row: row[0].low, text=_size),
+        Column("", "90 %", lambda row: row[0].high, text=_size),
+        Column("", "demonstrated", lambda row: f"{100 * row[0].demonstrated:.1f} %"),
     ),
     formats=(),
     left=2,
 )
-REPEATS = Table(
-    "repeats",
-    "one row per share of luck that is the target's own",
-    (
-        Column("", "luck of the target's own", lambda row: f"{100 * row.share:g} %"),
-        Column("", "right", "right", text=_size),
-        Column("", "right too small", "right_too_small", text=_percent),
-        Column("", "WRONG", "wrong", text=_size),
-        Column("", "too small", "wrong_too_small", text=_percent),
-    ),
-    formats=(),
-)
+"""Its rows are pairs: a plan, and whether it is the one recommended."""
 
 
 def plans_grid(design: StudyDesign) -> Grid:
     """Every plan, the recommended one with a star, and what its studies demonstrate."""
-    rows = [Planned(plan, plan is design.recommended.plan) for plan in design.plans]
+    rows = [(plan, plan is design.recommended.plan) for plan in design.plans]
     return PLANS.grid(rows, heads={"limit": f"{design.limit_name}{design.in_unit}"})
-
-
-def _repeats(design: StudyDesign) -> tuple[Grid, str]:
-    """Return the table of repeats and its note."""
-    limit, row, plan = f"{design.limit_name}{design.in_unit}", design.repeats[0], design.plans[0]
-    said = (
-        f"{row.repeats} repeats of {row.targets} targets are {row.targets} targets. {row.studies} simulated "
-        f"studies; medians, and the share of limits below the guess's {design.size_name} of "
-        f"{design.text(row.true_size)}, which may be {100 * (1 - plan.confidence):.3g} %. The right limit counts "
-        "targets, the wrong one inspections, which is safe only where no target has luck of its own."
-    )
-    return REPEATS.grid(design.repeats, heads={"right": f"right: {limit}", "WRONG": f"WRONG: {limit}"}), said
 
 
 def hole_free_lines(design: StudyDesign) -> list[str]:
@@ -240,23 +199,24 @@ def notes(design: StudyDesign) -> list[str]:
         f"{planned.LEAST_SIGNALS} where signals are recorded (a-hat)",
         f"medians and quantiles of {plan.studies} simulated studies, bound by {plan.method}; the share that "
         f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
+        "repeats of the noise are no further targets: 50 inspections of each of 8 holes are worth 8 targets",
         "the plan is as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
     ]
 
 
 def design_data(design: StudyDesign) -> dict[str, Any]:
     """Return the plan as JSON's types; an infinite size becomes None."""
-    area, chosen = design.hole_free, design.recommended
+    area, chosen, guess = design.hole_free, design.recommended, design.guess
+    curve = {"link": guess.link, "log_size": guess.log_size, "mu": float(guess.mu), "sigma": float(guess.sigma)}
     said: dict[str, Any] = {
         "recommendation": answer(design),
         "unit": design.unit,
-        "guess": {**_curve_data(design.guess), "origin": design.origin},
+        "guess": {**curve, "a50": guess.size_at(0.5), "a90": guess.size_at(0.9), "origin": design.origin},
         "range_of_sizes": design.range_of_sizes,
         "goal": design.goal,
         "reaches_goal": chosen.reaches,
         "enough_targets": chosen.enough,
         "plans": [{**vars(plan), "recommended": plan is chosen.plan} for plan in design.plans],
-        "repeats": [vars(row) for row in design.repeats],
         "unflawed_sites": SITES_PER_TARGET * chosen.plan.targets,
         "hole_free": None,
         "notes": notes(design),
@@ -268,11 +228,6 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
             for calls, size in zip(planned.CALLS, area.areas_m2, strict=True)
         ]
     return dict(jsonable(said))
-
-
-def _curve_data(curve: PodCurve) -> dict[str, Any]:
-    numbers = {"mu": float(curve.mu), "sigma": float(curve.sigma), "a50": curve.size_at(0.5), "a90": curve.size_at(0.9)}
-    return {"link": curve.link, "log_size": curve.log_size, **numbers}
 
 
 def save_design_png(path: Path, design: StudyDesign) -> None:

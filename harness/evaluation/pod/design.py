@@ -1,18 +1,17 @@
-"""Plans of hit/miss studies, made before anybody drills a hole; and the little that repeats of a few holes show.
-Studies are simulated from a guess of the POD curve and analysed as real ones would be."""
+"""Plans of hit/miss studies, made before anybody drills a hole: studies are simulated from a guess of the POD curve and
+analysed as real ones would be."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import stats
 
 from harness.evaluation.intervals import threshold_for_rate
-from harness.evaluation.pod.curve import Bound, PodCurve, link_ppf
+from harness.evaluation.pod.curve import PodCurve, link_ppf
 from harness.evaluation.pod.hit_miss import Between, bound, fit_hit_miss
 from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
@@ -29,10 +28,6 @@ WORTH = 0.05
 spread ones do not rest on the guess. The ratio's Monte Carlo error is 0.028 with 200 studies of 60 targets."""
 CALLS = (0, 1, 2)
 """Numbers of false calls for which the area of an upper bound is told."""
-SHARES = (0.0, 0.5, 1.0)
-"""Shares of the variance of luck that are the target's own: none (then, and only then, rows are as good as targets),
-half, all (then a repeat tells nothing new). A study with repeats shows its own; a guess cannot."""
-
 Placement = Literal["uniform", "concentrated"]
 PLACEMENTS: tuple[Placement, ...] = ("uniform", "concentrated")
 
@@ -189,89 +184,3 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
     areas = tuple(float(stats.chi2.ppf(confidence, 2 * (calls + 1)) / 2 / rate_per_m2) for calls in CALLS)
     rates = threshold.rate_per_m2, threshold.upper_per_m2
     return HoleFree(rate_per_m2, board_m2, confidence, fewest, *rates, areas)
-
-
-def repeats_are_not_targets(
-    size: ArrayLike,
-    hit: ArrayLike,
-    target: ArrayLike,
-    *,
-    link: str = "logit",
-    log_size: bool = False,
-    pod: float = 0.9,
-    confidence: float = 0.95,
-) -> tuple[Bound, Bound]:
-    """The bound of ``size``, ``hit`` (0/1) and ``target`` (identity), each (n,), and the wrong one that takes each row
-    for a target of its own. Fifty repeats of eight holes repeat the noise, not the holes: they are eight targets."""
-    right, wrong = (
-        # A fit of its own: where hits and misses separate, the penalty would still count targets.
-        bound(fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=names), pod, confidence)
-        for names in (target, None)
-    )
-    return right, wrong
-
-
-@dataclass(frozen=True)
-class RepeatedStudies:
-    """``studies`` simulated studies, each of ``repeats`` inspections of ``targets`` targets of ``sizes`` (targets,).
-    ``share``: of the variance of luck, the target's own. ``right``, ``wrong``: medians of the upper bound that counts
-    targets and of that which counts rows, infinite where half demonstrate none; ``*_demonstrated``: share with a finite
-    one; ``*_too_small``: share below ``true_size``. ``text``: the first study that has a curve, in words."""
-
-    share: float
-    targets: int
-    repeats: int
-    studies: int
-    true_size: float
-    sizes: np.ndarray
-    right: float
-    wrong: float
-    right_demonstrated: float
-    wrong_demonstrated: float
-    right_too_small: float
-    wrong_too_small: float
-    text: str
-
-
-NUMBERS = ("right", "wrong", "right_demonstrated", "wrong_demonstrated", "right_too_small", "wrong_too_small")
-
-
-def repeated_studies(
-    guess: PodCurve,
-    targets: int,
-    repeats: int,
-    range_of_sizes: tuple[float, float],
-    *,
-    shares: Sequence[float] = SHARES,
-    pod: float = 0.9,
-    confidence: float = 0.95,
-    studies: int = 200,
-    seed: int = 0,
-) -> tuple[RepeatedStudies, ...]:
-    """Simulate studies with repeats: one row for each of ``shares``; sizes evenly spread. Any single inspection is
-    found with the guess's POD at any share (luck is a normal copula). A study without a rising curve demonstrates
-    nothing. Bounds by likelihood ratio."""
-    sizes, true_size = place_sizes(guess, targets, range_of_sizes, "uniform"), guess.size_at(pod)
-    size, target, n, rows = np.repeat(sizes, repeats), np.repeat(np.arange(targets), repeats), targets * repeats, []
-    asked: dict[str, Any] = {"link": guess.link, "log_size": guess.log_size, "pod": pod, "confidence": confidence}
-    for share in shares:
-        stream = random_stream(seed, "repeats", targets, repeats)
-        bounds, text = np.full((2, studies), np.inf), ""
-        for study in range(studies):
-            own, of_noise = stream.standard_normal((targets, 1)), stream.standard_normal((targets, repeats))
-            luck = stats.norm.cdf(np.sqrt(share) * own + np.sqrt(1 - share) * of_noise)
-            hit = luck < guess.pod(sizes)[:, None]
-            try:
-                both = repeats_are_not_targets(size, hit.ravel(), target, **asked)
-            except UserError:  # One class only, or a slope that is not positive: such a study demonstrates nothing.
-                continue
-            bounds[:, study] = [one.value for one in both]
-            name = f"a{100 * pod:g}/{100 * confidence:g}"
-            said = [f"{limit.value:.4g}" if limit.demonstrated else "not demonstrated" for limit in both]
-            right = f"{n} inspections of {targets} targets are {targets} targets: {name} {said[0]}"
-            text = text or f"{right}; taken for {n} targets, wrongly, {said[1]}"
-        medians = np.quantile(bounds, 0.5, axis=1, method="inverted_cdf").tolist()
-        known, small = np.isfinite(bounds).mean(axis=1).tolist(), (bounds < true_size).mean(axis=1).tolist()
-        numbers = dict(zip(NUMBERS, (*medians, *known, *small), strict=True))
-        rows.append(RepeatedStudies(share, targets, repeats, studies, true_size, sizes, text=text, **numbers))
-    return tuple(rows)
