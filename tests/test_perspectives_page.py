@@ -66,7 +66,6 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
         "What each map gives",
         "If facts were otherwise",
         "Failures",
-        "Cost",
         "Provenance",
     ]
     for name in ("tre", "merged"):

@@ -87,7 +87,6 @@ def test_sections_come_in_order(outline: Outline) -> None:
         "If facts were otherwise",
         "False calls",
         "Failures",
-        "Cost",
         "Provenance",
     ]
     assert outline.stack == []

@@ -59,7 +59,6 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
         "If facts were otherwise",
         "Thresholds and false calls",
         "Failures",
-        "Cost",
         "Provenance",
     ]
     for name in ("limits", "sights"):

@@ -15,7 +15,7 @@ from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, axis_lines
 from harness.report.clouds import StudyExample, examples_figure
-from harness.report.study_page import MOST_PANELS, axis_figure, curves_figure, study_parts, with_room
+from harness.report.study_page import MOST_CURVES, axis_figure, overlay_figure, study_parts, with_room
 from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, notes_of, study_answer
 from harness.tables.schema import Estimate
 from harness.tables.study import axis_grid, axis_groups
@@ -30,7 +30,7 @@ def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
 def result_of(limits: list[SetUpLimit]) -> StudyResult:
     """A result of limits alone."""
     set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", (), np.nan) for one in limits)
-    return StudyResult(study_record(), set_ups, tuple(limits), (), ())
+    return StudyResult(study_record(), set_ups, tuple(limits), (), (), {})
 
 
 def row_of(limit: SetUpLimit) -> dict[str, str]:
@@ -65,7 +65,9 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
         assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in said
-    assert study_answer(two) == "One unit of the camera: " + " ".join(limit_sentence(limit) for limit in two)
+    second = limit_sentence(two[1], again=True)
+    assert second.startswith(f"{two[1].record.label}: {two[1].a90_95.value:.2f} mm, at ")
+    assert study_answer(two) == f"One unit of the camera: {limit_sentence(two[0])} {second}"
 
 
 def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
@@ -210,9 +212,10 @@ def test_few_targets_are_told() -> None:
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
 def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
+    """To two decimals, or to two significant digits of the estimate, where the interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
-    numbers = [float(one) for one in re.findall(r"-?\d+\.\d\d", text)]
-    assert np.allclose(numbers, [value, value - down, value + up], atol=0.0051)
+    numbers = [float(one) for one in re.findall(r"-?\d+(?:\.\d+)?", text)]
+    assert np.allclose(numbers, [value, value - down, value + up], atol=max(0.0051, 0.051 * abs(value)))
 
 
 def test_numbers_are_held_to_their_units() -> None:
@@ -226,7 +229,9 @@ def test_intervals_without_ends() -> None:
     assert with_interval(1.0, 0.5, np.inf) == "1.00 (0.50 to ∞)"
     assert with_interval(np.inf, 2.0, np.inf) == "∞ (2.00 to ∞)"
     assert with_interval(np.nan, 2.0, 3.0) == "none"
-    assert Estimate(3.2, 2.9, 3.6).text() == "3.20 (2.90 to 3.60)"
+    assert Estimate(3.2, 2.9, 3.6).text() == "3.2 (2.9 to 3.6)"
+    assert Estimate(3.2, 3.15, 3.25).text() == "3.20 (3.15 to 3.25)"
+    assert Estimate(61.2, 40, 90).text() == "61 (40 to 90)"
 
 
 def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
@@ -271,7 +276,7 @@ def test_an_axis_ends_at_a_little_more_than_the_largest_size(two: list[SetUpLimi
 def test_sizes_that_are_all_equal_have_an_axis(recwarn: pytest.WarningsRecorder) -> None:
     record = study_record(Study(set_ups=(SetUp(),), boards=20, hole_free_boards=12)).set_ups[0]
     same = replace(record.inspected, diameter_mm=np.full_like(record.inspected.diameter_mm, 6.0))
-    figure = curves_figure([limit_of(replace(record, inspected=same), draws=50)])
+    figure = overlay_figure([limit_of(replace(record, inspected=same), draws=50)])
     assert "all sizes are 6" in figure
     assert [str(one.message) for one in recwarn] == []
 
@@ -287,14 +292,14 @@ def test_of_many_set_ups_those_from_the_smallest_limit_to_the_largest_are_shown(
     sizes = np.random.default_rng(2).permutation(np.arange(1.0, 21.0))
     many = [replace(two[0], a90_95=replace(two[0].a90_95, value=float(size))) for size in sizes]
     shown = [one.limit.a90_95.value for one in with_room(result_of(many).set_ups)]
-    assert len(shown) == MOST_PANELS
+    assert len(shown) == MOST_CURVES
     assert sorted(shown) == [1.0, 5.0, 9.0, 12.0, 16.0, 20.0]
     assert shown == [size for size in sizes if size in shown]
     assert [one.limit for one in with_room(result_of(two).set_ups)] == two
 
 
 def test_curves_without_a_curve_are_drawn(nothing_found: SetUpLimit, everything_found: SetUpLimit) -> None:
-    figure = curves_figure([nothing_found, everything_found])
+    figure = overlay_figure([nothing_found, everything_found])
     assert "a90/95 is not demonstrated" in figure
     assert "nan" not in re.sub(r"<!--.*?-->", "", figure, flags=re.DOTALL).lower()
 

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from markupsafe import Markup, escape
 
 from harness.tables.text import Grid, many
@@ -30,6 +31,8 @@ SHOWN_FIRST = (
     *("indirect_noise_mm", "renders", "versions"),
 )
 """Keys of the provenance that a page names in any case, as not recorded where they are missing."""
+MOST_VALUES = 81
+"""Points of a line whose values a pointer can read."""
 SHOWN_APART = ("command", "seconds", "failures")
 
 
@@ -131,9 +134,14 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
         for key in (*SHOWN_FIRST, *others)
     ]
     lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
-    parts += [heading("Cost"), cost, heading("Provenance"), tag("table", tag("tbody", joined(lines)), kind="prov")]
-    parts += command_of(provenance.get("command", "not recorded"))
-    return [*parts, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
+    parts += [heading("Provenance")]
+    table = tag("table", tag("tbody", joined(lines)), kind="prov")
+    told = (cost, table, *command_of(provenance.get("command", "not recorded")))
+    return [
+        *parts,
+        fold("Cost, versions and command", *told),
+        fold("The resolved experiment", tag("pre", experiment_yaml_text)),
+    ]
 
 
 def plain(value: Any) -> str:
@@ -176,17 +184,42 @@ COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE), "osD^vP"
 
 
 def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figure], None]) -> str:
-    """Draw a figure of ``size_in`` (width, height) inches; the text of an inline ``<svg>`` with ``alt`` as its label.
-    ``name`` seeds the ids inside, so that several figures live on one page; no date, no random number gets in."""
+    """Draw a figure of ``size_in`` (width, height) inches; the text of an inline ``<svg>`` with ``alt`` as its label,
+    and the values of its lines for a pointer that stands on them. ``name`` seeds the ids inside, so that several
+    figures live on one page; no date, no random number gets in."""
     buffer = io.StringIO()
-    _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})
+    drawn = _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     body = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{name}-", body)
     for size in ("width", "height"):
         body = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", body, count=1)
-    return body.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
+    values = json.dumps(_values(drawn), separators=(",", ":"), ensure_ascii=False)
+    return body.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}" data-values="{escape(values)}"', 1)
+
+
+def _values(figure: Figure) -> list[dict[str, Any]]:
+    """Return each panel's box (left, top, right, bottom), axis and lines: name, then x and y in the drawing and on the
+    axes for each of at most `MOST_VALUES` points. Lengths are points from the upper left."""
+    panels, scale, height = [], 72 / figure.dpi, figure.bbox.height
+    for axes in figure.axes:
+        names = {id(one[0]): one.get_label() for one in axes.containers if hasattr(one, "has_yerr")}
+        lines = []
+        for line in axes.get_lines():
+            name, xy = str(names.get(id(line), line.get_label())), np.asarray(line.get_xydata(), float)
+            xy = xy[np.isfinite(xy).all(axis=1)]
+            if name.startswith("_") or len(xy) < 2 or line.get_transform() != axes.transData:
+                continue
+            xy = xy[np.unique(np.linspace(0, len(xy) - 1, MOST_VALUES).round().astype(int))]
+            at = axes.transData.transform(xy)
+            rows = np.column_stack([at[:, 0] * scale, (height - at[:, 1]) * scale, xy])
+            lines.append([name.replace("\n", " "), *(float(f"{value:.4g}") for value in rows.ravel())])
+        left, low, right, top = axes.get_window_extent().extents
+        if lines:
+            box = [round(end * scale) for end in (left, height - top, right, height - low)]
+            panels.append({"box": box, "x": axes.get_xlabel().replace("\\$", "$"), "lines": lines})
+    return panels
 
 
 def plain_decades(axis: Axis) -> None:
@@ -201,7 +234,7 @@ def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], 
         _save(temporary, size_in, draw, format="png", metadata={"Software": None})
 
 
-def _save(target: Any, size_in: Any, draw: Callable[[Figure], None], name: str = "", **how: Any) -> None:
+def _save(target: Any, size_in: Any, draw: Callable[[Figure], None], name: str = "", **how: Any) -> Figure:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -210,3 +243,4 @@ def _save(target: Any, size_in: Any, draw: Callable[[Figure], None], name: str =
         figure = Figure(figsize=size_in, layout="constrained")
         draw(figure)
         figure.savefig(target, dpi=160, **how)
+        return figure

@@ -1,5 +1,6 @@
 "use strict";
-// A list of contents from the headings, and tables whose rows can be sorted and filtered. Without it nothing is lost.
+// A list of contents, tables to sort and filter, which fit narrow screens, and values under the pointer on charts. Without
+// it nothing is lost.
 {
   const heads = [...document.querySelectorAll("main h2")];
   const nav = document.getElementById("contents");
@@ -40,5 +41,41 @@
       for (const row of rows) row.hidden = !words.every(word => row.textContent.toLowerCase().includes(word));
     });
     table.before(filter);
+  }
+  const wide = [...document.querySelectorAll(".scroll > table")];
+  const fit = () => {
+    for (const table of wide) table.classList.remove("dense", "cards");
+    for (const kind of ["dense", "cards"]) for (const table of wide.filter(each => each.scrollWidth > each.parentNode.clientWidth + 1)) {
+      const titles = table.tHead ? [...table.tHead.rows[0].cells].map(cell => cell.textContent) : [];
+      for (const row of table.tBodies[0].rows) [...row.cells].forEach((cell, k) => { cell.dataset.title = titles[k] || ""; });
+      table.classList.add(kind);
+    }
+  };
+  addEventListener("resize", fit);
+  fit();
+  const tip = document.createElement("div");
+  tip.id = "tip";
+  tip.hidden = true;
+  document.body.append(tip);
+  const short = value => String(Number(value.toPrecision(3)));
+  for (const svg of document.querySelectorAll("svg[data-values]")) {
+    const panels = JSON.parse(svg.dataset.values);
+    svg.addEventListener("pointermove", event => {
+      const place = svg.getBoundingClientRect(), scale = svg.viewBox.baseVal.width / place.width;
+      const x = (event.clientX - place.left) * scale, y = (event.clientY - place.top) * scale;
+      const panel = panels.find(({ box }) => x >= box[0] && y >= box[1] && x <= box[2] && y <= box[3]);
+      tip.hidden = !panel;
+      if (!panel) return;
+      const near = panel.lines.map(([name, ...at]) => {
+        let best = 0;
+        for (let k = 4; k < at.length; k += 4) if (Math.abs(at[k] - x) < Math.abs(at[best] - x)) best = k;
+        return { name, off: Math.abs(at[best] - x), x: at[best + 2], y: at[best + 3] };
+      }).sort((a, b) => a.off - b.off);
+      const here = near.filter(each => each.off <= near[0].off + 4);
+      tip.textContent = [`${panel.x} ${short(here[0].x)}`, ...here.map(each => `${short(each.y)}  ${each.name}`)].join("\n");
+      tip.style.left = `${Math.min(event.pageX + 14, document.documentElement.clientWidth - tip.offsetWidth - 8)}px`;
+      tip.style.top = `${event.pageY + 14}px`;
+    });
+    svg.addEventListener("pointerleave", () => { tip.hidden = true; });
   }
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.study.curves import PRO_LIMIT
-from harness.evaluation.study.limit import PodSurface, SetUpLimit, depth_varies
+from harness.evaluation.study.limit import SetUpLimit, depth_varies
 from harness.evaluation.study.result import SetUpResult, StudyResult
-from harness.report.blocks import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, closing, joined, svg, template
+from harness.report.blocks import COLOURS, GREY, MARKERS, PALE, closing, joined, svg, template
 from harness.report.clouds import StudyExample, examples_figure
-from harness.report.page import COLOURS, MARKERS
-from harness.report.pod import draw_hits, draw_pod, draw_signals, hits_in_view, plain, plain_numbers
+from harness.report.pod import MOST_MARKS, plain, plain_numbers
+from harness.report.scene import scene_svg
 from harness.tables import study
 from harness.tables.limits import is_within_sizes, limit_notes, limit_sentence, limits_grid, name_of, study_answer
 from harness.tables.outputs import REPORT
@@ -24,115 +24,60 @@ from harness.tables.text import Grid, unbroken
 from harness.vocabulary.files import write_text
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOST_PANELS = 6
-PANEL_IN = (5.2, 4.5)
-ONE_IN = (8.6, 5.2)
-LEVELS = {0.1: SKY, 0.5: GREEN, 0.9: ORANGE}
-GRID = 121
+MOST_CURVES = 6
 STYLES = ("-", "--", ":", "-.")
 LONGEST_NAME = 60
+ROW = 0.035
+"""Height of a set-up's row of hits above 1 and of misses below 0, in units of POD."""
 
 
 def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
-    """Return those shown in figures: all, or `MOST_PANELS` evenly from the smallest limit to the largest, in order."""
+    """Return those shown in figures: all, or `MOST_CURVES` evenly from the smallest limit to the largest, in order."""
     by_limit = sorted(set_ups, key=lambda one: one.limit.a90_95.value)
-    places = np.linspace(0, len(by_limit) - 1, min(MOST_PANELS, len(by_limit))).round().astype(int)
+    places = np.linspace(0, len(by_limit) - 1, min(MOST_CURVES, len(by_limit))).round().astype(int)
     chosen = {id(by_limit[place]) for place in places}
     return [one for one in set_ups if id(one) in chosen]
-
-
-def curves_figure(limits: Sequence[SetUpLimit]) -> str:
-    """Draw hits and misses, the curve with its band, a50, a90 and a90/95, on one scale of sizes."""
-    span = _span(limits)
-
-    def draw(axes: Axes, limit: SetUpLimit) -> None:
-        strength = min(0.6, 150 / max(limit.inspections, 1))
-        if limit.statement is not None:
-            draw_pod(axes, limit.statement, limit.a90_95, strength, most=limit.largest_mm)
-        else:
-            seen = limit.record.inspected
-            draw_hits(axes, seen.size_mm, seen.hit, strength=strength)
-            hits_in_view(axes)
-            if limit.a90_95.demonstrated:
-                axes.plot([limit.a90_95.value], [0.9], "o", color=PURPLE, label=f"a90/95: {limit.a90_95.value:.2f} mm")
-            words, place = plain(fill(f"no curve: {limit.why}", 44)), axes.transAxes
-            axes.text(0.5, 0.5, words, transform=place, ha="center", va="center", color=GREY, fontsize=9)
-        axes.set(xlim=span, xlabel=_size_axis(limit), ylabel="probability of detection")
-
-    return _panels("curves", limits, draw, " ".join(limit_sentence(limit) for limit in limits))
 
 
 def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
     """Draw `draw_overlay` for a page."""
     names = [name_of(limit) for limit in limits]
-    lines = sum(-(-len(name) // (2 * LONGEST_NAME)) for name in names) / _names_across(names)
+    lines = sum(-(-len(name) // LONGEST_NAME) for name in names) / _names_across(names)
     said = " ".join(limit_sentence(limit) for limit in limits)
-    return svg("overlay", (8.6, 4.0 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
+    return svg("overlay", (7.0, 3.9 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
 
 
 def _names_across(names: Sequence[str]) -> int:
-    return 2 if max(map(len, names)) <= LONGEST_NAME * 2 // 3 else 1
+    return 2 if max(map(len, names)) <= LONGEST_NAME // 2 else 1
 
 
 def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
-    """Draw the curves of all set-ups with their bands on one axis of sizes, a mark at each a90/95 within it."""
+    """Draw the curves of all set-ups with their bands on one axis of sizes, a mark at each a90/95 within it, and each
+    inspection as a stroke at its true size: hits above 1, misses below 0, a row for each set-up."""
     axes, names = figure.subplots(), [name_of(limit) for limit in limits]
+    axes.axhspan(1, 2, color=PALE, lw=0)
+    axes.axhspan(-1, 0, color=PALE, lw=0)
     for number, limit in enumerate(limits):
-        statement, colour = limit.statement, COLOURS[number % len(COLOURS)]
-        if statement is None:
-            continue
-        style = STYLES[number // len(COLOURS) % len(STYLES)]
-        axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
-        name, pod = plain(fill(names[number], 2 * LONGEST_NAME)), statement.curve.pod(statement.sizes)
-        axes.plot(statement.sizes, pod, style, color=colour, label=name)
+        statement, colour, seen = limit.statement, COLOURS[number % len(COLOURS)], limit.record.inspected
+        name = plain(fill(names[number], LONGEST_NAME))
+        if statement is not None:
+            line = STYLES[number // len(COLOURS) % len(STYLES)]
+            axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
+            axes.plot(statement.sizes, statement.curve.pod(statement.sizes), line, color=colour, label=name)
+        else:
+            axes.plot([], [], color=colour, label=f"{name}: no curve")
         if is_within_sizes(limit):
             axes.plot(limit.a90_95.value, 0.9, "o", color=colour, ms=6, mec="white", zorder=5)
+        style: dict[str, Any] = {"marker": "|", "s": 16, "lw": 0.7, "alpha": min(0.7, 150 / max(len(seen.hit), 1))}
+        height = np.where(seen.hit, 1 + ROW * (number + 0.5), -ROW * (number + 0.5))
+        axes.scatter(seen.size_mm, height, color=colour, rasterized=len(height) > MOST_MARKS, **style)
     axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
-    axes.set(xlim=_span(limits), ylim=(0, 1), xlabel=_size_axis(limits[0]), ylabel="probability of detection")
+    room = ROW * len(limits)
+    axes.set(xlim=_span(limits), ylim=(-room, 1 + room), yticks=np.linspace(0, 1, 6))
+    axes.set(xlabel=_size_axis(limits[0]), ylabel="probability of detection")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=_names_across(names))
-
-
-def signals_figure(limits: Sequence[SetUpLimit]) -> str:
-    """Draw signals against size, their regression and the threshold, of set-ups that have a regression."""
-
-    def draw(axes: Axes, limit: SetUpLimit) -> None:
-        assert limit.signals is not None
-        draw_signals(axes, limit.signals)
-        axes.set(xlim=_span([limit]), xlabel=_size_axis(limit), ylabel="highest score at the damage")
-
-    names = "; ".join(name_of(limit) for limit in limits)
-    return _panels("signals", limits, draw, f"Score of each damage against its size, with the threshold: {names}.")
-
-
-def surface_figure(surfaces: Sequence[tuple[SetUpLimit, PodSurface]]) -> str:
-    """Draw lines of equal POD over diameter and depth, the interval of that of 90 %, every damage found or missed."""
-    of_limit = {id(limit): surface for limit, surface in surfaces}
-
-    def draw(axes: Axes, limit: SetUpLimit) -> None:
-        surface = of_limit[id(limit)]
-        (left, right), (low, high) = surface.diameter_range_mm, surface.depth_range_mm
-        diameter, depth = np.linspace(left, right, GRID), np.geomspace(low, high, GRID)
-        pod = surface.pod(*np.meshgrid(diameter, depth))
-        shade = axes.contourf(diameter, depth, pod, levels=np.linspace(0, 1, 11), cmap="Greys", alpha=0.28)
-        shade.set_rasterized(True)
-        inside = [np.clip(edge, left, right) for edge in (surface.a90_low_mm, surface.a90_high_mm)]
-        axes.fill_betweenx(surface.depth_mm, *inside, color=ORANGE, alpha=0.3, lw=0, label="90 %, interval over boards")
-        for level, colour in LEVELS.items():
-            if pod.min() < level < pod.max():
-                axes.contour(diameter, depth, pod, levels=[level], colors=[colour], linewidths=2)
-            axes.plot([], [], color=colour, lw=2, label=f"POD {100 * level:.0f} %")
-        seen = limit.record.inspected
-        hit = np.asarray(seen.hit, bool)
-        axes.scatter(seen.diameter_mm[hit], seen.depth_mm[hit], s=9, color=BLUE, lw=0, alpha=0.8, label="found")
-        missed: dict[str, Any] = {"s": 11, "facecolor": "white", "edgecolor": INK, "lw": 0.6, "alpha": 0.8}
-        axes.scatter(seen.diameter_mm[~hit], seen.depth_mm[~hit], label="missed", **missed)
-        axes.set(xlabel=f"{seen.size_of} (mm)", ylabel="depth (mm)", xlim=(left, right), ylim=(low, high))
-
-    alt = "Probability of detection over size and depth."
-    return _panels("surface", [limit for limit, _ in surfaces], draw, alt, one_legend=True)
 
 
 def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
@@ -156,34 +101,7 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
 
     lines = sum(-(-len(name_of(limit)) // LONGEST_NAME) for limit, _ in surfaces)
     alt = "Smallest depth found 90 % of the time against size, as depth_limits.csv says."
-    return svg("depth-limits", (8.6, 4.4 + 0.17 * lines), alt, draw)
-
-
-def _panels(
-    name: str,
-    limits: Sequence[SetUpLimit],
-    draw_one: Callable[[Axes, SetUpLimit], None],
-    alt: str,
-    *,
-    one_legend: bool = False,
-) -> str:
-    across = min(2, len(limits))
-    down = -(-len(limits) // across)
-
-    def draw(figure: Figure) -> None:
-        grid = figure.subplots(down, across, squeeze=False).ravel()
-        for axes, limit in zip(grid, limits, strict=False):
-            draw_one(axes, limit)
-            axes.set_title(plain(fill(name_of(limit), 46 if across > 1 else 80)))
-            if not one_legend:
-                axes.legend(loc="upper left", bbox_to_anchor=(0, -0.17), ncols=2, borderaxespad=0, fontsize=8)
-        for axes in grid[len(limits) :]:
-            axes.set_visible(False)
-        if one_legend:
-            figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-
-    high = 3.9 * down + 0.7 if one_legend else PANEL_IN[1] * down
-    return svg(name, (PANEL_IN[0] * across, high) if across > 1 else ONE_IN, alt, draw)
+    return svg("depth-limits", (7.0, 4.0 + 0.17 * lines), alt, draw)
 
 
 def _size_axis(limit: SetUpLimit) -> str:
@@ -249,7 +167,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
 
 
 ROOM = 1.3
-WIDTH_CHARACTERS = 75
+WIDTH_CHARACTERS = 60
 
 
 def axis_figure(axis: study.AxisGroup, name: str) -> str:
@@ -312,7 +230,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
 
     return svg(
         name,
-        (8.6, 4.4 + 0.13 * len(shown)),
+        (7.0, 3.6 + 0.13 * len(shown)),
         f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says.",
         draw,
     )
@@ -353,17 +271,11 @@ def study_html(
     groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
     shown = with_room(result.set_ups)
     inspected = [one.limit for one in shown if one.limit.inspections]
-    surfaces = [(one.limit, one.surface) for one in shown if one.surface is not None]
-    signals = [one.limit for one in shown if one.limit.signals is not None]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    curves = [limit for limit in inspected if limit.statement is not None]
-    if len({_size_axis(limit) for limit in curves}) == 1:  # a depth is not drawn beside a diameter
-        figures["overlay"] = overlay_figure(curves)
-    figures |= {"curves": curves_figure(inspected)} if inspected else {}
-    figures |= {"surface": surface_figure(surfaces)} if surfaces else {}
-    figures |= {"depth-limits": depth_limits_figure(shown)} if surfaces else {}
-    figures |= {"signals": signals_figure(signals)} if signals else {}
+    if inspected and len({_size_axis(limit) for limit in inspected}) == 1:  # a depth is not drawn beside a diameter
+        figures["overlay"] = overlay_figure(inspected)
+    figures |= {"depth-limits": depth_limits_figure(shown)} if any(one.surface for one in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}
     named: list[tuple[str, str]] = []
     for limit in (one.limit for one in shown):
@@ -386,7 +298,8 @@ def study_html(
         limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(note) for note in limit_notes(limits)],
         set_ups=len(limits),
-        most_panels=MOST_PANELS,
+        most_curves=MOST_CURVES,
+        scene=scene_svg(result.facts),
         axes=[
             {
                 "title": group.name,

@@ -235,7 +235,7 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:
     if len(limits) <= MOST_ANSWERS:
-        return " ".join(limit_sentence(limit) for limit in limits)
+        return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
     shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
     if not shown:
         return (
@@ -254,8 +254,9 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     return f"{span}{few} no limit within the sizes inspected." if without else f"{span}."
 
 
-def limit_sentence(limit: SetUpLimit) -> str:
-    """Return ``50 frames: damage of 5.31 mm is found 90 % of the time with 95 % confidence (a90/95), at ...``."""
+def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
+    """Return ``50 frames: damage of 5.31 mm is found 90 % of the time with 95 % confidence (a90/95), at ...``;
+    ``again``, where that was said, the size alone."""
     quote, new = quoted(limit), ""
     if limit.over_units is not None:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
@@ -273,6 +274,7 @@ def limit_sentence(limit: SetUpLimit) -> str:
             limit.record.inspected.limit_of, "of {} mm"
         ).format(size)
         found = f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
+        found = size.removeprefix("of ") if again else found
     calls, rate = limit.false_calls, ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)

@@ -29,7 +29,7 @@ from harness.tables.limits import (
 )
 from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import Grid
-from harness.vocabulary.path_names import differing, names_of, on_one_line, unit_of, value_text
+from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
 """Distance on the sensor up to which two highest scores are those of one blob: the window of a camera's filter."""
@@ -315,6 +315,8 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
 
 def axis_value(path: str, value: Any) -> str:
     """Return a value in words: ``50 frames``, ``0.7 m``, ``kinect_v2``."""
+    if path.endswith("camera.name"):
+        return camera_title(value)
     return text.many(value, "frame") if path == FRAMES else value_text(path, value)
 
 

@@ -67,11 +67,13 @@ def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> 
 
 
 def with_interval(value: float, low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
-    """Return ``5.10 (4.80 to 5.62)``; the estimate alone where its interval is unknown or lies beyond ``most``."""
-    text = _number(value, digits, most)
+    """Return ``5.1 (4.8 to 5.6)``; the estimate alone where its interval is unknown or beyond ``most``. Numbers have
+    ``digits`` decimals at most, and two significant digits where the interval is wider than `ROUGH` of the value."""
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
-        return text
-    return f"{text} ({interval(low, high, digits, most)})"
+        return _number(value, digits, most)
+    if np.isfinite([value, low, high]).all() and value and high - low > ROUGH * abs(value):
+        digits = min(digits, max(0, 1 - int(np.floor(np.log10(abs(value))))))
+    return f"{_number(value, digits, most)} ({interval(low, high, digits, most)})"
 
 
 def many(count: int, what: str) -> str:
@@ -103,7 +105,8 @@ def _number(value: float, digits: int, most: float) -> str:
 Tone = Literal["", "good", "key", "bad", "open", "changed"]
 COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
 """Colours of a terminal; the text says the same without them."""
-MOST_WIDE = 14
+ROUGH = 0.1
+"""Width of an interval over the value from which on a third digit says nothing."""
 CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
 
 
@@ -171,9 +174,8 @@ class Grid:
             cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]
             cells += [_data_cell(cell, place >= self.left) for place, cell in enumerate(row[1:], 1)]
             rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-        kind = f"{self.kind} dense" if len(self.heads) > MOST_WIDE else self.kind
         table = '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
-        return Markup(table).format(kind, heads, Markup("\n").join(rows))
+        return Markup(table).format(self.kind, heads, Markup("\n").join(rows))
 
 
 def _data_cell(cell: Cell, is_number: bool) -> Markup:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +47,21 @@ def value_text(path: str, value: Any) -> str:
     return f"{value:g} {unit}" if _is_number(value) and unit else text
 
 
+@cache
+def camera_title(name: str) -> str:
+    """Return the title in the file of a camera that comes with tofpod, without commas; of any other name its words."""
+    if re.fullmatch(r"\w+", name):
+        file = resources.files("scenes") / "cameras" / f"{name}.yaml"
+        told = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
+        if told:
+            return told[1].replace(",", "")
+    return name.replace("_", " ")
+
+
 def in_words(variant: str) -> str:
-    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "kinect v2, distance 0.5 m"."""
+    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m"."""
     parts = [part.partition("=") for part in re.split(r", (?=[^=,]+=)", variant)]
-    said = (value.replace("_", " ") if name in NAMED else f"{name} {value}".strip() for name, _, value in parts)
+    said = (camera_title(value) if name in NAMED else f"{name} {value}".strip() for name, _, value in parts)
     return ", ".join(said)
 
 

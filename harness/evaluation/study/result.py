@@ -39,6 +39,7 @@ from harness.evaluation.study.limit import (
 )
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.tables.trials import ResultTables
+from harness.vocabulary.path_names import camera_title
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
@@ -271,7 +272,9 @@ CONDITIONS = (
     ("source.target.distance_m", "at {:g} m"),
     ("source.target.tilt_deg", "tilted by up to {:g}°"),
     ("source.target.backing.distance_mm", "with a surface {:g} mm behind"),
+    ("source.target.backing_distance_mm", "with a surface {:g} mm behind"),
     ("source.target.material.albedo_850", "albedo {:g}"),
+    ("source.target.plywood_albedo_850", "albedo {:g}"),
     ("detector.name", "detector {}"),
     ("threshold.calibrate.false_calls_per_m2", "threshold for {:g} false calls per m²"),
     ("threshold.k", "threshold {:g} deviations"),
@@ -289,7 +292,7 @@ def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -
             value = value.get(key) if isinstance(value, Mapping) else None
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
         if value is not None and not varied:
-            said.append(words.format(value.replace("_", " ") if isinstance(value, str) else value))
+            said.append(words.format(camera_title(value) if isinstance(value, str) else value))
     drawn = facts.get("source", {}).get("target", {}).get("damage", {}).get("per_board", 0)
     drawn *= (facts.get("study") or {}).get("boards", 0)
     fewest = min((limit.targets for limit in limits), default=drawn)
@@ -321,15 +324,20 @@ class SetUpResult:
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """All set-ups in the record's order, lines of limits over the swept axes, the limits of validity, and the
-    conditions that all set-ups share."""
+    """All set-ups in the record's order, lines of limits over the swept axes, the limits of validity; ``facts``: the
+    resolved experiment as plain data."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
     limits: tuple[SetUpLimit, ...]
     axes: tuple[AxisLine, ...]
     validity: tuple[Section, ...]
-    conditions: str = ""
+    facts: Mapping[str, Any]
+
+    @property
+    def conditions(self) -> str:
+        """What all set-ups have in common, in one line."""
+        return conditions_of(self.facts, self.limits)
 
 
 def evaluate_study(
@@ -345,7 +353,7 @@ def evaluate_study(
     set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, diameters_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)
     validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
-    return StudyResult(record, set_ups, limits, axis_lines(limits), validity, conditions_of(facts, limits))
+    return StudyResult(record, set_ups, limits, axis_lines(limits), validity, facts)
 
 
 def _set_up(

@@ -1,0 +1,43 @@
+"""The scene of an experiment as a picture: camera, target and what stands behind it, from the side, not to scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from harness.report.blocks import template
+from harness.vocabulary.path_names import camera_title, value_text
+
+BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_mm")
+"""Where the declared targets say how far behind them a surface stands."""
+
+
+def scene_svg(facts: Mapping[str, Any]) -> Markup:
+    """Return the picture with its caption; empty where ``facts``, the resolved experiment, hold no simulated target."""
+    cameras, distances = _values(facts, "source.camera.name"), _values(facts, "source.target.distance_m")
+    if not (cameras and distances):
+        return Markup("")
+    names = [camera_title(name) for name in cameras]
+    named = names[0] if len(names) == 1 else f"{len(names)} cameras"
+    distance = value_text("distance_m", [distances[0], distances[-1]]) if len(distances) > 1 else f"{distances[0]:g} m"
+    gaps = [gap for path in BEHIND for gap in _values(facts, path)]
+    gap = " or ".join(f"{one:g} mm" for one in gaps)
+    behind = f", {gap} before another surface" if gaps else ""
+    target = facts["source"]["target"].get("name", "target")
+    target = {"drawn": "board with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
+    words = f"{', '.join(names)} at {distance} from a {target}{behind}. Not to scale."
+    return Markup(
+        template("scene.html").render(words=words, camera=named, distance=distance, target="target", behind=gap)
+    )
+
+
+def _values(facts: Mapping[str, Any], path: str) -> list[Any]:
+    """The values of a setting: those of its axis, or the one of the experiment; empty where it has none."""
+    if path in (axes := facts.get("sweep") or {}):
+        return [value for value in axes[path] if value is not None]
+    value: Any = facts
+    for key in path.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return [] if value is None else [value]
