@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from harness.evaluation.pod.transfer import Mapod
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
-BOUNDED = ("none", "floor", "ceiling", "both")
-BOUNDS = ("likelihood-ratio", "profile", "wald")
 FILES = ("pod.json", "pod.png", "pod.html")
 MAPOD_FILES = ("mapod.json", "mapod.png", "mapod.html")
 
@@ -40,8 +38,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--log", action=switch, help=f"the curve against the sizes' logarithm, or not {least}")
     put = parser.add_argument_group("with --hit").add_argument
     put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
-    put("--bound", choices=BOUNDS, help="how a90/95 is found (default: likelihood-ratio, 3.841)")
-    put("--bounded", choices=BOUNDED, help="fit hits by chance (floor), misses at any size (ceiling) or both as well")
     put = parser.add_argument_group("with --ahat").add_argument
     put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
     put("--left", type=float, metavar="Y", help="signals at or below this are known to be no more than that (noise)")
@@ -95,7 +91,7 @@ def _corrected(options: argparse.Namespace) -> Mapod:
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
 
-    for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log", "bounded", "bound"):
+    for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log"):
         if getattr(options, name) is not None:
             fix = "leave it out: the study's curve decides it"
             raise UserError(f"--{name.replace('_', '-')} and --prior: not both", fix=fix)
@@ -123,7 +119,7 @@ def _stated(options: argparse.Namespace) -> PodStatement:
         said = "one of them, not both" if of_hits else "which column tells what was found?"
         raise UserError(f"--hit and --ahat: {said}", legal=legal, fix="name one column; none is guessed")
     other = "--ahat" if of_hits else "--hit"
-    for name in ("decision", "left", "right", "log_signal") if of_hits else ("link", "bound", "bounded"):
+    for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
         if getattr(options, name) is not None:
             raise UserError(f"--{name.replace('_', '-')} belongs to {other}", fix="leave it out")
     if not of_hits and options.decision is None:
@@ -137,8 +133,7 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     if options.log:
         table.require_positive(read, response=False, why="--log")
     if of_hits:
-        told: dict[str, Any] = {"link": options.link, "log_size": options.log, "bounded": options.bounded or "none"}
-        return pod.state_hits(read, **told, method=(options.bound or BOUNDS[0]).replace("-", " "), unit=options.unit)
+        return pod.state_hits(read, link=options.link, log_size=options.log, unit=options.unit)
     if options.log_signal and options.left is None:
         table.require_positive(read, response=True, why="--log-signal")
     names = ("decision", "left", "right", "log_signal", "unit")

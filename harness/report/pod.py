@@ -52,7 +52,7 @@ def pod_html(statement: PodStatement, command: str) -> str:
     """The page as text: limit, figure, table of models, tests, notes; it needs no network."""
     caption = (
         "The curve with its pointwise band, the inspections behind it, and the sizes at POD 0.5 and 0.9. a90/95 is "
-        "where the band's lower edge reaches 0.9 if the band and the limit are of one method."
+        "where the band's lower edge reaches 0.9."
     )
     chosen_by = (
         f"Sorted by {statement.criterion}, smaller is nearer to the data. Unless one was asked for, that alone "
@@ -92,7 +92,6 @@ def sizes_grid(statement: PodStatement) -> Grid:
     """a50, a90 and every bound: size, and how it was found."""
     of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
     bounds = [(statement.bound, f"{statement.bound.method}{of}: the limit to quote")]
-    bounds += [(each, f"{each.method}{of}") for each in statement.others]
     if statement.independent is not None:
         bounds.append((statement.independent, "WRONG here: as if every inspection were a target of its own"))
     rows = [(name, sized(getattr(statement, name), statement.unit), "estimate") for name in ("a50", "a90")]
@@ -170,7 +169,7 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
         if statement.signal:
             draw_signals(panels[0], statement)
             panels[0].set(ylabel=plain(statement.response_column), title="Signals")
-        draw_pod(panels[-1], statement, statement.bound)
+        draw_pod(panels[-1], statement)
         if statement.curve.log_size:
             _log_sizes(panels[-1], statement.sizes)
         panels[-1].set_ylabel("probability of detection")
@@ -183,11 +182,8 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
     return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
 
 
-def draw_pod(
-    axes: Axes, statement: PodStatement, bound: Bound, strength: float = 0.6, most: float = float("inf")
-) -> None:
-    """Curve, band, data (strokes of opacity ``strength``) and the sizes read off, ``bound`` among them; sizes beyond
-    ``most`` are named as such and not drawn."""
+def draw_pod(axes: Axes, statement: PodStatement) -> None:
+    """Curve, band, data and the sizes read off."""
     curve, sizes = statement.curve, statement.sizes
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
@@ -196,16 +192,14 @@ def draw_pod(
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
     if statement.signal is None:
-        draw_hits(axes, statement.size, statement.response == 1, strength)
+        draw_hits(axes, statement.size, statement.response == 1, 0.6)
     for name, value, pod, colour in (
         ("a50", statement.a50, 0.5, GREEN),
         ("a90", statement.a90, POD, ORANGE),
-        ("a90/95", bound.value, POD, RED),
+        ("a90/95", statement.bound.value, POD, RED),
     ):
         text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
-        if most < value < np.inf:
-            text = f"> {most:.3g} {statement.unit}"
-        inside = sizes[0] <= value <= min(sizes[-1], most)
+        inside = sizes[0] <= value <= sizes[-1]
         if inside:
             axes.plot([value, value], [0, pod], color=colour, lw=1.1)
         at = ([value], [pod]) if inside else ([], [])

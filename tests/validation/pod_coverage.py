@@ -19,7 +19,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.hit_miss import METHODS, choose_model, fit_hit_miss, largest_bound, near_models
+from harness.evaluation.pod.hit_miss import METHOD, choose_model, fit_hit_miss, largest_bound, near_models
 from harness.vocabulary.errors import UserError
 
 UNKNOWN = np.zeros((2, 2))
@@ -62,7 +62,7 @@ class Coverage:
 def coverage(
     studies: int,
     targets: int,
-    methods: tuple[str, ...] = (*METHODS, *CHOSEN),
+    methods: tuple[str, ...] = (METHOD, *CHOSEN),
     seed: int = 1823,
     truth: PodCurve = TRUTH,
 ) -> list[Coverage]:
@@ -80,13 +80,12 @@ def coverage(
             refused += 1
             continue
         separated += fit.method == "Firth"
-        fits = {method: (fit,) for method in METHODS}
+        fits = {METHOD: (fit,)}
         if set(CHOSEN) & set(methods):
             tried = choose_model(sizes, hits)
             fits |= {CHOSEN[0]: tried[:1], CHOSEN[1]: near_models(tried)}
         for method in methods:
-            by = method if method in METHODS else METHODS[0]
-            limits[method].append(largest_bound(fits[method], by).value)
+            limits[method].append(largest_bound(fits[method]).value)
     true = truth.size_at(0.9)
     return [
         Coverage(

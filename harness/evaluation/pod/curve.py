@@ -1,9 +1,9 @@
 """A probability of detection curve, its four links, and the likelihood of hits and misses under them.
 
 POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only; sigma is the width. For
-all links ln F and ln(1 - F) are concave, so without floor and ceiling there is one maximum wherever hits and misses
-overlap; where they do not, Firth's penalty makes the estimate finite. Sources: McCullagh and Nelder, Generalized Linear
-Models (1989), 2.5 and 4.3; Firth, Biometrika 80 (1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
+all links ln F and ln(1 - F) are concave, so there is one maximum wherever hits and misses overlap; where they do not,
+Firth's penalty makes the estimate finite. Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3;
+Firth, Biometrika 80 (1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
 
 from __future__ import annotations
 
@@ -67,27 +67,22 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
 @dataclass(frozen=True)
 class PodCurve:
     """``mu``, ``sigma`` in the unit of x (size, or its natural logarithm where ``log_size``); ``covariance`` (2, 2) of
-    the two; ``floor`` and ``ceiling``: POD of the smallest and the largest, 0 and 1 unless fitted."""
+    the two."""
 
     link: str
     log_size: bool
     mu: float
     sigma: float
     covariance: np.ndarray
-    floor: float = 0.0
-    ceiling: float = 1.0
 
     def pod(self, size: np.ndarray) -> np.ndarray:
         """POD at sizes of any shape."""
         x = np.log(size) if self.log_size else np.asarray(size, float)
-        return self.floor + (self.ceiling - self.floor) * link_cdf(self.link, (x - self.mu) / self.sigma)
+        return link_cdf(self.link, (x - self.mu) / self.sigma)
 
     def size_at(self, pod: float) -> float:
-        """The size with this POD; infinite or 0 where floor or ceiling keep the curve from it."""
-        share = (pod - self.floor) / (self.ceiling - self.floor)
-        if not 0 < share < 1:
-            return float("inf") if share >= 1 else 0.0
-        x = self.mu + self.sigma * float(link_ppf(self.link, np.array(share)))
+        """The size with this POD."""
+        x = self.mu + self.sigma * float(link_ppf(self.link, np.array(pod)))
         return float(np.exp(x)) if self.log_size else x
 
 
@@ -121,8 +116,7 @@ PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 class HitsAndMisses:
     """Hits and misses of one study or of several (d) on the same rows. ``design`` (n, p): columns of the predictor;
     ``hits``, ``misses`` (n,) or (d, n) counts. ``penalty`` (a number, or (d,)): how often Jeffreys' prior is added:
-    None for never, 1 for Firth's, k where every target has k rows; for p = 2 only. ``floor``, ``ceiling``: fixed,
-    counted by `value` alone."""
+    None for never, 1 for Firth's, k where every target has k rows; for p = 2 only."""
 
     design: np.ndarray
     hits: np.ndarray
@@ -130,8 +124,6 @@ class HitsAndMisses:
     link: str
     penalty: np.ndarray | float | None = None
     offset: float = 0.0
-    floor: float = 0.0
-    ceiling: float = 1.0
 
     @property
     def z(self) -> np.ndarray:
@@ -141,11 +133,6 @@ class HitsAndMisses:
     def value(self, b: np.ndarray) -> np.ndarray:
         """(Penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
         found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
-        if self.floor > 0 or self.ceiling < 1:
-            with np.errstate(divide="ignore"):
-                between = np.log(self.ceiling - self.floor)
-                found = np.logaddexp(np.log(self.floor), between + found)
-                missed = np.logaddexp(np.log(1.0 - self.ceiling), between + missed)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
             weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])

@@ -12,7 +12,7 @@ from scipy import stats
 
 from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.pod.curve import PodCurve, link_ppf
-from harness.evaluation.pod.hit_miss import Between, bound, fit_hit_miss
+from harness.evaluation.pod.hit_miss import METHOD, bound, fit_hit_miss
 from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
@@ -77,12 +77,10 @@ def design(
     seed: int = 0,
 ) -> tuple[StudyPlan, ...]:
     """Simulate one `StudyPlan` for each number of targets and placement, in that order; a study takes about 5 ms.
-    Studies are analysed with the guess's link and axis, and with a floor or ceiling where it has one. A study that
-    found all or nothing, or whose POD does not grow with size, demonstrates nothing."""
+    Studies are analysed with the guess's link and axis. A study that found all or nothing, or whose POD does not grow
+    with size, demonstrates nothing."""
     low, high = range_of_sizes
-    kinds: dict[tuple[bool, bool], Between] = {(False, False): "none", (True, False): "floor", (False, True): "ceiling"}
-    bounded = kinds.get((guess.floor > 0, guess.ceiling < 1), "both")
-    method, true_size, plans = "likelihood ratio", guess.size_at(pod), []
+    true_size, plans = guess.size_at(pod), []
     for number in targets:
         for placement in placements:
             sizes = place_sizes(guess, number, range_of_sizes, placement)
@@ -90,10 +88,10 @@ def design(
             bounds = np.full(studies, np.inf)
             for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
                 try:
-                    fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size, bounded=bounded)
+                    fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
                 except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
                     continue
-                bounds[study] = bound(fit, pod, confidence, method).value
+                bounds[study] = bound(fit, pod, confidence).value
             notes = []
             if number < LEAST_TARGETS:
                 notes.append(f"{number} targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -102,7 +100,7 @@ def design(
                 notes.append(f"{size}, lies outside the range: it is extrapolated")
             # Order statistics, as there is no mean between a number and infinity.
             least, median, most = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-            shown, told = float(np.mean(np.isfinite(bounds))), (number, placement, pod, confidence, method, studies)
+            shown, told = float(np.mean(np.isfinite(bounds))), (number, placement, pod, confidence, METHOD, studies)
             plans.append(StudyPlan(*told, true_size, median, least, most, shown, sizes, tuple(notes)))
     return tuple(plans)
 
@@ -118,7 +116,7 @@ def place_sizes(guess: PodCurve, number: int, range_of_sizes: tuple[float, float
     low, high = range_of_sizes
     if placement == "uniform":
         return evenly(number, low, high)
-    rise = [guess.size_at(guess.floor + share * (guess.ceiling - guess.floor)) for share in RISE]
+    rise = [guess.size_at(share) for share in RISE]
     start, end = np.clip(rise, low, high).tolist()
     if not start < end:
         legal = f"a range that meets {rise[0]:.4g} to {rise[1]:.4g}"

@@ -2,14 +2,10 @@
 
 Rows that share an identity in ``inspections`` are one target and taken as fully dependent (the handbook's reading): of
 k rows a target, covariance and likelihood ratio criterion are scaled by k; where numbers differ, rows are weighted so
-that each target counts once. P(hit) = f + (c - f) F(b0 + b1 z) with 0 <= f <= 1/2 <= c <= 1; with floor f or ceiling c
-fitted it is not concave, and maximised from several starts. Not modelled: targets that differ in anything but size,
-inspectors, a floor above or a ceiling below one half. Bounds are one-sided:
-
-- "likelihood ratio" (default): the set 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 in (mu, sigma), MIL-HDBK-1823A
-  G.3; a90/95 is the largest a90 in it, which equals the profile likelihood of a90 at that criterion.
-- "profile": the same at the one-sided criterion chi2(2 confidence - 1, 1) = 2.706.
-- "wald": the size at which the pointwise lower Wald band of the linear predictor crosses the wanted POD (Fieller).
+that each target counts once. The bound is one-sided: the largest a90 in the set 2 (llmax - ll) <= chi2(confidence, 1) =
+3.841 of (mu, sigma), G.3 of the handbook, which equals the profile likelihood of a90 at that criterion. Not modelled:
+targets that differ in anything but size, inspectors, and hits by chance or misses at any size, which are tested for
+(`floor_ceiling_tests`).
 
 A bound of one model holds if that model is true. Where the data choose among eight models, the best one's bound covers
 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So `largest_bound` takes the largest over all
@@ -21,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,8 +41,8 @@ from harness.evaluation.pod.curve import (
 )
 from harness.vocabulary.errors import UserError
 
-Between = Literal["none", "floor", "ceiling", "both"]
-BOUNDED = ("none", "floor", "ceiling", "both")
+Beyond = Literal["floor", "ceiling", "both"]
+METHOD = "likelihood ratio"
 EXACT = 1e-9
 """Tolerance of the coefficients of a single study."""
 STEEPEST = 1e3
@@ -56,16 +52,13 @@ NEAR_DEVIANCE = 2.0
 have as many parameters, so it is a difference of 2 in Akaike's criterion (Burnham and Anderson 2002, section 2.6)."""
 STARTS = 10
 """Places of a coarse grid from which the maximum with floor or ceiling is sought."""
-NEAR_EDGE = 1e-6
-"""Distance of floor and ceiling from 0 and 1, and from the POD that a profile holds, that counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
 class HitMissFit:
-    """A fitted curve and its basis. POD = floor + (ceiling - floor) F(b0 + b1 x), x = size or ln size; ``covariance``
-    (2, 2) of the two, scaled for ``repeats`` = n / targets. Deviances count every row, without the penalty of
-    ``method`` "Firth". ``place`` (4,): intercept and slope in z = (x - centre) / spread, floor and ceiling; ``data``:
-    the likelihood maximised."""
+    """A fitted curve and its basis. POD = F(b0 + b1 x), x = size or ln size; ``covariance`` (2, 2) of the two, scaled
+    for ``repeats`` = n / targets. Deviances count every row, without the penalty of ``method`` "Firth". ``place`` (2,):
+    intercept and slope in z = (x - centre) / spread; ``data``: the likelihood maximised."""
 
     curve: PodCurve
     b0: float
@@ -80,9 +73,6 @@ class HitMissFit:
     repeats: float
     method: Literal["ML", "Firth"]
     notes: tuple[str, ...]
-    bounded: Between
-    x: np.ndarray
-    hit: np.ndarray
     centre: float
     spread: float
     place: np.ndarray
@@ -91,13 +81,13 @@ class HitMissFit:
 
 @dataclass(frozen=True)
 class FloorCeilingTest:
-    """A test whether floor or ceiling are needed: ``statistic`` = fall in deviance over ``repeats``; ``p_value`` from
-    the mixture of chi-squares of a parameter on its boundary; ``needed`` at 5 %; ``fit`` the fit with them."""
+    """A test whether POD = floor + (ceiling - floor) F fits better: ``p_value`` from the mixture of chi-squares of a
+    parameter on its boundary; ``needed`` at 5 %; the likeliest ``floor`` and ``ceiling``."""
 
-    bounded: Between
-    statistic: float
+    beyond: Beyond
     p_value: float
-    fit: HitMissFit
+    floor: float
+    ceiling: float
 
     @property
     def needed(self) -> bool:
@@ -112,12 +102,11 @@ def fit_hit_miss(
     link: str = "logit",
     log_size: bool = False,
     inspections: ArrayLike | None = None,
-    bounded: Between = "none",
 ) -> HitMissFit:
     """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row.
     Where hits and misses do not overlap there is no maximum of the likelihood: Firth's penalised one is fitted, with a
     note. `UserError` for values that cannot be fitted and for a chance of detection that does not grow with size."""
-    x, hits = _checked(size, hit, link, log_size, bounded)
+    x, hits = _checked(size, hit, link, log_size)
     n, rows_each = len(x), rows_of_target(x, inspections)
     targets = round(float((1 / rows_each).sum()))
     repeats, centre, spread = n / targets, float(x.mean()), float(x.std())
@@ -130,26 +119,21 @@ def fit_hit_miss(
     several = HitsAndMisses(design, found[None], (weight - found)[None], link, penalty)
     notes: tuple[str, ...] = ()
     if separated:
-        place = np.append(penalised_maxima(several, EXACT)[0], [0.0, 1.0])
+        place = penalised_maxima(several, EXACT)[0]
         if x[hits].mean() < x[~hits].mean():
             place[1] = 0.0
         notes = ("no miss is larger than any hit (separation): no maximum likelihood; Firth's penalised likelihood",)
-        if bounded != "none":
-            notes += (f"no {'floor or ceiling' if bounded == 'both' else bounded} fitted: separated data hold none",)
     else:
         start = np.array([float(link_ppf(link, np.array(rate))), 0.0])
-        place = np.append(maxima(several, start, EXACT)[0], [0.0, 1.0])
-        if bounded != "none" and place[1] > 0:
-            place, notes = _bounded_maximum(HitsAndMisses(design, found, weight - found, link), place, bounded)
+        place = maxima(several, start, EXACT)[0]
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
         raise UserError("the chance of detection does not grow with size: the slope is not positive", fix=fix)
-    floor, ceiling = float(place[2]), float(place[3])
-    single = HitsAndMisses(design, found, weight - found, link, floor=floor, ceiling=ceiling)
-    log_likelihood = float(single.value(place[:2]))
+    single = HitsAndMisses(design, found, weight - found, link)
+    log_likelihood = float(single.value(place))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
-    b0, b1 = (float(b) for b in unscale @ place[:2])
-    covariance = unscale @ (_covariance(single, place) * repeats) @ unscale.T
+    b0, b1 = (float(b) for b in unscale @ place)
+    covariance = unscale @ (np.linalg.pinv(_information(single, place)) * repeats) @ unscale.T
     slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
         notes += (f"{n} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
@@ -157,13 +141,11 @@ def fit_hit_miss(
             notes += (
                 f"{rows_each.min()} to {rows_each.max()} inspections a target: weighted, each target counts once",
             )
-    curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T, floor, ceiling)
+    curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
     numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
     method: Literal["ML", "Firth"] = "Firth" if separated else "ML"
-    fitted: Between = "none" if separated else bounded
-    maximised = replace(single, penalty=penalty)
-    return HitMissFit(curve, *numbers, method, notes, fitted, x, hits, centre, spread, place, maximised)
+    return HitMissFit(curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty))
 
 
 def choose_model(
@@ -172,12 +154,11 @@ def choose_model(
     *,
     links: Sequence[str] = LINKS,
     inspections: ArrayLike | None = None,
-    bounded: Between = "none",
 ) -> tuple[HitMissFit, ...]:
     """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order knows nothing of
     the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
-    fit = partial(fit_hit_miss, size, hit, inspections=inspections, bounded=bounded)
+    fit = partial(fit_hit_miss, size, hit, inspections=inspections)
     fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, links)]
     return tuple(sorted(fits, key=lambda one: one.deviance))
 
@@ -188,24 +169,19 @@ def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
     return tuple(fit for fit in fits if fit.deviance <= least + NEAR_DEVIANCE * fit.repeats)
 
 
-def floor_ceiling_test(
-    size: ArrayLike,
-    hit: ArrayLike,
-    *,
-    bounded: Between = "both",
-    link: str = "logit",
-    log_size: bool = False,
-    inspections: ArrayLike | None = None,
-) -> FloorCeilingTest:
-    """Test three or four parameters against two by the likelihood ratio. A floor of 0 and a ceiling of 1 lie on the
-    boundary: 1/2 chi2(0) + 1/2 chi2(1) for one of them, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for both (Self
-    and Liang, JASA 82 (1987), 605, cases 5 and 7, their correlation neglected)."""
-    plain = fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=inspections)
-    fit = fit_hit_miss(size, hit, link=link, log_size=log_size, inspections=inspections, bounded=bounded)
-    statistic = max((plain.deviance - fit.deviance) / plain.repeats, 0.0)
-    one, two = stats.chi2.sf(statistic, [1, 2])
-    tail = float(0.5 * one if bounded != "both" else 0.5 * one + 0.25 * two)
-    return FloorCeilingTest(bounded, statistic, tail if statistic > 1e-9 else 1.0, fit)
+def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
+    """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of 0 and a ceiling of 1
+    lie on the boundary: 1/2 chi2(0) + 1/2 chi2(1) for one of them, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for
+    both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, their correlation neglected). None of separated data."""
+    tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
+    asked: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
+    for beyond, floor, ceiling in asked if fit.method == "ML" else ():
+        place, value = _search(fit.data, np.append(fit.place, [0.0, 1.0]), floor, ceiling)
+        statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
+        one, two = stats.chi2.sf(statistic, [1, 2])
+        tail = 0.5 * one if beyond != "both" else 0.5 * one + 0.25 * two
+        tests.append(FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist()))
+    return tuple(tests)
 
 
 def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, np.ndarray]:
@@ -218,50 +194,6 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
     along = slope * (ceiling - floor) * density
     gradient = np.array([along.sum(), along @ data.z, slope @ (1.0 - share), slope @ share])
     return float(data.hits @ np.log(p_hit) + data.misses @ np.log(p_miss)), gradient
-
-
-def most_likely_below(data: HitsAndMisses, place: np.ndarray, bounded: str, pod: float) -> float:
-    """Largest log-likelihood of the curves whose ceiling is at most ``pod``; -inf where the ceiling is fixed at 1.
-    ``place`` (4,): the best curve of all, which guides the search."""
-    if bounded not in ("ceiling", "both") or pod < 0.5:
-        return float("-inf")
-    return _search(data, place, (0.0, 0.5) if bounded == "both" else (0.0, 0.0), (0.5, pod))[1]
-
-
-def bounded_profile(data: HitsAndMisses, place: np.ndarray, bounded: str, z0: float, pod: float) -> float:
-    """Largest log-likelihood of the curves with floor < ``pod`` < ceiling that are ``pod`` at ``z0``; ``place`` (4,):
-    the best curve of all, from which the search starts."""
-    floor = (0.0, min(0.5, pod - NEAR_EDGE)) if bounded in ("floor", "both") else (0.0, 0.0)
-    ceiling = (max(0.5, pod + NEAR_EDGE), 1.0) if bounded in ("ceiling", "both") else (1.0, 1.0)
-
-    def loss(at: np.ndarray) -> tuple[float, np.ndarray]:
-        b1, between = float(np.exp(at[0])), at[2] - at[1]
-        share = float(np.clip((pod - at[1]) / between, 1e-12, 1.0 - 1e-12))
-        predictor = float(link_ppf(data.link, np.array(share)))
-        value, by = value_and_gradient(data, np.array([predictor - b1 * z0, b1, at[1], at[2]]))
-        by_share = by[0] / np.exp(float(logs_of_link(data.link, np.array(predictor))[2])) / between
-        slopes = [b1 * (by[1] - z0 * by[0]), by[2] - by_share * (1.0 - share), by[3] - by_share * share]
-        return -value, -np.array(slopes)
-
-    floors = sorted({float(np.clip(f, *floor)) for f in (place[2], 0.01)})
-    ceilings = sorted({float(np.clip(c, *ceiling)) for c in (place[3], 0.5 * (1.0 + pod))})
-    limits = ((np.log(1e-6), np.log(STEEPEST)), floor, ceiling)
-    return -min(
-        float(optimize.minimize(loss, [np.log(b1), f, c], jac=True, method="L-BFGS-B", bounds=limits).fun)
-        for b1, f, c in product((place[1], 0.3 * place[1]), floors, ceilings)
-    )
-
-
-def _bounded_maximum(data: HitsAndMisses, plain: np.ndarray, bounded: str) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The largest likelihood with a floor, a ceiling or both, and notes; ``plain`` (4,) that without them."""
-    floor = (0.0, 0.5) if bounded in ("floor", "both") else (0.0, 0.0)
-    ceiling = (0.5, 1.0) if bounded in ("ceiling", "both") else (1.0, 1.0)
-    best, value = _search(data, plain, floor, ceiling)
-    best = best if value > float(data.value(plain[:2])) + 1e-9 else plain
-    share = np.exp(logs_of_link(data.link, best[0] + best[1] * data.z)[0])
-    if len(np.unique(data.z[(share > 0.01) & (share < 0.99)])) < 2:
-        return best, ("fewer than two sizes lie on the curve's rise: it is a step, whose width means nothing",)
-    return best, ()
 
 
 def _search(
@@ -303,28 +235,18 @@ def _search(
     return found, largest
 
 
-def _covariance(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:
-    """(2, 2) covariance of (b0, b1): inverse expected information over the parameters off their boundaries."""
-    b0, b1, floor, ceiling = place
-    hit, miss, density = np.exp(logs_of_link(data.link, b0 + b1 * data.z))
-    p_hit = np.maximum(floor + (ceiling - floor) * hit, 1e-300)
-    p_miss = np.maximum(1 - ceiling + (ceiling - floor) * miss, 1e-300)
-    slopes = [(ceiling - floor) * density, (ceiling - floor) * density * data.z]
-    slopes += [1.0 - hit] if floor > NEAR_EDGE else []
-    slopes += [hit] if ceiling < 1.0 - NEAR_EDGE else []
-    design, weight = np.column_stack(slopes), (data.hits + data.misses) / (p_hit * p_miss)
-    return np.asarray(np.linalg.pinv(design.T @ (design * weight[:, None]))[:2, :2])
+def _information(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:
+    """(2, 2) expected information of (b0, b1)."""
+    hit, miss, density = logs_of_link(data.link, data.design @ place)
+    weight = (data.hits + data.misses) * np.exp(2.0 * density - hit - miss)
+    return np.asarray(data.design.T @ (weight[:, None] * data.design))
 
 
-def _checked(
-    size: ArrayLike, hit: ArrayLike, link: str, log_size: bool, bounded: Between
-) -> tuple[np.ndarray, np.ndarray]:
+def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tuple[np.ndarray, np.ndarray]:
     """x (n,) and hits (n,) as booleans, or the user's mistake."""
     sizes, hits = np.asarray(size, float), np.asarray(hit, float)
     if link not in LINKS:
         raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
-    if bounded not in BOUNDED:
-        raise UserError(f"bounded {bounded!r} is not known", legal=", ".join(BOUNDED))
     if sizes.ndim != 1 or sizes.shape != hits.shape:
         raise UserError(f"sizes {sizes.shape} and hits {hits.shape} differ in shape", legal="one hit for each size")
     if not np.isfinite(sizes).all():
@@ -355,7 +277,6 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
     return np.bincount(target)[target]
 
 
-METHODS = ("likelihood ratio", "wald", "profile")
 FARTHEST = 2.0**40
 """Largest distance from the estimate, in spreads of the sizes, at which a bound is looked for."""
 DIRECTIONS = 720
@@ -364,96 +285,66 @@ REACH = 10
 """Doublings of a distance at most, from 2 to 2000 standard errors."""
 
 
-def bound(
-    fit: HitMissFit,
-    pod: float = 0.9,
-    confidence: float = 0.95,
-    method: str = "likelihood ratio",
-    *,
-    design_effect: float = 1.0,
-) -> Bound:
+def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:
     """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
     ``design_effect``: what targets that come in clusters multiply the variance by; so it multiplies the criterion (Rao
     and Scott, Annals of Statistics 12 (1984), 46)."""
-    _check(pod, confidence, method)
-    if pod <= fit.curve.floor:
-        raise UserError(f"POD {pod:g} is under the fitted floor {fit.curve.floor:.3g}: every size reaches it")
-    if method == "wald":
-        x, why = _wald_bound(fit, pod, confidence, design_effect)
-    else:
-        x, why = _likelihood_bound(fit, pod, criterion(method, confidence) * design_effect * fit.repeats)
+    if not 0 < pod < 1:
+        raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
+    x, why = _likelihood_bound(fit, pod, criterion(confidence) * design_effect * fit.repeats)
     with np.errstate(over="ignore"):
         value = float(np.exp(x)) if fit.curve.log_size else x
     if not np.isfinite(value):
         why = f"not demonstrated: {why or 'the bound is beyond all numbers'}"
-        return Bound(pod, confidence, method, float("inf"), why)
-    return Bound(pod, confidence, method, value)
+        return Bound(pod, confidence, METHOD, float("inf"), why)
+    return Bound(pod, confidence, METHOD, value)
 
 
-def band(
-    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95, method: str = "likelihood ratio"
-) -> tuple[np.ndarray, np.ndarray]:
+def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper POD at ``sizes`` (n,), each one-sided at ``confidence`` as in `bound`, for drawing: the lower one
-    crosses 90 % at a90/95 to a part in 1e4. A fitted floor and ceiling are held at their estimates."""
-    _check(0.5, confidence, method)
+    crosses 90 % at a90/95 to a part in 1e4."""
     x = np.log(sizes) if fit.curve.log_size else np.asarray(sizes, float)
-    if method == "wald":
-        middle, v = fit.b0 + fit.b1 * x, fit.covariance
-        reach = float(stats.norm.ppf(confidence)) * np.sqrt(v[0, 0] + 2.0 * x * v[0, 1] + x**2 * v[1, 1])
-        low, high = middle - reach, middle + reach
-    else:
-        outline = _outline(fit, criterion(method, confidence) * fit.repeats)
-        predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
-        low, high = predictors.min(axis=0), predictors.max(axis=0)
-    between = fit.curve.ceiling - fit.curve.floor
-    low, high = (fit.curve.floor + between * link_cdf(fit.curve.link, edge) for edge in (low, high))
+    outline = _outline(fit, criterion(confidence) * fit.repeats)
+    predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
+    low, high = (link_cdf(fit.curve.link, edge) for edge in (predictors.min(axis=0), predictors.max(axis=0)))
     return low, high
 
 
-def largest_bound(fits: Sequence[HitMissFit], method: str, design_effects: Sequence[float] = ()) -> Bound:
+def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
     """Take the largest a90/95 over models; infinite where any of them has none. ``design_effects``: one a model."""
     effects = design_effects or [1.0] * len(fits)
-    bounds = (bound(fit, method=method, design_effect=of) for fit, of in zip(fits, effects, strict=True))
+    bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
     return max(bounds, key=lambda one: one.value)
 
 
-def widest_band(fits: Sequence[HitMissFit], sizes: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray]:
+def widest_band(fits: Sequence[HitMissFit], sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Envelope the models' bands at ``sizes`` (n,): the lower edge crosses 90 % at their `largest_bound`."""
-    low, high = zip(*(band(fit, sizes, method=method) for fit in fits), strict=True)
+    low, high = zip(*(band(fit, sizes) for fit in fits), strict=True)
     return np.min(low, axis=0), np.max(high, axis=0)
 
 
-def criterion(method: str, confidence: float) -> float:
-    """Largest 2 (llmax - ll) in the set: 3.841 for the likelihood ratio, 2.706 for the one-sided profile, at 95 %."""
-    share = confidence if method == "likelihood ratio" else 2.0 * confidence - 1.0
-    return float(stats.chi2.ppf(share, 1))
+def criterion(confidence: float) -> float:
+    """Largest 2 (llmax - ll) in the set: 3.841 at 95 %."""
+    if not 0.5 < confidence < 1:
+        raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")
+    return float(stats.chi2.ppf(confidence, 1))
 
 
 def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
     """The largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and why."""
     data, place, level = fit.data, fit.place, float(link_ppf(fit.curve.link, np.array(pod)))
-    share = (pod - fit.curve.floor) / (fit.curve.ceiling - fit.curve.floor)
-    # The curve's middle where floor or ceiling keep it from this POD.
-    z_best = fit.curve.mu + fit.curve.sigma * (float(link_ppf(fit.curve.link, np.array(share))) if 0 < share < 1 else 0)
-    z_best = (z_best - fit.centre) / fit.spread
-    top = float(data.value(place[:2]))
-    plain = replace(data, floor=0.0, ceiling=1.0)
-    flat = 2.0 * (top - flat_maximum(plain, level))
+    z_best = (fit.curve.mu + fit.curve.sigma * level - fit.centre) / fit.spread
+    top = float(data.value(place))
+    flat = 2.0 * (top - flat_maximum(data, level))
     if flat <= allowed:
         return float("inf"), f"a chance that does not grow with size fits too (ratio {flat:.2f} <= {allowed:.2f})"
-    low = 2.0 * (top - most_likely_below(data, place, fit.bounded, pod))
-    if low <= allowed:
-        return float("inf"), f"a ceiling of {pod:.0%} or less fits too (ratio {low:.2f} <= {allowed:.2f})"
 
     slope = place[1]
 
     def excess(z: float) -> float:
         """The root of the ratio, which grows about linearly with z, less that of the criterion."""
         nonlocal slope
-        if fit.bounded == "none":
-            value, slope = profile(plain, z, level, slope)
-        else:
-            value = bounded_profile(data, place, fit.bounded, z, pod)
+        value, slope = profile(data, z, level, slope)
         return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
 
     reach = 0.25
@@ -461,28 +352,13 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
         reach *= 2.0
         if reach > FARTHEST:
             return float("inf"), "the likelihood ratio set has no end"
-    exactness = 1e-10 if fit.bounded == "none" else 1e-6
-    z = optimize.brentq(excess, z_best, z_best + reach, xtol=exactness)
+    z = optimize.brentq(excess, z_best, z_best + reach, xtol=1e-10)
     return fit.centre + fit.spread * float(z), ""
-
-
-def _wald_bound(fit: HitMissFit, pod: float, confidence: float, design_effect: float) -> tuple[float, str]:
-    """The root of (b0 + b1 x - t)^2 = z^2 Var(b0 + b1 x) above the estimate; none where the slope may be 0."""
-    if fit.bounded != "none":
-        raise UserError("no Wald bound with a floor or a ceiling", legal="likelihood ratio, profile")
-    level, z2 = float(link_ppf(fit.curve.link, np.array(pod))), float(stats.norm.ppf(confidence)) ** 2
-    v = fit.covariance * design_effect
-    square = fit.b1**2 - z2 * v[1, 1]
-    if square <= 0:
-        return float("inf"), f"the slope is within {np.sqrt(z2):.3f} standard errors of 0"
-    half = fit.b1 * (fit.b0 - level) - z2 * v[0, 1]
-    constant = (fit.b0 - level) ** 2 - z2 * v[0, 0]
-    return float((-half + np.sqrt(max(half**2 - square * constant, 0.0))) / square), ""
 
 
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
-    data, best = fit.data, fit.place[:2]
+    data, best = fit.data, fit.place
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T
     try:
@@ -513,12 +389,3 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
         excess, (inside[crossed], outside[crossed]), args=(which[crossed],), tolerances={"xrtol": 1e-9, "fatol": 1e-9}
     ).x
     return np.asarray(best + outside[:, None] * step)
-
-
-def _check(pod: float, confidence: float, method: str) -> None:
-    if method not in METHODS:
-        raise UserError(f"bound by {method!r} is not known", legal=", ".join(METHODS))
-    if not 0 < pod < 1:
-        raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
-    if not 0.5 < confidence < 1:
-        raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")

@@ -11,14 +11,13 @@ import numpy as np
 from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import (
-    METHODS,
     NEAR_DEVIANCE,
-    Between,
+    Beyond,
     HitMissFit,
     bound,
     choose_model,
     fit_hit_miss,
-    floor_ceiling_test,
+    floor_ceiling_tests,
     largest_bound,
     near_models,
     widest_band,
@@ -34,9 +33,10 @@ LEAST_TARGETS = 60
 """MIL-HDBK-1823A: independent targets that a hit/miss study should have at least."""
 APART = 0.05
 """Share by which a90/95 of models that fit about equally well may differ without a warning."""
+DOUBTED = ": do not trust its limit"
 FEWEST_SITES = 5
 """Unflawed sites below which no law is fitted to their signals."""
-TESTED: dict[Between, str] = {
+TESTED: dict[Beyond, str] = {
     "floor": "a floor: hits by chance at any size",
     "ceiling": "a ceiling: misses at any size",
     "both": "floor and ceiling",
@@ -78,7 +78,6 @@ class PodStatement:
     model: str
     models: tuple[ModelRow, ...]
     bound: Bound
-    others: tuple[Bound, ...]
     independent: Bound | None
     sizes: np.ndarray
     lower: np.ndarray
@@ -98,18 +97,20 @@ class PodStatement:
 
     @property
     def doubts(self) -> list[str]:
-        """Return a warning where a90/95 of models that fit about equally well differ by more than `APART`."""
+        """Return warnings where a90/95 of models that fit about equally well differ by more than `APART`, and where the
+        data speak for a floor or a ceiling."""
+        doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         most = min(row.criterion for row in self.models) + NEAR_DEVIANCE * len(self.size) / self.targets
         limits = [row.bound.value for row in self.models if row.criterion <= most]
         if max(limits) <= (1 + APART) * min(limits):
-            return []
+            return doubts
         texts = [f"{one:.4g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
-        return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}"]
+        return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}", *doubts]
 
     def to_data(self) -> dict[str, Any]:
         """The statement as JSON's types; an infinite size becomes None, and ``why`` says so."""
         curve, names = self.curve, ("kind", "unit", "size_column", "response_column", "targets", "model")
-        of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma", "floor", "ceiling")}
+        of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
             {"model": row.name, self.criterion: finite(row.criterion), "a50": finite(row.a50), "a90": finite(row.a90)}
             | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
@@ -124,7 +125,6 @@ class PodStatement:
             "a50": finite(self.a50),
             "a90": finite(self.a90),
             "a90_95": _bound_data(self.bound),
-            "other_bounds": [_bound_data(one) for one in self.others],
             "if_every_inspection_were_a_target": None if self.independent is None else _bound_data(self.independent),
             "models": models,
             "numbers": {name: finite(value) for name, value in self.numbers.items()},
@@ -139,40 +139,32 @@ def state_hits(
     *,
     link: str | None = None,
     log_size: bool | None = None,
-    bounded: Between = "none",
-    method: str = "likelihood ratio",
     unit: str = "",
     tested: bool = True,
 ) -> PodStatement:
     """State the curve of hits and misses: of all links and sizes or their logarithms (of those that ``link``,
-    ``log_size`` leave) the fit with the least deviance, with a floor or ceiling where ``bounded``; bounds by all
-    `METHODS` that it has, ``method``'s first, each the largest over the `near_models` of those left. Of targets
-    inspected more than once also the limit as if every row had its own. ``tested``: for a floor and a ceiling, which
-    takes most of the time."""
+    ``log_size`` leave) the fit with the least deviance; its bound is the largest over the `near_models` of those left.
+    Of targets inspected more than once also the limit as if every row had its own. ``tested``: for hits by chance and
+    misses at any size, which takes most of the time."""
     from threadpoolctl import threadpool_limits
 
     # L-BFGS-B hands systems of four unknowns to LAPACK, whose threads wait for each other: 9 s, not 0.6 s, on two
     # busy cores.
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
-        tried = choose_model(size, hit, inspections=read.target, bounded=bounded)
+        tried = choose_model(size, hit, inspections=read.target)
         left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
         fit, near = left[0], near_models(left)
-        curve, notes, tests, independent = fit.curve, [*read.notes, *fit.notes], [], None
+        curve, notes, independent = fit.curve, [*read.notes, *fit.notes], None
         if fit.targets < fit.n:
             # A fit of its own, because where hits and misses separate the penalty counts targets.
-            axes = [(one.curve.link, one.curve.log_size, one.bounded) for one in near]
-            rows = [fit_hit_miss(size, hit, link=of, log_size=log, bounded=with_) for of, log, with_ in axes]
-            independent = largest_bound(rows, method)
-        if tested and bounded == "none" and fit.method == "ML":
-            model: dict[str, Any] = {"link": curve.link, "log_size": curve.log_size, "inspections": read.target}
-            tests = [floor_ceiling_test(size, hit, bounded=one, **model) for one in TESTED]
-        models = [(one, bound(one, POD, CONFIDENCE, method)) for one in tried]
-        others = [one for one in METHODS if one != method and (bounded == "none" or one != "wald")]
-        further = tuple(largest_bound(near, one) for one in others)
-        limit = largest_bound(near, method)
+            axes = [(one.curve.link, one.curve.log_size) for one in near]
+            independent = largest_bound([fit_hit_miss(size, hit, link=of, log_size=log) for of, log in axes])
+        tests = floor_ceiling_tests(fit) if tested else ()
+        models = [(one, bound(one, POD, CONFIDENCE)) for one in tried]
+        limit = largest_bound(near)
         sizes = drawn_sizes(size, curve.log_size, (curve.size_at(POD), limit.value))
-        lower, upper = widest_band(near, sizes, method)
+        lower, upper = widest_band(near, sizes)
 
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -180,22 +172,21 @@ def state_hits(
         notes.append(f"a90/95 = {limit.value:.4g} lies beyond the largest size inspected, {largest:.4g}")
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
-        said_p = f"(p = {likeliest.p_value:.2g}): see --bounded {likeliest.bounded}"
-        notes.append(f"the curve has no floor or ceiling, and the data speak for {TESTED[likeliest.bounded]} {said_p}")
+        speaks = f"the data speak for {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
+        notes.append(f"the curve has no floor or ceiling, and {speaks}{DOUBTED}")
     said = []
     for test in tests:
-        fitted = f"(floor {test.fit.curve.floor:.3f}, ceiling {test.fit.curve.ceiling:.3f})"
-        said.append((TESTED[test.bounded], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
+        fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
+        said.append((TESTED[test.beyond], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
     errors = np.sqrt(np.diag(fit.covariance)).tolist()
     numbers = {"b0": fit.b0, "b0's standard error": errors[0], "b1": fit.b1, "b1's standard error": errors[1]}
-    numbers |= {name: getattr(curve, name) for name in ("mu", "sigma", "floor", "ceiling")}
+    numbers |= {name: getattr(curve, name) for name in ("mu", "sigma")}
     numbers |= {"deviance": fit.deviance, "deviance of a constant": fit.null_deviance}
     numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
-    bounds = (limit, further, independent)
     drawn = (sizes, lower, upper)
-    return _statement(read, "hit/miss", unit, near, models, bounds, drawn, numbers, notes, said)
+    return _statement(read, "hit/miss", unit, near, models, (limit, independent), drawn, numbers, notes, said)
 
 
 def state_signals(
@@ -229,7 +220,7 @@ def state_signals(
     drawn = (sizes, *ahat_band(fit, sizes, CONFIDENCE))
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
-    kind, bounds = "signal against size", (limit, (), rows)
+    kind, bounds = "signal against size", (limit, rows)
     return _statement(read, kind, unit, (fit,), models, bounds, drawn, numbers, [*read.notes, *fit.notes], said)
 
 
@@ -239,22 +230,21 @@ def _statement(
     unit: str,
     fits: tuple[Any, ...],
     models: list[tuple[Any, Bound]],
-    bounds: tuple[Bound, tuple[Bound, ...], Bound | None],
+    bounds: tuple[Bound, Bound | None],
     drawn: tuple[np.ndarray, np.ndarray, np.ndarray],
     numbers: dict[str, float],
     notes: list[str],
     tests: list[tuple[str, float, str]],
 ) -> PodStatement:
     """The statement of the first of ``fits``, all of them among ``models`` (fits with their limits). ``bounds``: limit,
-    others, of rows."""
+    of rows."""
     fit: HitMissFit | AhatFit = fits[0]
 
     def name(one: HitMissFit | AhatFit) -> str:
         size = "ln size" if one.curve.log_size else "size"
         if isinstance(one, AhatFit):
             return f"{'ln signal' if one.log_signal else 'signal'} against {size}"
-        bounded = {"none": "", "both": ", floor and ceiling"}.get(one.bounded, f", {one.bounded}")
-        return f"{one.curve.link}, {size}{bounded}"
+        return f"{one.curve.link}, {size}"
 
     rows = [
         ModelRow(

@@ -29,7 +29,7 @@ from harness.evaluation.pod.curve import (
     penalised_maxima,
     slopes_of_link,
 )
-from harness.evaluation.pod.hit_miss import METHODS, largest_bound, widest_band
+from harness.evaluation.pod.hit_miss import METHOD, largest_bound, widest_band
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
@@ -393,7 +393,7 @@ def limit_of(
             effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
             effect, at_least_one = effects[0], [max(1.0, one) for one in effects]
             if max(at_least_one) > 1:
-                over_boards = largest_bound(statement.fits, METHODS[0], at_least_one)
+                over_boards = largest_bound(statement.fits, at_least_one)
         if apart.unit is not None:
             rows = (apart.size_mm, seen.hit, target_names(seen), apart.unit)
             units = over_units(*rows, statement.curve, over_boards)
@@ -407,7 +407,7 @@ def limit_of(
         of_a50 = of_a90 = np.full(draws, a90)
     else:
         a50 = a90 = np.nan
-        a90_95 = over_boards = Bound(POD, CONFIDENCE, METHODS[0], np.inf, f"not demonstrated: {why}")
+        a90_95 = over_boards = Bound(POD, CONFIDENCE, METHOD, np.inf, f"not demonstrated: {why}")
         of_a50 = of_a90 = np.full(draws, np.inf)
     rate_interval = UNKNOWN
     if targets.hits.sum() not in (0.0, targets.inspections.sum()):
@@ -507,7 +507,7 @@ def pod_at(limit: SetUpLimit, diameters_mm: Sequence[float]) -> tuple[SizeRow, .
     sizes = np.asarray(diameters_mm if seen.limit_of == "diameter" else (), float)
     of_curve = np.full((3, len(sizes)), np.nan)
     if limit.statement is not None and len(sizes):
-        of_curve = np.array([limit.statement.curve.pod(sizes), *widest_band(limit.statement.fits, sizes, METHODS[0])])
+        of_curve = np.array([limit.statement.curve.pod(sizes), *widest_band(limit.statement.fits, sizes)])
     low, high = seen.diameter_mm.min(initial=np.inf), seen.diameter_mm.max(initial=-np.inf)
     names, rows = target_names(seen), []
     for size, pod, lower, upper in np.vstack([sizes, of_curve]).T.tolist():
