@@ -30,6 +30,7 @@ from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
 from harness.vocabulary.geometry import INCH, MM
+from harness.vocabulary.path_names import in_words, names_of
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
@@ -149,9 +150,15 @@ def _write_study(
     outcome.failures += lost
     examples = [study_example(damage, outcome.thresholds) for damage in shown if not lost]
     write_tables(folder, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
-    title = experiment.config.title or experiment.config.name
-    write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title)
+    write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title_of(experiment))
     return study_parts(result)
+
+
+def title_of(experiment: Experiment) -> str:
+    """Return the title of an experiment's page: its own, and the axes."""
+    axes = list(names_of(experiment.data.get("sweep") or {}).values())
+    by = ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
+    return (experiment.config.title or in_words(experiment.config.name)) + by
 
 
 def _write_report(
@@ -162,9 +169,8 @@ def _write_report(
     from harness.report.sections import final_tables
 
     write_tables(folder, summaries(tables, outcome.examples), provenance)
-    title = experiment.config.title or experiment.config.name
-    target = experiment.config.simulated.target.name
-    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, target)
+    title, facts = title_of(experiment), experiment.data
+    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, facts)
     return final_tables(tables)
 
 

@@ -105,11 +105,6 @@ def folded(tables: Sequence[tuple[str, Markup]]) -> list[Markup]:
     return [fold(title, content, is_open=not place) for place, (title, content) in enumerate(tables)]
 
 
-def links(targets: Iterable[tuple[str, str]]) -> Markup:
-    """Links to (words, file)."""
-    return joined((tag("a", words, href=file) for words, file in targets), " ")
-
-
 def command_of(command: str) -> list[Markup]:
     """The command that made a page."""
     return [subheading("Command"), tag("pre", command)]

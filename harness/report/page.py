@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 
 from harness.evaluation.set_ups import LIMIT_RULE, EffectCosts, SwitchCost, compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import (
@@ -69,6 +68,31 @@ def errors_figure(rows: pd.DataFrame) -> str:
 
     alt = "Error of the measured diameter and of the distance from the largest hole, with one standard deviation."
     return blocks.svg("errors", (10, 4.2), alt, draw)
+
+
+def rates_figure(main: pd.DataFrame) -> str:
+    """The share of repeats that detected each hole against its diameter, with Wilson intervals, a line for each number
+    of frames."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for (frames, rows), colour, marker in zip(main.groupby("frames"), COLOURS, MARKERS, strict=False):
+            by_size = rows.groupby("true_diameter_mm")[["rate", "rate_low", "rate_high"]].mean()
+            axes.fill_between(by_size.index, by_size["rate_low"], by_size["rate_high"], color=colour, alpha=0.1, lw=0)
+            style: dict[str, Any] = {
+                "marker": marker,
+                "ms": 4,
+                "color": colour,
+                "label": many(int(str(frames)), "frame"),
+            }
+            axes.plot(by_size.index, by_size["rate"], **style)
+        axes.axhline(0.5, color=blocks.GREY, lw=0.8, ls=":")
+        axes.set(xlabel="true diameter (mm)", ylabel="share of repeats that detected it", ylim=(-0.03, 1.03))
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+    return blocks.svg(
+        "rates", (7.0, 4.2), "Detection rate of each hole against its diameter, by number of frames.", draw
+    )
 
 
 def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
@@ -166,11 +190,6 @@ CAMERA = (
     *("set-up", "frames", "mm per pixel", "valid", "one frame (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
     "surface noise (mm)",
 )
-CAMERA_NOTE = (
-    "From hole-free runs, but the surface. One frame: standard deviation of its temporal noise, displacements of whole "
-    "frames taken out; average: scatter over repeats, likewise. Offset and pattern: mean and spread over probe pixels "
-    "of what all repeats share. Surface: robust deviation from the fitted surface on undamaged face."
-)
 
 
 @dataclass(frozen=True)
@@ -218,46 +237,30 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
         figures["limits"] = limits_figure(compared, layout, frames)
     if not costs and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
         figures["sights"] = sights_figure(sights)
+    figures |= {"effects": effects_figure(costs)} if costs else {}
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
-    body = posterior_section(posterior) if posterior is not None else []
-    body += [blocks.heading("Holes found"), sections.set_ups_grid(compared).html()]
-    if "limits" in figures:
-        body.append(blocks.figure(figures, "limits", "The smallest diameter from which on every hole is found."))
-    body += _effects_section(costs)
-    if "sights" in figures:
-        at = f" at {layout.columns[middle]}" if layout.columns else ""
-        caption = (
-            f"Distance behind (+) or before (−) the fitted surface{at}, most frames, first damaged repeat. Circle: the "
-            "true rim. Dots: detected pixels. Grey: no valid point. Linear within ±1 mm, logarithmic beyond."
-        )
-        body += [blocks.heading("The same hole, as each sees it"), blocks.figure(figures, "sights", caption)]
-    body += [
-        blocks.heading("Sizes and positions"),
-        blocks.paragraph(
-            "Over all single measurements of the holes found: mean error ± standard deviation (number), in mm. "
-            "Positions are distances from the largest hole. A set-up that finds small holes is judged by them too."
-        ),
-        SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
-        blocks.heading("What each camera gives"),
-        SET_UPS.grid(shown, only=CAMERA).html(),
-        blocks.note(CAMERA_NOTE),
-        *sections.claims_section("The thesis' claim", [verdict] if verdict else []),
-    ]
     everything = [str(name) for name in tables.variants["variant"]]
-    body += sections.varied_section(tables, compare_set_ups(tables, summary, everything, half_sizes=False), frames)
+    everywhere = compare_set_ups(tables, summary, everything, half_sizes=False)
     calls = false_calls(tables.runs)
     calls = calls[(calls["role"] == "damaged") & calls["variant"].isin(variants) & calls["frames"].isin(frames)]
-    body += [
-        blocks.heading("Thresholds and false calls"),
-        blocks.note(sections.CALLS_NOTE),
-        FALSE_CALLS.grid(sections.records(calls)).html(),
-    ]
-    body += blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs))
     rule = "Each set-up has hole-free runs and a threshold of its own."
-    under = sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule)
-    guesses = about.provenance.get("guesses", ())
-    answer = set_ups_answer(compared, layout, costs, verdict) if posterior is None else borne_out_if(posterior)
-    return blocks.page(about.title, answer, body, [under], guesses)
+    return sections.sweep_page(
+        "set_ups.html",
+        tables,
+        about,
+        set_ups_answer(compared, layout, costs, verdict) if posterior is None else borne_out_if(posterior),
+        figures,
+        rule=sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule),
+        posterior=blocks.joined(posterior_section(posterior)) if posterior is not None else "",
+        found=sections.set_ups_grid(compared).html(),
+        costs=_costs_grid(costs).html() if costs else "",
+        sights_at=f" at {layout.columns[middle]}" if layout.columns else "",
+        errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
+        cameras=SET_UPS.grid(shown, only=CAMERA).html(),
+        claims=sections.claims_section("The thesis' claim", [verdict] if verdict else []),
+        varied=sections.varied_section(tables, everywhere, frames),
+        calls=FALSE_CALLS.grid(sections.records(calls)).html(),
+    )
 
 
 def set_ups_answer(
@@ -289,9 +292,7 @@ def _averaged(frames: int) -> str:
     return "one frame" if frames == 1 else f"{frames} averaged frames"
 
 
-def _effects_section(costs: Sequence[EffectCosts]) -> list[Markup]:
-    if not costs:
-        return []
+def _costs_grid(costs: Sequence[EffectCosts]) -> Grid:
     places = [", ".join(part for part in (each.place, many(each.frames, "frame")) if part) for each in costs]
     heads = ("effect", *(f"{place}: {which}" for place in places for which in ("alone", "on top of all others")))
     rows = [
@@ -299,19 +300,7 @@ def _effects_section(costs: Sequence[EffectCosts]) -> list[Markup]:
         for at, one in enumerate(costs[0].effects)
     ]
     rows.append(["all together", *(cell for each in costs for cell in (cost_text(each.together), "–"))])
-    return [
-        blocks.heading("What each effect costs"),
-        blocks.paragraph(
-            "The loss is the change of the 50 % size when an effect goes on: alone, and on top of all others. The same "
-            "noise and holes stand behind both sides. Without noise the rounding of the output is the only error left."
-        ),
-        blocks.figure(
-            {"effects": effects_figure(costs)},
-            "effects",
-            "Error bars are 95 % bootstrap intervals over holes of one size and over repeats, paired.",
-        ),
-        Grid.of(heads, rows).html(),
-    ]
+    return Grid.of(heads, rows)
 
 
 def write_report(
@@ -321,13 +310,15 @@ def write_report(
     provenance: Mapping[str, Any],
     experiment_yaml_text: str,
     title: str,
-    target: str = "",
+    facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write ``folder/report.html`` and return its path: the page of one set-up, that of several side by side, or that
     of maps, with a page beside it for each map of ``examples`` that turns in the browser. ``provenance``: see
-    `harness.report.blocks.closing`. Claims of the thesis are scored where the ``target`` is "thesis". The same input
-    gives the same bytes. Raises UserError where the folder cannot be written."""
-    about = sections.About(provenance, experiment_yaml_text, title, target == "thesis")
+    `harness.report.blocks.closing`; ``facts``: the resolved experiment as plain data. Claims of the thesis are scored
+    where the target is the thesis'. The same input gives the same bytes. Raises UserError where the folder cannot be
+    written."""
+    is_thesis = ((facts or {}).get("source", {}).get("target") or {}).get("name") == "thesis"
+    about = sections.About(provenance, experiment_yaml_text, title, is_thesis, facts or {})
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
     if len(tables.registrations):
@@ -348,66 +339,28 @@ def report_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: s
     frames = sorted(int(n) for n in main["frames"].unique())
     noise = noise_against_frames(tables.probes[tables.probes["variant"] == MAIN])
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
-    figures: dict[str, str] = {}
-    if frames:
-        figures["errors"] = errors_figure(main[main["frames"] == frames[-1]])
-    if clouds:
-        figures["residual"] = residual_figure(clouds)
-    if len(noise) and (noise["temporal_rms_mm"] > 0).all():
-        figures["noise"] = noise_figure(noise)
+    last = main[main["frames"] == main["frames"].max()]
+    figures = {"rates": rates_figure(main), "errors": errors_figure(last)} if frames else {}
+    figures |= {"residual": residual_figure(clouds)} if clouds else {}
+    figures |= {"noise": noise_figure(noise)} if len(noise) and (noise["temporal_rms_mm"] > 0).all() else {}
     verdicts = score_claims(tables, MAIN, examples, summary) if about.with_claims else []
     calls = false_calls(tables.runs)
     variants = [MAIN, *(str(name) for name in tables.variants["variant"] if name != MAIN)]
-    body = [
-        blocks.heading("Holes against frames"),
-        blocks.paragraph(
-            "Detections of trials, with the 95 % Wilson interval of the rate beneath. The bluer, the more often the "
-            "hole was detected."
-        ),
-        sections.holes_grid(summary).html(),
-        blocks.heading("Sizes and positions"),
-        blocks.figure(
-            figures,
-            "errors",
-            "With the most frames, over the trials that detected the hole: mean less truth ± one standard deviation. "
-            "Extent: of the thresholded cluster. Model: a blurred hole fitted to the residuals.",
-        ),
-        SUMMARY.grid(sections.records(main[main["frames"] == main["frames"].max()])).html(),
-        blocks.note(
-            "Mean ± one standard deviation over the repeats, which share one fixed pattern: another unit of the camera "
-            "differs by more. Depth: along the optical axis to the floor or to what stands behind the hole."
-        ),
-        blocks.heading("Range residual"),
-        blocks.figure(
-            figures,
-            "residual",
-            "Distance behind (+) or before (−) the fitted surface, linear within ±1 mm and logarithmic beyond. Magenta:"
-            " pixels of findings. Rings: the true holes, dashed where not found. Grey: no valid point, or outside the "
-            "crop. These are single clouds; the rates above are over all repeats.",
-        ),
-        blocks.heading("Noise against frames"),
-        blocks.figure(
-            figures,
-            "noise",
-            "Over the probe pixels of the undamaged face: the temporal noise is the scatter over repeats, "
-            "displacements of whole clouds taken out, the systematic error is what every repeat shares.",
-        ),
-        NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
-        *sections.claims_section("The thesis' claims", verdicts),
-        *sections.varied_section(
-            tables,
-            compare_set_ups(tables, summary, variants, half_sizes=False),
-            (*frames[:1], *frames[-1:]),
-            of=MAIN,
-        ),
-        blocks.heading("False calls"),
-        blocks.note(sections.CALLS_NOTE),
-        FALSE_CALLS.grid(sections.records(calls[calls["variant"] == MAIN]), heads={"set-up": ""}).html(),
-        *blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs)),
-    ]
-    repeats = int(main["n"].max()) if len(main) else 0
-    guesses = about.provenance.get("guesses", ())
-    return blocks.page(about.title, answer_sentence(main, verdicts), body, [sections.rule_note(repeats)], guesses)
+    compared = compare_set_ups(tables, summary, variants, half_sizes=False)
+    return sections.sweep_page(
+        "sweep.html",
+        tables,
+        about,
+        answer_sentence(main, verdicts),
+        figures,
+        rule=sections.rule_note(int(main["n"].max()) if len(main) else 0),
+        holes=sections.holes_grid(summary).html(),
+        sizes=SUMMARY.grid(sections.records(last)).html(),
+        noise=NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
+        claims=sections.claims_section("The thesis' claims", verdicts),
+        varied=sections.varied_section(tables, compared, (*frames[:1], *frames[-1:]), of=MAIN),
+        calls=FALSE_CALLS.grid(sections.records(calls[calls["variant"] == MAIN]), heads={"set-up": ""}).html(),
+    )
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:

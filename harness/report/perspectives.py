@@ -8,6 +8,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from harness.evaluation import maps
 from harness.evaluation.set_ups import set_ups_of
@@ -16,6 +17,7 @@ from harness.report import blocks, sections
 from harness.report.clouds import MappedExample
 from harness.report.view3d import KINDS, SEVERAL, VIEW_COLOURS
 from harness.tables.outputs import MAPS
+from harness.tables.schema import Table
 from harness.tables.text import many
 from harness.tables.trials import REGISTRATION_ERRORS, SET_UPS, ResultTables
 from harness.thesis.claims import Verdict
@@ -25,17 +27,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-MOST_CLOUDS = 5
+MOST_CLOUDS = 3
 LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That stays open"}
 MAPS_SHOWN = (
     *("registration", "merge", "views", "found", "from (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
     *("surface noise (mm)", "threshold (mm)", "false calls", "views left out", "time (s)"),
-)
-MAPS_NOTE = (
-    "Average: scatter over repeats at fixed places of the hole-free board, displacements of whole maps taken out; "
-    "offset and pattern are what all repeats share. Surface noise: robust deviation from the fitted surface on "
-    "undamaged face. Time: seconds from the views' clouds to the map, median of the runs on the damaged board; "
-    "registrations that set-ups share count where they were made. Views left out: mean number a run leaves out."
 )
 
 
@@ -54,66 +50,54 @@ def perspectives_html(tables: ResultTables, examples: Sequence[MappedExample], a
         figures["tre"] = tre_figure(own, frames[::-1])
     if several:
         figures["merged"] = merged_figure(several[:MOST_CLOUDS])
-    body = [
-        *sections.claims_section("The thesis' claims and its proposal", verdicts),
-        blocks.heading("Holes found"),
-        blocks.paragraph("By the least and the most frames a view; +: undecided."),
-        sections.ways_grid(compared).html(),
-        blocks.heading("Registration error"),
-        blocks.paragraph(
-            "The target registration error: how far places on the board lie from where they should, root mean square "
-            "over the board, against the truth. What a camera that ranges too far displaces counts, though it does not "
-            "blur the map. A registration that failed is found out without the truth, its view left out of the map."
-        ),
-        blocks.figure(
-            figures,
-            "tre",
-            "Each registration of a view to the first. The prediction is what the method's own covariance says: noise, "
-            "no error that a whole view shares.",
-        ),
-        *blocks.folded(
-            [
-                (maps.frames_text(n), REGISTRATION_ERRORS.grid(sections.records(errors[errors["frames"] == n])).html())
-                for n in frames
-            ]
-        ),
-        blocks.note(
-            "Errors in mm of those that did not fail, both boards. Ratio: actual over predicted, above 1 too sure of "
-            "itself, bootstrap over repeats. Before: median error of the nominal pose."
-        ),
-        blocks.heading("Merged clouds"),
-        blocks.figure(
-            figures,
-            "merged",
-            "Points from the front, thinned out, in the colour of their view. Rings: the true holes, dashed where this "
-            "map shows none. Crosses: findings that are no hole.",
-        ),
-    ]
-    if files := map_files(examples):
-        targets = blocks.links((map_text(example), name) for name, example in files.items())
-        body.append(blocks.paragraph("The same maps, to turn with the mouse: ", targets))
-    body += [
-        blocks.heading("What each map gives"),
-        *blocks.folded(
-            [
-                (
-                    maps.frames_text(n),
-                    SET_UPS.grid(sections.records(set_ups[set_ups["frames"] == n]), only=MAPS_SHOWN).html(),
-                )
-                for n in frames
-            ]
-        ),
-        blocks.note(MAPS_NOTE),
-        *sections.varied_section(tables, compared),
-        *blocks.closing(about.provenance, about.experiment_yaml_text, sections.left_out(tables.runs)),
-    ]
-    under = sections.rule_note(
-        int(set_ups["repeats"].max()) if len(set_ups) else 0,
+    if len(set_ups):
+        figures["found"] = found_figure(sections.records(set_ups[set_ups["frames"] == frames[0]]))
+    rule = (
         "Each set-up has hole-free runs and a threshold of its own. The same frames feed every set-up; repeats vary "
-        "the error of the nominal poses too. Of a single view all ways of registering are the same.",
+        "the error of the nominal poses too. Of a single view all ways of registering are the same."
     )
-    return blocks.page(
-        about.title, answer_sentence(cases, verdicts), body, [under], about.provenance.get("guesses", ())
+
+    def by_frames(table: Table, rows: pd.DataFrame, only: Sequence[str] = ()) -> Markup:
+        grids = [(n, table.grid(sections.records(rows[rows["frames"] == n]), only=only).html()) for n in frames]
+        return blocks.joined(blocks.folded([(maps.frames_text(n), grid) for n, grid in grids]))
+
+    return sections.sweep_page(
+        "views.html",
+        tables,
+        about,
+        answer_sentence(cases, verdicts),
+        figures,
+        rule=sections.rule_note(int(set_ups["repeats"].max()) if len(set_ups) else 0, rule),
+        claims=sections.claims_section("The thesis' claims and its proposal", verdicts),
+        ways=sections.ways_grid(compared).html(),
+        errors=by_frames(REGISTRATION_ERRORS, errors),
+        maps=[(name, map_text(example)) for name, example in map_files(examples).items()],
+        each=by_frames(SET_UPS, set_ups, MAPS_SHOWN),
+        varied=sections.varied_section(tables, compared),
+    )
+
+
+def found_figure(rows: Sequence[sections.Row]) -> str:
+    """The number of holes found against the number of views, a line for each way of registering and merging."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        ways = dict.fromkeys((row["registration"], row["merge"]) for row in rows)
+        for number, way in enumerate(ways):
+            own = sorted(
+                (row["views"], len(row["found"])) for row in rows if (row["registration"], row["merge"]) == way
+            )
+            colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
+            shift = 0.04 * (number - len(ways) / 2)  # so that equal counts stay apart
+            views, counts = np.array(sorted(own), float).T
+            label = maps.label_of(method_text(way[0]), way[1])
+            axes.plot(views + shift, counts, marker=marker, ms=5, lw=1.2, color=colour, label=label)
+        axes.set(xlabel="views", ylabel=f"holes found, of {max(row['holes'] for row in rows)}")
+        axes.set_xticks(sorted({row["views"] for row in rows}))
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+    return blocks.svg(
+        "found", (7.0, 4.4), "Number of holes found against the number of views, by way of merging.", draw
     )
 
 

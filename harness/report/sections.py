@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
 from harness.evaluation.maps import compare_maps, label_of
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.study.result import conditions_of
 from harness.evaluation.summary import MAIN, found_rule, summarise_holes
-from harness.report.blocks import heading, note, paragraph
+from harness.report.blocks import closing, heading, joined, note, paragraph, template
+from harness.report.scene import scene_svg
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
 from harness.tables.trials import CLAIMS, MARKS, SET_UPS, ResultTables
@@ -24,12 +27,23 @@ Row = Mapping[str, Any]
 
 class About(NamedTuple):
     """Title and origin of a report: ``provenance`` as of `harness.report.blocks.closing`, and the resolved experiment.
-    ``with_claims``: whether the target is the thesis' own."""
+    ``with_claims``: whether the target is the thesis' own; ``facts``: the resolved experiment as plain data."""
 
     provenance: Mapping[str, Any]
     experiment_yaml_text: str
     title: str
     with_claims: bool = False
+    facts: Mapping[str, Any] = MappingProxyType({})
+
+
+def sweep_page(
+    name: str, tables: ResultTables, about: About, answer: str, figures: Mapping[str, str], **parts: Any
+) -> str:
+    """Return the page of a sweep by the template ``name``: what all have in common, and its own ``parts``."""
+    told = {"title": about.title, "answer": answer, "warnings": about.provenance.get("guesses", ()), "figures": figures}
+    told |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts), "calls_note": CALLS_NOTE}
+    end = closing(about.provenance, about.experiment_yaml_text, left_out(tables.runs))
+    return template(name).render(**told, closing=joined(end), **parts)
 
 
 RULES_NOTE = (
@@ -95,9 +109,7 @@ VARIED = Table(
 )
 
 
-def varied_section(
-    tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = ""
-) -> list[Markup]:
+def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = "") -> Markup:
     """The sensitivity study: each variation beside the set-up that it changes, else beside ``of``, with as many frames
     or else the most. ``compared``: of `compare_set_ups`; ``frames``: those to show, none for all."""
     there: dict[str, list[Row]] = {}
@@ -112,18 +124,18 @@ def varied_section(
             alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
             rows.append(Varied(variant, one, next(iter([*alike, *others[-1:]]), None)))
     if not rows:
-        return []
+        return Markup("")
     said = (
         "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
-    return [heading("If facts were otherwise"), paragraph(said), VARIED.grid(rows).html()]
+    return joined([heading("If facts were otherwise"), paragraph(said), VARIED.grid(rows).html()])
 
 
-def claims_section(title: str, verdicts: Sequence[Verdict]) -> list[Markup]:
+def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
     """A heading and the table of claims; nothing without verdicts. Pages of other targets hold none of it."""
     rows = [vars(verdict) for verdict in verdicts]
-    return [heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows).html()] if rows else []
+    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows).html()] if rows else [])
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
