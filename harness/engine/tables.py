@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from sys import intern
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,10 @@ def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...],
             else:
                 kept = [np.array(counts, np.int32) for counts in column]
             column = pd.Series(kept, dtype=object)
-        elif column.dtype == object and not column.map(lambda value: isinstance(value, str)).any():
+        elif column.dtype == object and column.map(lambda value: isinstance(value, str)).any():
+            # texts of all records that are alike are one in memory
+            column = column.map(lambda value: intern(value) if isinstance(value, str) else value)
+        elif column.dtype == object:
             column = column.astype(float)
         found[str(name)] = column.array.copy()
     return found
