@@ -103,7 +103,7 @@ def test_the_page_escapes_and_stands_an_interval_below_its_estimate() -> None:
 
 
 def test_estimates_as_text() -> None:
-    assert Estimate(3.2, 2.9, 3.6).text() == "3.20 (2.90 to 3.60)"
+    assert Estimate(3.2, 2.9, 3.6).text() == "3.2 (2.9 to 3.6)"
     assert Estimate(20.0, 8.0, np.inf, most=9.0).text() == ">\u00a09 (8.00 to >\u00a09)"
     assert Estimate(20.0, 12.0, np.inf, most=9.0).text() == ">\u00a09"
     assert Estimate(2.05, at_most=True).text() == "≤\u00a02.05"

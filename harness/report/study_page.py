@@ -230,7 +230,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
 
     return svg(
         name,
-        (7.0, 3.6 + 0.13 * len(shown)),
+        (7.0, 4.4 + 0.13 * len(shown)),
         f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says.",
         draw,
     )
