@@ -146,22 +146,6 @@ def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, model: dict) -
     assert np.all(said.curve.pod(said.sizes) <= said.upper + 1e-9)
 
 
-@pytest.mark.parametrize(("targets", "seed"), [(60, 1), (60, 4), (400, 1)])
-def test_models_that_differ_in_the_limit_are_warned_of_first(
-    targets: int, seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """By more than 5 % between those that fit about equally well; with many targets they do not differ as much."""
-    sizes = np.linspace(0.5, 12.0, targets)
-    file = table(tmp_path / "a.csv", size=sizes, hit=hits(sizes, seed))
-    assert main([str(file), "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
-    near = [row["a90_95"]["size"] for row in stated(tmp_path)["models"] if row["in_a90_95"]]
-    ratio = max(near) / min(near)
-    assert (ratio > 1.05) == (targets == 60)
-    told = f"models that fit about equally well differ by {100 * (ratio - 1):.0f} % in a90/95"
-    for text in (capsys.readouterr().out.splitlines()[0], (tmp_path / "pod.html").read_text()):
-        assert (f"warning: {told}" in text) == (targets == 60)
-
-
 def test_a_ceiling_that_the_data_ask_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A fifth of the targets is hidden and never found: the first line says so."""
     sizes = np.linspace(0.5, 12.0, 200)
@@ -172,7 +156,7 @@ def test_a_ceiling_that_the_data_ask_for(tmp_path: Path, capsys: pytest.CaptureF
     ceiling = next(one for one in stated(tmp_path)["tests"] if one["test"].startswith("a ceiling"))
     assert ceiling["p"] < 0.01
     said = capsys.readouterr().out
-    assert said.startswith("warning: the curve has no floor or ceiling, and the data speak for ")
+    assert "warning: the curve has no floor or ceiling, and the data speak for " in said.partition(str(file))[0]
     assert "warning: the curve has no floor or ceiling" in (tmp_path / "pod.html").read_text()
 
 
