@@ -71,16 +71,14 @@ def test_example_3_gives_the_handbooks_digits(example3: list[np.ndarray]) -> Non
     assert (round(fit.deviance), round(fit.null_deviance)) == (77, 167)
 
 
-@pytest.mark.parametrize("bounded", ["none", "both"])
-def test_targets_inspected_unequally_often_count_once_each(example3: list[np.ndarray], bounded: str) -> None:
+def test_targets_inspected_unequally_often_count_once_each(example3: list[np.ndarray]) -> None:
     """Rows of every third target three times: the same curve and bound as of each once."""
     size, hit = example3
     times = np.where(np.arange(len(size)) % 3 == 0, 3, 1)
-    once = fit_hit_miss(size, hit, bounded=bounded)
+    once = fit_hit_miss(size, hit)
     often = fit_hit_miss(
         *(np.repeat(each, times) for each in (size, hit)),
         inspections=np.repeat(np.arange(len(size)), times),
-        bounded=bounded,
     )
     assert (often.targets, often.n) == (len(size), times.sum())
     assert "1 to 3 inspections a target" in often.notes[-1]
