@@ -11,7 +11,7 @@ from harness.report.blocks import template
 from harness.vocabulary.path_names import camera_title, value_text
 
 BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_mm")
-"""Where the declared targets say how far behind them a surface stands."""
+"""Paths that say how far behind a declared target a surface stands."""
 
 
 def scene_svg(facts: Mapping[str, Any]) -> Markup:

@@ -336,7 +336,7 @@ class StudyResult:
 
     @property
     def conditions(self) -> str:
-        """What all set-ups have in common, in one line."""
+        """Return what all set-ups have in common, in one line."""
         return conditions_of(self.facts, self.limits)
 
 
