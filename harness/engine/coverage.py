@@ -171,8 +171,8 @@ def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int,
             facts.append((*sizes_mm, *seen, max(float(square), 0.0) ** 0.5, sum(hits), len(hits)))
     plan_mm, depth_mm, *seen, strength, found, inspections = np.array(facts).T
     by_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
-    named = ("depth", depth_mm) if by_depth else (damage.size_of, plan_mm)
-    return Damages(*named, Seen(*seen), strength, found, inspections)
+    word, size_mm = ("depth", depth_mm) if by_depth else (damage.size_of, plan_mm)
+    return Damages(word, size_mm, Seen(*seen), strength, found, inspections)
 
 
 def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
