@@ -40,7 +40,8 @@ def sweep_page(
     name: str, tables: ResultTables, about: About, answer: str, figures: Mapping[str, str], **parts: Any
 ) -> str:
     """Return the page of a sweep by the template ``name``: what all have in common, and its own ``parts``."""
-    told = {"title": about.title, "answer": answer, "warnings": about.provenance.get("warnings", ()), "figures": figures}
+    warnings = about.provenance.get("warnings", ())
+    told = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
     told |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts), "calls_note": CALLS_NOTE}
     end = closing(about.provenance, about.experiment_yaml_text, left_out(tables.runs))
     return template(name).render(**told, closing=joined(end), **parts)
