@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-MOST_CLOUDS = 3
+MOST_CLOUDS = 2
 LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That stays open"}
 MAPS_SHOWN = (
     *("registration", "merge", "views", "found", "from (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
@@ -92,7 +92,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
             views, counts = np.array(sorted(own), float).T
             label = maps.label_of(method_text(way[0]), way[1])
             axes.plot(views + shift, counts, marker=marker, ms=5, lw=1.2, color=colour, label=label)
-        axes.set(xlabel="views", ylabel=f"holes found, of {max(row['holes'] for row in rows)}")
+        most = max(row["holes"] for row in rows)
+        axes.set(xlabel="views", ylabel=f"holes found, of {most}", ylim=(-0.3, most + 0.3))
         axes.set_xticks(sorted({row["views"] for row in rows}))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
