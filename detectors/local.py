@@ -86,8 +86,8 @@ class LocalEvidence(Evidence):
     cell: np.ndarray = None  # type: ignore[assignment]
 
 
-class Picture(NamedTuple):
-    """What `LocalDetector.scored` judges: the surface, each point's cell (h, w) as in `LocalEvidence`, and
+class LocalPicture(NamedTuple):
+    """Input of `LocalDetector.scored`: the surface, each point's cell (h, w) as in `LocalEvidence`, and
     ``residuals``, its arguments."""
 
     ground: Background
@@ -105,7 +105,7 @@ class LocalDetector:
     def __init__(self, settings: LocalConfig) -> None:
         self.settings = settings
 
-    def picture(self, cloud: Cloud, pixels: int = 1) -> Picture:
+    def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
         """Return the residuals of the crop on a grid, of an organised cloud the means over squares of so many
         ``pixels`` a side. Raises UserError on an empty crop and where no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
@@ -126,7 +126,7 @@ class LocalDetector:
         share, weights = share / typical, (weights / typical).reshape(shape).astype(np.float32)
         sums = np.bincount(place, share * ground.residual_m[judged], weights.size).reshape(shape)
         residuals = sums / np.maximum(weights, 1e-12), weights, rounding_variances(cloud, judged)
-        return Picture(ground, cell, residuals)
+        return LocalPicture(ground, cell, residuals)
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop. Raises UserError on an empty crop and where no surface can be fitted."""

@@ -38,7 +38,7 @@ from pydantic import model_validator
 
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, Picture, local_sigma
+from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, LocalPicture, local_sigma
 from detectors.masks import grown
 from detectors.missing import missing_evidence
 from detectors.noise import median_of
@@ -126,7 +126,7 @@ class MatchedDetector(LocalDetector):
         signed.ravel()[evidence.cell[there]] = np.copysign(score[there], signed.ravel()[evidence.cell[there]])
         return replace(evidence, score=score, signed=signed)
 
-    def picture(self, cloud: Cloud, pixels: int = 1) -> Picture:
+    def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
         """Return the residuals on a grid in which noise reaches no farther than through a camera's own window: depth
         that was upsampled is no sharper than its camera's pixels."""
         return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / len(WINDOW))))

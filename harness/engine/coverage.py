@@ -214,7 +214,7 @@ def _board_learnt(
 
 
 def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
-    """How the patches of an undamaged part are seen and judged."""
+    """Return how the patches of an undamaged part are seen and judged."""
     set_up = load_set_up(view.set_ups[0])
     _, _, deviation_m = _residuals(view, point, seed)
     there = transform_points(set_up.T_camera_board, patches.points_m)

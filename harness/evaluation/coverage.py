@@ -62,7 +62,7 @@ class Damages:
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """How damage shows and is found. ``index``: d' found nine times in ten; ``scatter``: root mean square of the
+    """Law by which damage shows and is found. ``index``: d' found nine times in ten; ``scatter``: root mean square of the
     logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and least cosine, ``steepest``, of the
     ``damages`` inspected."""
 
@@ -76,7 +76,7 @@ class Findable:
 
     @property
     def said(self) -> str:
-        """What was learnt, in a sentence."""
+        """Return what was learnt, in a sentence."""
         return (
             f"Learnt from {self.damages} damages, whose strength scatters by {100 * self.scatter:.0f} % about what "
             f"size, angle and distance say; found nine times in ten from a d' of {self.index:.3g} on."

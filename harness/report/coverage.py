@@ -48,7 +48,7 @@ def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: fl
 
 
 def warnings_of(found: Findable, seen: Mapping[Any, Seen]) -> list[str]:
-    """What makes the figures unreliable, in sentences."""
+    """Return what makes the figures unreliable, in sentences."""
     said = ["damage of one size shows with very different strength: limits are rough"] if found.scatter > 0.5 else []
     if unseen := sum(bool(np.isinf(each.deviation_m).all()) for each in seen.values()):
         said.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
