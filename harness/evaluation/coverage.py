@@ -63,8 +63,8 @@ class Damages:
 @dataclass(frozen=True, eq=False)
 class Findable:
     """Law by which damage shows and is found. ``index``: d' found nine times in ten; ``scatter``: root mean square of
-    the logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and least cosine, ``steepest``, of the
-    ``damages`` inspected."""
+    the logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and least cosine, ``steepest``, of
+    the ``damages`` inspected."""
 
     size_of: str
     coefficients: np.ndarray
