@@ -131,7 +131,8 @@ def test_it_finds_the_hole_and_writes_everything(
 
 def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert detect.main([str(capture), "--out", str(out), "--threshold", "6", *NO_BLUR]) == 0
+    local = ("--detector", "local")  # matched filters find the hole too wide for their model and measure its contour
+    assert detect.main([str(capture), "--out", str(out), "--threshold", "6", *local, *NO_BLUR]) == 0
     told = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
     (finding,) = told["findings"]
     row = rows_of(out / "findings.csv")[0]
@@ -178,7 +179,9 @@ def test_the_picture_is_a_picture(capture: Path, tmp_path: Path) -> None:
 def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
-    (row,) = rows_of(tmp_path / "out" / "findings.csv")
+    row, *others = rows_of(tmp_path / "out" / "findings.csv")
+    # too little noise for a threshold of the cloud's own: rounding gives some scores above the fallback of 5
+    assert float(row["score"]) > 100 and all(float(other["score"]) < 7 for other in others) and len(others) < 5
     assert row["u_px"] == "" and row["volume_mm3"] == ""
     # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to a part of the hole.
     offset = np.array([float(row[f"{a}_mm"]) for a in "xy"]) - TRUE_CENTRE_MM[:2]
@@ -187,7 +190,8 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     finding = json.loads((tmp_path / "out" / "findings.json").read_text())["findings"][0]
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
-    assert "single points" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.startswith("warning: the capture cannot set its own threshold") and "single points" in said
 
 
 def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
