@@ -382,5 +382,6 @@ def test_the_drilled_plate_as_it_stands(shared_data: Path, tmp_path: Path, capsy
 @pytest.mark.slow
 def test_the_recording_as_it_stands(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert detect.main([str(shared_data / "azure_mkv" / "recording.mkv"), "--out", str(tmp_path)]) == 0
-    assert "1 frames averaged" in capsys.readouterr().out
-    assert rows_of(tmp_path / "findings.csv")
+    said = capsys.readouterr().out
+    assert "1 frames averaged" in said
+    assert said.startswith("warning: it is doubtful which surface is the target")
