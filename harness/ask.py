@@ -113,6 +113,8 @@ def _answer(
     warnings: dict[str, str],
     about: Any,
 ) -> None:
+    import numpy as np
+
     from harness.tables.atlas import ATLAS, damage_words, rows_at
     from harness.tables.text import many, show
 
@@ -149,10 +151,13 @@ def _answer(
         f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m are found nine times out of ten in "
         f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
     )
-    worst = max(row.surface.error for row in rows)
+    errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
+    missed = (
+        f"; the surfaces miss set-ups left out by {100 * max(errors):.0f} % of a90 at the most (rms)" if errors else ""
+    )
     notes = [
-        f"Simulated: one unit of each camera under the conditions of {about.get('experiment', 'the study')}.yaml; "
-        f"the surfaces miss set-ups left out by {100 * worst:.0f} % of a90 at the most (rms).",
+        f"Simulated: one unit of each camera under the conditions of {about.get('experiment', 'the study')}.yaml"
+        f"{missed}.",
         *(f"not answered: {reason}" for reason in refused),
     ]
     show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
@@ -192,8 +197,7 @@ def _exactly(row: Any, about: dict[str, Any]) -> str:
     parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
     depth = row.place.get("depth_mm")
     if depth is not None or row.surface.kind != "through":
-        axes[atlas.DAMAGE] = {"kind": row.surface.kind, "per_board": 6, "diameter_mm": [2.0, 40.0], "sizes": "log"}
-        axes[atlas.DAMAGE] |= {} if depth is None else {"depth_mm": [depth, depth]}
+        axes[atlas.DAMAGE] = json.loads(row.surface.damage) | ({} if depth is None else {"depth_mm": [depth, depth]})
     if "albedo" in row.place:
         axes[atlas.AXES["albedo"]] = row.place["albedo"]
     swept = {path: [value] for path, value in axes.items()}

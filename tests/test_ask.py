@@ -13,8 +13,10 @@ import pytest
 from harness.ask import main
 from harness.evaluation.atlas import Outside, surfaces_of
 
-THROUGH = {"kind": "through", "diameter_mm": [2.0, 40.0]}
-BLIND = [{"kind": "blind", "diameter_mm": [2.0, 40.0], "depth_mm": [depth, depth]} for depth in (3.0, 6.0)]
+THROUGH = {"kind": "through", "per_board": 6, "diameter_mm": [2.0, 40.0]}
+BLIND = [
+    {"kind": "blind", "per_board": 6, "diameter_mm": [2.0, 40.0], "depth_mm": [depth, depth]} for depth in (3.0, 6.0)
+]
 SCATTER = 0.05
 
 
@@ -43,6 +45,7 @@ def limits(seed: int = 1, lost: float = 40.0) -> pd.DataFrame:
                         "a90_high_mm": found * np.exp(1.96 * SCATTER),
                         "largest_mm": 40.0,
                         "is_at_most": False,
+                        "hits": 0 if found >= lost else 50,
                     }
                 )
     return pd.DataFrame(rows)
@@ -85,10 +88,21 @@ def test_nothing_is_extrapolated(place: dict[str, float]):
 
 def test_beside_a_set_up_without_a_limit_none_is_stated():
     surface = surfaces_of(limits(lost=law_mm(1.3, 1)))[0]
-    for distance_m in (1.1, 1.5):
+    for distance_m, verdict in (
+        (1.1, "undecided"),
+        (1.5, "no"),
+    ):  # some of the set-ups around have a limit, or none has
         answer = surface.at(distance_m=distance_m, frames=1)
-        assert np.isnan(answer.a90_mm) and answer.verdict(39.0) == "no" and answer.verdict(41.0) == "undecided"
+        assert np.isnan(answer.a90_mm) and answer.verdict(39.0) == verdict and answer.verdict(41.0) == "undecided"
     assert surface.at(distance_m=1.0, frames=1).a90_mm == pytest.approx(law_mm(1.0, 1), rel=0.2)
+
+
+def test_a_limit_below_all_sizes_is_no_limit_above_them():
+    """Where the least damage was found too, the set-up has no a90, and larger damage is not called missed."""
+    rows = limits()
+    rows.loc[rows["frames"] == 50, "is_at_most"] = True
+    answer = surfaces_of(rows)[0].at(distance_m=1.0, frames=50)
+    assert np.isnan(answer.a90_mm) and np.isnan(answer.largest_mm) and answer.verdict(30.0) == "undecided"
 
 
 @pytest.fixture

@@ -36,8 +36,8 @@ class Outside(Exception):
 
 @dataclass(frozen=True)
 class Answer:
-    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN where no limit was found among the sizes that
-    were inspected around the set-up, up to ``largest_mm``."""
+    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN where a set-up around has no limit.
+    ``largest_mm``: the largest size inspected; without a limit NaN, unless all set-ups around miss such damage too."""
 
     a90_mm: float
     low_mm: float
@@ -55,7 +55,8 @@ class Answer:
 class LimitSurface:
     """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed on each axis;
     ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``; ``largest_mm`` (n,): the largest size
-    inspected at each; ``known`` (n,): whether a limit was found. ``error``: of ln a90, leaving each set-up out."""
+    inspected at each; ``known`` (n,): whether a limit was found; ``beyond`` (n,): whether it lies above all sizes.
+    ``damage``: declaration of the first set-up's, as JSON. ``error``: of ln a90, leaving each set-up out."""
 
     camera: str
     kind: str
@@ -64,6 +65,8 @@ class LimitSurface:
     nodes: np.ndarray
     largest_mm: np.ndarray
     known: np.ndarray
+    beyond: np.ndarray
+    damage: str
     coefficients: np.ndarray
     covariance: np.ndarray
     terms: tuple[tuple[int, ...], ...]
@@ -82,7 +85,7 @@ class LimitSurface:
         largest_mm = float(self.largest_mm[around].min()) if around.any() else float("nan")
         if not around.any() or not self.known[around].all() or not len(self.coefficients):
             unknown = float("nan")
-            return Answer(unknown, unknown, unknown, largest_mm)
+            return Answer(unknown, unknown, unknown, largest_mm if self.beyond[around].all() else unknown)
         row = _rows(self._scaled(wanted[None]), self.terms)[0]
         middle = float(row @ self.coefficients)
         spread = np.hypot(np.sqrt(row @ self.covariance @ row), self.error)
@@ -124,13 +127,14 @@ def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Se
         rows[name].to_numpy(float) for name in ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm")
     )
     known = np.isfinite(a90) & (a90 <= largest) & ~rows["is_at_most"].to_numpy(bool)
+    beyond = (a90 > largest) | (rows["hits"].to_numpy() == 0)
     with np.errstate(all="ignore"):
         variance = (np.log(high / low) / (2 * stats.norm.ppf(0.5 + CONFIDENCE / 2))) ** 2
     sure = np.isfinite(variance) & (low > 0) & (variance < UNKNOWN_VARIANCE)
     variance = np.where(sure, np.maximum(variance, 1e-4), UNKNOWN_VARIANCE)
     scaled = _scaled(nodes, list(grid.values()))
     terms = _terms([len(values) for values in grid.values()], int(known.sum()))
-    fixed = (camera, kind, detector, grid, nodes, largest, known)
+    fixed = (camera, kind, detector, grid, nodes, largest, known, beyond, rows.iloc[0][DAMAGE])
     if not terms:
         return LimitSurface(*fixed, np.zeros(0), np.zeros((0, 0)), (), 0, float("nan"))
     design, weights = _rows(scaled[known], terms), 1.0 / variance[known]

@@ -51,7 +51,7 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
 
 def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
     """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage."""
-    damages = list(dict.fromkeys(row.damage for row in rows))
+    damages = list(dict.fromkeys(row.damage for row in rows if np.isfinite(row.answer.a90_mm)))
     titles = list(dict.fromkeys(row.title for row in rows))
     counts = sorted({int(row.place["frames"]) for row in rows})
     shown = {counts[0]: "--", counts[-1]: "-"}

@@ -41,9 +41,8 @@ def damage_words(kind: str) -> str:
 
 def _a90(row: Row) -> Estimate:
     one = row.answer
-    return Estimate(
-        one.largest_mm * 1.001 if np.isnan(one.a90_mm) else one.a90_mm, one.low_mm, one.high_mm, one.largest_mm
-    )
+    a90_mm = one.largest_mm * 1.001 if np.isnan(one.a90_mm) else one.a90_mm
+    return Estimate(a90_mm, one.low_mm, one.high_mm, np.nan_to_num(one.largest_mm, nan=np.inf))
 
 
 ATLAS = Table(
@@ -62,11 +61,11 @@ ATLAS = Table(
             "a90_mm",
             "a90 (mm)",
             _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest inspected where no "
-            "limit was found",
+            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest inspected where "
+            "all set-ups around miss such damage; none where one of them has no limit",
             interval=True,
         ),
-        Column("largest_mm", "", "answer.largest_mm", "largest size inspected there"),
+        Column("largest_mm", "", "answer.largest_mm", "largest size inspected there; none where a90 is unknown"),
         Column("surface_error", "", "surface.error", "of the surface: rms of ln a90, each set-up left out in turn"),
         Column(
             "found",
