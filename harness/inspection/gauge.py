@@ -28,15 +28,15 @@ FEWEST_MARKS = 3
 WORST_FIT_MM = 2.0
 """Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
 Length = Annotated[float, Field(gt=0, le=5e3)]
-Place = Annotated[float, Field(ge=-5e3, le=5e3)]
+CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 
 
 class GaugeMark(Config):
     """A printed code: its number, its centre on the board, and the side of its black square."""
 
     code: Annotated[int, Field(ge=0, le=999)]
-    x_mm: Place
-    y_mm: Place
+    x_mm: CoordinateMm
+    y_mm: CoordinateMm
     side_mm: Length
 
 
@@ -46,8 +46,8 @@ class GaugeHole(Config):
     id: Annotated[int, Field(ge=1)]
     diameter_mm: Length
     depth_mm: Length | None = None
-    x_mm: Place
-    y_mm: Place
+    x_mm: CoordinateMm
+    y_mm: CoordinateMm
 
 
 class GaugeBoard(Config):

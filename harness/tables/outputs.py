@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Literal
 
-Place = Literal["results", "capture"]
+FolderKind = Literal["results", "capture"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Output:
 
     name: str
     note: str
-    place: Place = "results"
+    place: FolderKind = "results"
     of: str = ""
 
 
@@ -76,6 +76,6 @@ def outputs() -> Iterator[Output]:
                 yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)
 
 
-def is_output(name: str, place: Place) -> bool:
+def is_output(name: str, place: FolderKind) -> bool:
     """Return whether a file of this name is what a program writes at this place."""
     return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

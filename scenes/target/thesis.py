@@ -22,7 +22,7 @@ THICKNESS_MM = 12.7
 DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 8, 3 / 4, 1.0)
 """Holes 1 to 11 (stated, Table I)."""
 Degrees = Annotated[float, Field(ge=-70.0, le=70.0)]
-Place = Annotated[float, Field(ge=0.0, le=5e3)]
+NonNegativeMm = Annotated[float, Field(ge=0.0, le=5e3)]
 
 
 def _open(default: Any, reason: str) -> Any:
@@ -39,7 +39,7 @@ class ThesisTargetConfig(Config):
     blind_depth_mm: Annotated[float, Field(gt=0.0, lt=THICKNESS_MM)] = _open(
         9.5, "Counts for blind holes only. Three quarters of the thickness."
     )
-    backing_distance_mm: Place | None = _open(
+    backing_distance_mm: NonNegativeMm | None = _open(
         20.0,
         "Only points with z < 1.1 m and a range < 1 m are kept, and the holes still show points at depth, so something "
         "stood close behind; a sheet leaning on a wall leaves centimetres. none: nothing behind.",
@@ -82,8 +82,8 @@ class ThesisTargetConfig(Config):
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(1, "Which board out of all alike.")
     tape_length_mm: custom.Length = _open(40.0, "Four strips, one near each corner, clear of the row.")
     tape_width_mm: custom.Length = _open(12.0, "Half-inch tape.")
-    tape_x_mm: Place = _open(200.0, "The strips' centres: +-x.")
-    tape_y_mm: Place = _open(38.0, "The strips' centres: +-y.")
+    tape_x_mm: NonNegativeMm = _open(200.0, "The strips' centres: +-x.")
+    tape_y_mm: NonNegativeMm = _open(38.0, "The strips' centres: +-y.")
     tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(0.15, "Vinyl tape is 0.13 to 0.18 mm thick.")
     tape_albedo_850: custom.Albedo = _open(0.6, "Red dyes are clear in the near infrared. A guess.")
     tape_rgb: custom.Rgb = _open(
