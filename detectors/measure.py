@@ -1,14 +1,8 @@
-"""Size and place of a detection: the thesis' extents, and beside them the model of a blurred hole.
+"""Size and place of a detection: the thesis' extents, and beside them the model of a blurred hole, or where that does
+not hold the contour at half depth.
 
 Depths are measured along the optical axis from the fitted surface, positive behind it. Sizes are measured on the
-surface. The model: a round tube that starts with the surface's mouth, and behind it a floor of one depth, seen and lit
-obliquely, averaged over ``blur_px`` x ``blur_px`` pixels. A ray that has come as deep as t has passed the mouth and the
-circle at depth t, and so has the light that comes back along it; in the image each is an ellipse, shifted by parallax.
-The tube's length over the depth is fitted too.
-
-Not modelled: light between wall and floor, which makes a wall look deeper than it is; walls darker than the floor; a
-floor that is not flat; the loss of weight of deep neighbours in a bilateral filter (holes of 2 to 3 times the blur come
-out up to 16 % too deep at 33 mm).
+surface.
 """
 
 from __future__ import annotations
@@ -20,260 +14,14 @@ import cv2
 import numba
 import numpy as np
 from pydantic import Field, field_validator
-from scipy.optimize import leastsq
 
+from detectors.clusters import PLAIN
+from detectors.hole_model import MOST_MISFIT, HoleFit, HolePatch, fit_hole, pictures, sight, straight_sight
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, sigma_of
-from detectors.whitening import correlated_products, whitener
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
-
-STRIPS = 64
-"""Strips that stand for the disc: the coverage is exact in total, and in each pixel within 0.001 for a blur of 3."""
-NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
-"""Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall; and its end."""
-STEP = 1e-3
-"""Size of the differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall.
-"""
-IMAGES, TOLERANCE = 60, 1e-4  # limits of a descent: the most images drawn, and the relative change below which it ends
-MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
-"""Errors that light between wall and floor leaves, as simulated clouds show beyond their noise: a pixel's share of its
-depth, by which the likelihood trusts it less, and parts of the fitted radius and depth, which their standard errors
-include."""
-MOST_MISFIT = 1.5
-"""Deviation of what the fit leaves from which on the model does not hold: 0.3 to 1.05 on simulated boards of its own
-optics, 1.1 to 3 before lenses that blur otherwise."""
-WALL_PRIOR = (0.5, 12.0**-0.5)
-"""Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
-
-_THETA = np.linspace(-np.pi / 2, np.pi / 2, STRIPS + 1)
-EDGES = np.sin(_THETA)  # edges (s + 1,) of strips across a unit disc, narrow where the chord changes fast
-HALF_CHORDS = np.diff(_THETA / 2 + np.sin(2 * _THETA) / 4) / np.diff(EDGES)  # mean half-chords (s,) of these strips
-MIDDLES = 0.5 * (EDGES[:-1] + EDGES[1:])
-
-
-def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, share: float = 1.0) -> np.ndarray:
-    """Return the place (8,) from where a hole is seen and lit, reduced to what moves in the image: the cosine between
-    ray and normal, times the ray's length per z; the drift along u and v; the shrinking; the beam along u and v; the
-    emitter's height; the share of the image that is seen from here. ``centre_m`` (3,) in the camera's frame,
-    ``per_px_m`` (2, 3).
-
-    A circle at depth h along the normal looks like the same circle on the surface, moved by h * drift / (1 + h *
-    shrinking), and smaller by that divisor. Light that comes back from depth h came in at beam * h / (h + height) from
-    it.
-    """
-    normal = np.cross(per_px_m[0], per_px_m[1])
-    normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
-    ray, z = centre_m / centre_m[2], centre_m[2]
-    slopes_per_px = ((per_px_m - np.outer(per_px_m[:, 2], ray)) / z)[:, :2].T
-    drift = np.linalg.pinv(slopes_per_px) @ (normal - normal[2] * ray)[:2] / z
-    distance, before = normal @ centre_m, normal @ emitter_m
-    beam = np.linalg.pinv(per_px_m.T) @ (emitter_m - centre_m * before / distance)
-    return np.array([normal @ ray, *drift, normal[2] / z, *beam, distance - before, share])
-
-
-def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
-    """Return the sight along z from everywhere at once, lit likewise: a parallel projection of unknown origin."""
-    normal = np.cross(per_px_m[0], per_px_m[1])
-    normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
-    drift = np.linalg.pinv(per_px_m[:, :2].T) @ normal[:2]
-    return np.array([normal[2], *drift, 0.0, 0.0, 0.0, 1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class HolePatch:
-    """Residuals around one detection. ``metric_m2`` (2, 2): squared length of a pixel offset (du, dv) is its quadratic
-    form. ``noise_m``: deviation beside the hole. ``blur_px`` (along u, along v): sides of the rectangle over which the
-    image is averaged. ``sights`` (s, 8). ``correlation`` (odd, odd): of the noise by lag, where it is known."""
-
-    residual_m: np.ndarray
-    used: np.ndarray
-    metric_m2: np.ndarray
-    blur_px: tuple[float, float]
-    noise_m: float
-    sights: np.ndarray
-    correlation: np.ndarray | None = None
-
-    @property
-    def prior_weight(self) -> float:
-        """Misfit in metres that a deviation of the wall by 1 is worth."""
-        return self.noise_m * math.sqrt(self.blur_px[0] * self.blur_px[1]) / WALL_PRIOR[1]
-
-
-def pictures(patch: HolePatch, holes: np.ndarray) -> np.ndarray:
-    """Return the residuals (m, h, w) of holes (m, 5), each (u, v, radius, depth, wall), without offset: depth along the
-    optical axis, wall in 0..1; a disc where the depth is negative. The mouth is cut into strips along u, and each hole
-    into layers: of each sight three of wall, and what is deeper."""
-    return _painted(holes, patch.sights, patch.metric_m2, *patch.blur_px, *patch.used.shape)
-
-
-@numba.njit(cache=True, nogil=True)
-def _painted(
-    holes: np.ndarray, sights: np.ndarray, metric: np.ndarray, blur_u: float, blur_v: float, h: int, w: int
-) -> np.ndarray:
-    g11, g12, g22 = metric[0, 0], metric[0, 1], metric[1, 1]
-    # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
-    height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
-    half_u, half_v = 0.5 * blur_u, 0.5 * blur_v
-    images, across = np.zeros((len(holes), h, w)), np.empty(w)
-    # of each layer its weight, and three circles that its light has passed: shift along u and v, and scale
-    layers, weights = np.empty((len(sights) * len(NODES), 3, 3)), np.empty(len(sights) * len(NODES))
-    for n in range(len(holes)):
-        u, v, radius, depth, wall = holes[n]
-        for k in range(len(weights)):
-            cosine, drift_u, drift_v, shrink, beam_u, beam_v, emitter, share = sights[k // len(NODES)]
-            node = k % len(NODES)
-            deepest = depth * cosine
-            length = wall * deepest if depth > 0 else 0.0
-            tube, is_wall = length * NODES[node], NODES[node] < 1.0
-            end = tube if is_wall else max(deepest, 0.0)
-            weights[k] = share / cosine * (length * WEIGHTS[node] if is_wall else deepest - length)
-            scale, lit, below = (
-                1.0 / (1.0 + tube * shrink),
-                end / (end + emitter),
-                (end - tube) / (end - tube + emitter),
-            )
-            shift_u, shift_v = tube * drift_u * scale, tube * drift_v * scale
-            layers[k, 0] = shift_u, shift_v, scale
-            layers[k, 1] = -lit * beam_u, -lit * beam_v, 1.0
-            layers[k, 2] = shift_u - below * beam_u, shift_v - below * beam_v, scale
-        for s in range(STRIPS):
-            bottom, top = v + radius * height * EDGES[s], v + radius * height * EDGES[s + 1]
-            down = radius * height * MIDDLES[s]
-            across[:] = 0.0
-            for k in range(len(weights)):
-                start, end = (
-                    slant * down - radius * HALF_CHORDS[s] * width,
-                    slant * down + radius * HALF_CHORDS[s] * width,
-                )
-                for shift_u, shift_v, scale in layers[k]:
-                    middle = shift_u + slant * (down - shift_v)
-                    half = width * math.sqrt(max((radius * scale) ** 2 - ((down - shift_v) / height) ** 2, 0.0))
-                    start, end = max(start, middle - half), min(end, middle + half)
-                start, end = u + start, u + end
-                if end > start:
-                    for c in range(max(0, math.ceil(start - half_u)), min(w - 1, math.floor(end + half_u)) + 1):
-                        across[c] += weights[k] * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
-            for r in range(max(0, math.ceil(bottom - half_v)), min(h - 1, math.floor(top + half_v)) + 1):
-                along = max(min(top, r + half_v) - max(bottom, r - half_v), 0.0) / (4.0 * half_u * half_v)
-                for c in range(w):
-                    images[n, r, c] += along * across[c]
-    return images
-
-
-def derivatives(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residual (h, w) of a hole (5,), and its derivatives (5, h, w), by differences."""
-    steps = STEP * np.array([1.0, 1.0, hole[2], hole[3] or STEP, -1.0 if hole[4] >= 0.5 else 1.0])
-    image, *moved = pictures(patch, np.vstack([hole, hole + np.diag(steps)]))
-    return image, (np.array(moved) - image) / steps[:, None, None]
-
-
-@dataclass(frozen=True)
-class HoleFit:
-    """``u_px``, ``v_px`` in the patch; ``covariance`` (6, 6) of (u, v, radius, depth, offset, wall), px and metres.
-    ``misfit``: deviation of what is left in units of the noise and the model's own error; 0 where neither is known."""
-
-    u_px: float
-    v_px: float
-    radius_m: float
-    depth_m: float
-    offset_m: float
-    wall: float
-    covariance: np.ndarray
-    converged: bool
-    misfit: float
-
-
-def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
-    """Fit by least squares (MINPACK) from a start, to six used pixels and more: the likelihood's maximum where the
-    patch knows the noise's covariance, else with `sandwich_covariance`.
-
-    Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2). The fourth is the hole's
-    volume, which the blur keeps, so that a small hole still has one well-determined direction for each parameter but
-    its radius. The wall has `WALL_PRIOR`: a small hole, or one seen straight on, does not determine it.
-    """
-    start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
-    h, w = patch.used.shape
-    # keeps a wild trial step finite: no disc is larger than ten patches
-    low = np.array([-10.0 * w, -10.0 * h, -20.0])
-    high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
-    used, data, error_m = patch.used, patch.residual_m[patch.used], MODEL_ERROR * np.abs(patch.residual_m - offset_m)
-    whitened = whitener(used, patch.correlation, max(patch.noise_m, 1e-9), error_m)
-    weight = patch.prior_weight if whitened is None else 1.0 / WALL_PRIOR[1]
-
-    def hole_of(q: np.ndarray) -> np.ndarray:
-        u, v, log_radius = np.clip(q[:3], low, high).tolist()
-        radius = math.exp(log_radius)
-        return np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
-
-    def misfit(q: np.ndarray) -> np.ndarray:
-        hole = hole_of(q)
-        left = pictures(patch, hole[None])[0][used] + q[4] - data
-        return np.append(left if whitened is None else whitened(left), weight * (hole[4] - WALL_PRIOR[0]))
-
-    def jacobian(q: np.ndarray) -> np.ndarray:
-        hole = hole_of(q)
-        radius, depth = hole[2], hole[3]
-        slope = 0.5 * math.pi * math.sin(math.pi * q[5])
-        rows, by = np.zeros((6, len(data) + 1)), derivatives(patch, hole)[1][:, used]
-        rows[:4, :-1] = by[0], by[1], radius * by[2] - 2.0 * depth * by[3], by[3] / radius**2
-        rows[4, :-1], rows[5, :-1] = 1.0, slope * by[4]
-        rows[5, -1] = weight * slope
-        if whitened is not None:
-            rows[:, :-1] = whitened(rows[:, :-1].T).T
-        return rows
-
-    stop = {"ftol": TOLERANCE, "xtol": TOLERANCE, "gtol": 1e-9, "maxfev": IMAGES}
-    q, _, _, _, outcome = leastsq(misfit, start, Dfun=jacobian, col_deriv=True, full_output=True, **stop)
-    hole, offset = hole_of(q), float(q[4])
-    u, v, radius, depth, wall = hole.tolist()
-    if whitened is None:
-        covariance, left = sandwich_covariance(patch, hole, offset), 0.0
-    else:
-        by = derivatives(patch, hole)[1][:, used]
-        rows = whitened(np.stack([*by[:4], np.ones(len(data)), by[4]]).T).T
-        left = float((misfit(q)[:-1] ** 2).sum()) / max(len(data) - 6, 1)
-        covariance = _likelihood_covariance(patch, hole, rows, left)
-    return HoleFit(u, v, radius, depth, offset, wall, covariance, outcome in (1, 2, 3, 4), math.sqrt(left))
-
-
-def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray, variance: float) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from whitened derivatives (6, n) by them and
-    the variance of what is left: the information's inverse times that variance, and the model's own errors."""
-    information = rows @ rows.T
-    information[5, 5] += WALL_PRIOR[1] ** -2
-    found = np.linalg.pinv(information, hermitian=True) * variance
-    found[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
-    found[3, 3] += (DEPTH_ERROR * hole[3]) ** 2
-    return np.asarray(found)
-
-
-def sandwich_covariance(patch: HolePatch, hole: np.ndarray, offset_m: float) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) under noise that the square filter
-    correlates, NaN where none is determined: cov = A^-1 (s^2 J' C J + p^2 W) A^-1 with A = J' J + W, W the prior's
-    square weight on the wall, p^2 its variance; s^2 from the misfit, E[misfit' misfit] = s^2 (n - trace(A^-1 J' C
-    J))."""
-    image, by = derivatives(patch, hole)
-    columns = np.stack([*by[:4], np.ones(patch.used.shape), by[4]]) * patch.used
-    flat = columns.reshape(6, -1)
-    # the odd numbers of pixels nearest to the blur: pixels so far apart have no noise in common
-    across, down = (2 * max(round((blur - 1) / 2), 0) + 1 for blur in patch.blur_px)
-    prior = np.zeros((6, 6))
-    prior[5, 5] = patch.prior_weight**2
-    try:
-        bread = np.linalg.inv(flat @ flat.T + prior)
-    except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan)
-    meat = correlated_products(columns, across, down) / (across * down)
-    freedom = int(patch.used.sum()) - float(np.trace(bread @ meat))
-    if freedom <= 0:
-        return np.full((6, 6), np.nan)
-    misfit = (image + offset_m - patch.residual_m)[patch.used]
-    variance = float(misfit @ misfit) / freedom
-    prior_variance = patch.noise_m**2 * patch.blur_px[0] * patch.blur_px[1]
-    return np.asarray(bread @ (variance * meat + prior_variance * prior) @ bread)
-
 
 OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
@@ -317,14 +65,31 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
     return along_u, along_v
 
 
-@numba.njit(cache=True, nogil=True)
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the thesis' size and centre (3,) of a cluster (n, 3), metres: mean of the distances between the extreme
     points in x and between those in y; mean of these four. Of equal extremes the first counts."""
-    x, y = points_m[:, 0], points_m[:, 1]
-    west, east, north, south = points_m[x.argmin()], points_m[x.argmax()], points_m[y.argmin()], points_m[y.argmax()]
-    diameter = 0.5 * (np.sqrt(((east - west) ** 2).sum()) + np.sqrt(((south - north) ** 2).sum()))
+    west, east, north, south = points_m[_extremes(points_m, np.zeros(len(points_m), np.int64), 1)[0]]
+    diameter = 0.5 * float(np.linalg.norm(east - west) + np.linalg.norm(south - north))
     return diameter, (west + east + north + south) / 4.0
+
+
+def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Return the centres (count, 3) that `extents` has of the clusters that the ``labels`` (n,) of points (n, 3)
+    make."""
+    return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
+
+
+@numba.njit(**PLAIN)
+def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Return the numbers (count, 4) of the points with the least and greatest x, and the least and greatest y."""
+    found = np.full((count, 4), -1)
+    for i in range(len(labels)):
+        best = found[labels[i]]
+        for end in range(4):
+            sign = 1.0 if end % 2 else -1.0
+            if best[end] < 0 or sign * points[i, end // 2] > sign * points[best[end], end // 2]:
+                best[end] = i
+    return found
 
 
 def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:

@@ -22,7 +22,6 @@ from pydantic import Field
 
 from detectors.average import AverageConfig, average
 from detectors.background import background
-from detectors.clusters import euclidean_clusters
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detector, Evidence
 from detectors.noise import median_of, rounding_floor, sigma_of
@@ -173,10 +172,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
             behind=signed > 0,
         )
 
-    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        # across the view: a score belongs to the surface, so that a rim and what lies deep behind it are one finding
-        flat = cloud.points_m.reshape(-1, 3)[pixels] * [1.0, 1.0, 0.0]
-        return euclidean_clusters(flat, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+    def places(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the places across the view: a score belongs to the surface, so that a rim and what lies deep behind it
+        are one finding."""
+        return points_m * [1.0, 1.0, 0.0]
 
     @cached_property
     def _reference_m(self) -> np.ndarray:

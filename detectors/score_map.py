@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from bisect import bisect_left
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 from pydantic import Field
 
-from detectors.clusters import euclidean_clusters
-from detectors.interface import Detection, Evidence, Measurement
+from detectors.clusters import nested_clusters
+from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.masks import on_grid as on_grid
-from detectors.measure import HoleModelConfig, extents, measure_detection
+from detectors.measure import HoleModelConfig, centres_of, measure_detection
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud
 
@@ -48,51 +48,85 @@ class ScoreMapDetector(ABC, Generic[S]):
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return clusters of pixels whose score is above the threshold, strongest first."""
-        pixels = above(evidence, threshold)
-        labels = self._clusters(cloud, pixels)
-        by_label = np.argsort(labels, kind="stable")
-        bounds = np.searchsorted(labels[by_label], np.arange(labels.max(initial=-1) + 2))
-        clusters = [pixels[by_label[start:end]] for start, end in pairwise(bounds)]
-        found = [self._detection(cloud, evidence, cluster) for cluster in clusters]
-        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
+        return self.findings(cloud, evidence, [threshold])[0].detections
+
+    def findings(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
+        """Return what `find` returns at each of the thresholds, which rise."""
+        pixels = above(evidence, thresholds[0])
+        pixels = pixels[cloud.valid.reshape(-1)[pixels]]
+        points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
+        levels = [*zip(*self._clusters(self.places(points), scores, thresholds), strict=True)]
+        found = []
+        for labels, strengths in levels:
+            count = int(labels.max(initial=-1)) + 1
+            kept = labels >= 0
+            of_kept = points[kept], labels[kept]
+            found.append(Findings(strengths[:count], pixels[kept], of_kept[1], centres_of(*of_kept, count)))
+        return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
-        return self._strength(cloud, evidence, above(evidence, 0.0))
+        pixels = above(evidence, 0.0)
+        pixels = pixels[cloud.valid.reshape(-1)[pixels]]
+        scores, least = evidence.score.reshape(-1)[pixels], self.settings.min_points
+        if least == 1:
+            return float(scores.max(initial=0.0))
+        # the highest scores are looked at first: they mostly hold a cluster
+        for count in (64 * least, len(pixels)):
+            highest = np.argsort(-scores, kind="stable")[:count]
+            places = self.places(cloud.points_m.reshape(-1, 3)[pixels[highest]])
+            _, strengths = self._clusters(places, scores[highest], [0.0])
+            if strengths.max(initial=0.0) > 0.0:
+                return float(strengths.max())
+        return 0.0
+
+    def places(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the places (n, 3) by whose distances points (n, 3) are joined."""
+        return points_m
+
+    def _clusters(
+        self, places_m: np.ndarray, scores: np.ndarray, thresholds: Sequence[float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        distance_m = self.settings.cluster_distance_mm * MM
+        return nested_clusters(places_m, scores, distance_m, self.settings.min_points, np.array(thresholds))
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
         """Measure the thesis' extents, and the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
 
-    def _detection(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> Detection:
-        centre_m = extents(cloud.points_m.reshape(-1, 3)[pixels])[1]
-        return Detection(self._strength(cloud, evidence, pixels), pixels, centre_m)
 
-    def _clusters(self, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        points = cloud.points_m.reshape(-1, 3)[pixels]
-        return euclidean_clusters(points, self.settings.cluster_distance_mm * MM, self.settings.min_points)
+@dataclass(frozen=True)
+class Findings:
+    """Findings at one threshold: ``scores`` (k,), ``centres_m`` (k, 3), and the flat ``pixels`` (n,), ascending, with
+    the number (n,) of the finding of each."""
 
-    def _strength(self, cloud: Cloud, evidence: Evidence, pixels: np.ndarray) -> float:
-        """Return the lowest threshold at which no cluster of ``min_points`` is left among these pixels: the score
-        of the point, in falling order, that completes the first cluster, found by doubling and bisection."""
-        least = self.settings.min_points
-        if len(pixels) < least:
-            return 0.0
-        scores = evidence.score.reshape(-1)[pixels]
-        if least == 1:
-            return float(scores.max())
-        falling = np.argsort(-scores, kind="stable")
+    scores: np.ndarray
+    pixels: np.ndarray
+    labels: np.ndarray
+    centres_m: np.ndarray
 
-        def completes(count: int) -> bool:
-            return bool((self._clusters(cloud, pixels[falling[:count]]) >= 0).any())
+    @classmethod
+    def of(cls, detections: Sequence[Detection]) -> Findings:
+        """Return detections as arrays."""
+        numbers = np.repeat(np.arange(len(detections)), [len(one.pixels) for one in detections])
+        pixels = np.concatenate([np.zeros(0, np.int64), *(one.pixels for one in detections)])
+        centres = np.array([one.centre_m for one in detections]).reshape(-1, 3)
+        return cls(np.array([one.score for one in detections]), pixels, numbers, centres)
 
-        low = high = least
-        while not completes(high):
-            if high == len(pixels):
-                return 0.0
-            low, high = high + 1, min(2 * high, len(pixels))
-        count = bisect_left(range(high), True, lo=low, key=completes)
-        return float(scores[falling[count - 1]])
+    @property
+    def detections(self) -> tuple[Detection, ...]:
+        """The same one by one, strongest first."""
+        by_label = np.argsort(self.labels, kind="stable")
+        groups = np.split(self.pixels[by_label], np.cumsum(np.bincount(self.labels, minlength=len(self.scores)))[:-1])
+        found = (Detection(float(self.scores[k]), groups[k], self.centres_m[k]) for k in range(len(self.scores)))
+        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
+
+
+def findings_at(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
+    """Return a detector's findings at thresholds, which rise."""
+    if isinstance(detector, ScoreMapDetector) and type(detector).find is ScoreMapDetector.find:
+        return detector.findings(cloud, evidence, thresholds)
+    return [Findings.of(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
 
 
 def above(evidence: Evidence, threshold: float) -> np.ndarray:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import scipy.fft
-from scipy.linalg import solve_triangular
 
 RADII_PX = (0.5, 1.5, 2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
 """Radii of discs seen through a window of 5 x 5 pixels, as continuous-wave cameras filter their phasors."""
@@ -219,12 +218,12 @@ def _drawn(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: floa
     return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
 
 
-def whitener(
+def noise_factor(
     used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
-) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the function that turns the values (n, ...) of the ``used`` pixels (r, c) into others whose errors are
-    independent, with deviation 1; None where there are too many pixels, or the correlation is not known or none. Errors
-    are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
+) -> np.ndarray | None:
+    """Return Cholesky's lower factor (n, n) of the covariance of the ``used`` pixels (r, c), whose inverse times values
+    has independent errors of deviation 1; None where there are too many pixels, or the correlation is not known or
+    none. Errors are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
     rows, columns = np.nonzero(used)
     if correlation is None or len(rows) > MOST_WHITENED:
         return None
@@ -233,10 +232,9 @@ def whitener(
     inside = ((lags >= 0) & (lags <= 2 * reach)).all(axis=0)
     alike = np.where(inside, correlation[tuple(np.clip(lags, 0, 2 * reach))], 0.0)
     try:
-        factor = np.linalg.cholesky(alike * (deviation**2 + np.outer(model_error[used], model_error[used])))
+        return np.linalg.cholesky(alike * (deviation**2 + np.outer(model_error[used], model_error[used])))
     except np.linalg.LinAlgError:
         return None
-    return partial(solve_triangular, factor, lower=True, check_finite=False)
 
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:

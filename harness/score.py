@@ -27,6 +27,7 @@ from harness.vocabulary.provenance import record
 from harness.vocabulary.seeds import digest
 
 if TYPE_CHECKING:
+    from detectors.score_map import Findings
     from harness.evaluation.study.limit import SetUpLimit
 
 ENDINGS = (".npy", ".tiff", ".tif")
@@ -168,7 +169,7 @@ def _judged(
     import pandas as pd
 
     from harness.engine.boards import read_arrays, read_truth
-    from harness.engine.judge import matched_places
+    from harness.engine.judge import matched_places, smeared
     from harness.engine.setup import highest_within, pixel_areas
     from harness.engine.study import judged_facts
     from harness.evaluation.intervals import threshold_for_rate
@@ -195,13 +196,14 @@ def _judged(
         damages, board = truth["damages"], truth["board"]
         truths.append([board, damages])
         lines = [np.array(one["line_m"]) for one in damages]
-        centres_m, found = _findings(places_m, scores > threshold)
-        outlines = [np.flatnonzero(damage == one["id"]) for one in damages]
-        rule = (radius_m, index["hit_overlap"], damage.shape)
-        pairs, parts = matched_places(lines, outlines, centres_m, found, *rule)
+        found, overlap = _findings(places_m, scores > threshold), index["hit_overlap"]
+        areas = (
+            [] if overlap is None else smeared([np.flatnonzero(damage == one["id"]) for one in damages], damage.shape)
+        )
+        ((pairs, parts),) = matched_places(lines, areas, lambda centres_m: centres_m, [found], radius_m, overlap)
         signals = highest_within(places_m, scores, lines, radius_m)
         common: dict[str, Any] = {"board": board, "repeat": 0, "threshold": float(threshold), "scale_mm": np.nan}
-        calls = {"false_calls": len(found) - len(pairs) - parts, "no_return_calls": 0, "inspected_m2": area_m2}
+        calls = {"false_calls": len(found.scores) - len(pairs) - parts, "no_return_calls": 0, "inspected_m2": area_m2}
         runs.append({**common, "role": "hole_free" if "/good/" in name else "damaged", **calls})
         for number, one in enumerate(damages):
             place = {"true_x_mm": one["x_board_mm"], "true_y_mm": one["y_board_mm"], "signal": float(signals[number])}
@@ -238,17 +240,17 @@ def _judged(
     }
 
 
-def _findings(places_m: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Centres (m, 2) on the face, and flat pixels, of the findings that the pixels ``above`` (h, w) make."""
+def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
+    """Findings that the pixels ``above`` (h, w) make, without scores; their centres (m, 2) lie on the face."""
     from detectors.clusters import euclidean_clusters
-    from detectors.measure import extents
+    from detectors.measure import centres_of
+    from detectors.score_map import Findings
 
     pixels = np.flatnonzero(above & np.isfinite(places_m[..., 0]))
     points = np.pad(places_m.reshape(-1, 2)[pixels], ((0, 0), (0, 1)))
     labels = euclidean_clusters(points, LINK_M, 1)
-    found = [labels == number for number in range(labels.max(initial=-1) + 1)]
-    centres_m = np.array([extents(points[each])[1][:2] for each in found]).reshape(-1, 2)
-    return centres_m, [pixels[each] for each in found]
+    centres_m = centres_of(points, labels, int(labels.max(initial=-1)) + 1)[:, :2]
+    return Findings(np.full(len(centres_m), np.nan), pixels, labels, centres_m)
 
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from detectors.hole_model import straight_sight
 from detectors.interface import Detection
 from detectors.mapping.merge import merge
 from detectors.mapping.settings import FusedMerge, GridMerge
-from detectors.measure import HoleModelConfig, blur_in_cells, straight_sight
+from detectors.measure import HoleModelConfig, blur_in_cells
 from detectors.thesis import ThesisConfig, ThesisDetector
 from harness.vocabulary.geometry import MM, Cloud, MapViews, Region, invert, transform_points
 from tests.mapped_views import Hole, Plane, arc, reference, registered, seen

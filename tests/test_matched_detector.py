@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from detectors.hole_model import HoleFit, HolePatch, fit_hole, pictures, straight_sight
 from detectors.interface import Detection
 from detectors.local import LocalDetector
 from detectors.matched import MatchedDetector
-from detectors.measure import HoleFit, HolePatch, fit_hole, pictures, straight_sight
 from detectors.whitening import (
     FIRST_SLOT,
     GRID,
@@ -22,10 +22,10 @@ from detectors.whitening import (
     halved,
     inverse_times,
     noise_covariance,
+    noise_factor,
     response,
     spectra,
     spectrum,
-    whitener,
     worths,
 )
 from harness.testing import SHAPE, plane, without
@@ -84,15 +84,15 @@ def test_whitened_values_have_the_inverse_covariance() -> None:
     lags = np.abs(np.arange(-8, 9))
     correlation = np.outer(0.6**lags, 0.6**lags)
     error = np.where(used, 2e-4, 0.0)
-    turn = whitener(used, correlation, 3e-4, error)
-    assert turn is not None
+    factor = noise_factor(used, correlation, 3e-4, error)
+    assert factor is not None
     places = np.argwhere(used)
     dense = 0.6 ** np.abs(places[:, None] - places).sum(axis=-1) * (3e-4**2 + 2e-4**2)
     reach = (np.abs(places[:, None] - places) <= 8).all(axis=-1)
-    white = turn(np.eye(len(places)))
+    white = np.linalg.inv(factor)
     inverse = np.linalg.inv(np.where(reach, dense, 0.0))
     np.testing.assert_allclose(white.T @ white, inverse, atol=1e-9 * np.abs(inverse).max())
-    assert whitener(used, None, 3e-4, error) is None
+    assert noise_factor(used, None, 3e-4, error) is None
 
 
 def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:

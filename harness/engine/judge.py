@@ -4,7 +4,7 @@ a study's board: signals at every place, findings, and counts at other threshold
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -16,6 +16,7 @@ from detectors.interface import Calibratable, Detection, Detector, Evidence, Mea
 from detectors.masks import grown
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
+from detectors.score_map import Findings, findings_at
 from harness.engine.setup import KnownCloud, at_hand, highest_within
 from harness.evaluation.match import closest_pairs
 from harness.vocabulary.geometry import MM
@@ -46,7 +47,6 @@ class JudgedCloud:
     detections: tuple[Detection, ...] = ()
     places_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     pairs: Mapping[int, int] = field(default_factory=dict)
-    measured: tuple[Measurement, ...] = ()
     overlap: float | None = None
 
 
@@ -88,12 +88,14 @@ def judge(
     run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}
     if hole_free:
         return JudgedCloud(run, [], detector, evidence, detections, places_m, pairs, overlap=overlap)
-    measured = tuple(detector.measure(cloud, evidence, detection) for detection in detections)
-    largest = max(measured, key=lambda m: m.points, default=None)
-    found = [measured[pairs[i]] if i in pairs else None for i in range(len(known.truth))]
-    holes = [_hole_row(known, evidence, *of, largest) for of in zip(known.truth, found, strict=True)]
+    # what counts is measured, and the largest finding, to whose place the others are compared
+    largest = max(range(len(detections)), key=lambda number: len(detections[number].pixels), default=-1)
+    wanted = {*pairs.values(), largest} - {-1}
+    measured = {number: detector.measure(cloud, evidence, detections[number]) for number in wanted}
+    found = [measured.get(pairs.get(i, -1)) for i in range(len(known.truth))]
+    holes = [_hole_row(known, evidence, *of, measured.get(largest)) for of in zip(known.truth, found, strict=True)]
     holes = [{**row, "threshold": threshold} for row in holes]
-    return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, measured, overlap)
+    return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, overlap)
 
 
 def matched(
@@ -104,36 +106,57 @@ def matched(
     within the radius of the damage's centre, of long damage of its centre line; with an ``overlap`` also where at least
     this share of its pixels lie on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside the
     one that counts are its parts."""
-    lines, outlines = [one.line_m for one in known.truth], [known.outlines[one.id] for one in known.truth]
-    places_m, pixels = _places_of(known, detections), [one.pixels for one in detections]
-    shape = known.cloud.valid.shape
-    return matched_places(lines, outlines, places_m, pixels, radius_m, overlap, shape, grid=known.cloud.organised)
+    (found,) = _matched(known, [Findings.of(detections)], radius_m, overlap)
+    return found
+
+
+def _matched(
+    known: KnownCloud, levels: Sequence[Findings], radius_m: float, overlap: float | None
+) -> list[tuple[dict[int, int], int]]:
+    """`matched` of the findings at each of several thresholds."""
+    lines, areas = [damage.line_m for damage in known.truth], []
+    if overlap is not None:
+        outlines = [known.outlines[damage.id] for damage in known.truth]
+        areas = smeared(outlines, known.cloud.valid.shape, grid=known.cloud.organised)
+    return matched_places(lines, areas, known.on_board, levels, radius_m, overlap)
+
+
+def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: bool = True) -> list[np.ndarray]:
+    """Return a mask (n,) of a cloud's pixels for each of the ``outlines``, flat indices, grown by `SMEARED_PX` where
+    the cloud has a pixel ``grid``."""
+    masks = []
+    for outline in outlines:
+        on = np.zeros(shape, bool)
+        on.ravel()[outline] = True
+        masks.append((grown(on, SMEARED_PX) if grid else on).ravel())
+    return masks
 
 
 def matched_places(
     lines_m: Sequence[np.ndarray],
-    outlines: Sequence[np.ndarray],
-    places_m: np.ndarray,
-    pixels: Sequence[np.ndarray],
+    areas: Sequence[np.ndarray],
+    placed: Callable[[np.ndarray], np.ndarray],
+    levels: Sequence[Findings],
     radius_m: float,
     overlap: float | None,
-    shape: tuple[int, ...],
-    *,
-    grid: bool = True,
-) -> tuple[dict[int, int], int]:
-    """Match as `matched` does: damages by their centre lines and flat pixels ``outlines``, findings by their places
-    (m, 2) and flat ``pixels``; ``shape`` of the cloud, which has a pixel ``grid`` or not."""
-    if not lines_m or not len(places_m):
-        return {}, 0
-    apart = np.array([from_line_m(line, places_m) for line in lines_m])
-    lies = np.zeros(apart.shape, bool)
-    for i, outline in enumerate(outlines if overlap is not None else ()):
-        on = np.zeros(shape, bool)
-        on.ravel()[outline] = True
-        on = (grown(on, SMEARED_PX) if grid else on).ravel()
-        lies[i] = [on[one].mean() >= overlap for one in pixels]
-    pairs = closest_pairs(np.where(lies, np.fmin(apart, radius_m), apart), radius_m)
-    return pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))
+) -> list[tuple[dict[int, int], int]]:
+    """Match as `matched` does: damages by their centre lines and masks ``areas`` (none without an ``overlap``), and the
+    findings at each of several thresholds, whose centres ``placed`` brings onto the face."""
+    places_m = placed(np.concatenate([found.centres_m for found in levels]))
+    apart = np.array([from_line_m(line, places_m) for line in lines_m]).reshape(len(lines_m), len(places_m))
+    matches, start = [], 0
+    for found in levels:
+        count = len(found.scores)
+        near, start = apart[:, start : start + count], start + count
+        if not len(areas):
+            matches.append((closest_pairs(near, radius_m), 0))
+            continue
+        sizes = np.bincount(found.labels, minlength=count)
+        on = [np.bincount(found.labels[area[found.pixels]], minlength=count) for area in areas]
+        lies = np.array(on).reshape(-1, count) >= overlap * sizes
+        pairs = closest_pairs(np.where(lies, np.fmin(near, radius_m), near), radius_m)
+        matches.append((pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))))
+    return matches
 
 
 @lru_cache(maxsize=32)
@@ -312,8 +335,9 @@ def _operating(
     known: KnownCloud, judged: JudgedCloud, threshold: float, radius_m: float, *, hole_free: bool
 ) -> dict[str, list[Any]]:
     """Lists over the grid of thresholds: numbers of findings and of hits."""
-    detector, evidence, cloud = judged.detector, judged.evidence, known.cloud
     thresholds = grid(threshold, FINDING_OCTAVES).tolist()
-    found = [detector.find(cloud, evidence, threshold) for threshold in thresholds]
-    hits = [0 if hole_free else len(matched(known, each, radius_m, judged.overlap)[0]) for each in found]
-    return {"threshold": thresholds, "findings": [len(each) for each in found], "hits": hits}
+    found = findings_at(judged.detector, known.cloud, judged.evidence, thresholds)
+    hits = [0] * len(found)
+    if not hole_free:
+        hits = [len(pairs) for pairs, _ in _matched(known, found, radius_m, judged.overlap)]
+    return {"threshold": thresholds, "findings": [len(each.scores) for each in found], "hits": hits}

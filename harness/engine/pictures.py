@@ -158,8 +158,8 @@ def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | 
     for n, damage in enumerate(known.truth):
         kind: Kind = "found" if n in judged.pairs else "missed"
         add(damage.centre_board_m, damage.diameter_m, str(damage.id), kind)
-    for n, (place_m, measured) in enumerate(zip(judged.places_m, judged.measured, strict=True)):
-        diameter_m = measured.extent_diameter_m
+    for n, (place_m, detection) in enumerate(zip(judged.places_m, judged.detections, strict=True)):
+        diameter_m = judged.detector.measure(cloud, judged.evidence, detection).extent_diameter_m
         kind = "finding" if n in judged.pairs.values() else "false call"
         add(place_m, diameter_m, f"{diameter_m / MM:.1f}", kind)
     merged = maps.merged(mapping, frames)

@@ -12,8 +12,10 @@ from functools import cached_property
 from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 
+from detectors.clusters import PLAIN
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, invert, rotate_vectors, transform_points
 from scenes.render.cache import read_view
@@ -330,18 +332,40 @@ def highest_within(
 ) -> np.ndarray:
     """Return (n,) the highest of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN where
     there is none. ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere."""
-    finite = np.isfinite(score)
-    places, scores, found = places_m[finite], score[finite], []
+    flat, scores, found = places_m.reshape(-1, 2), score.ravel(), []
     for line in map(np.atleast_2d, lines_m):
-        about = ((places >= line.min(axis=0) - radius_m) & (places <= line.max(axis=0) + radius_m)).all(axis=-1)
-        near = scores[about][from_line_m(line, places[about]) <= radius_m]
-        found.append(near.max() if near.size else np.nan)
+        near = _about(flat, scores, *(line.min(axis=0) - radius_m), *(line.max(axis=0) + radius_m))
+        near = near[from_line_m(line, flat[near]) <= radius_m]
+        found.append(scores[near].max() if near.size else np.nan)
     return np.array(found)
 
 
+@numba.njit(**PLAIN)
+def _about(  # type: ignore[no-untyped-def]
+    places: np.ndarray, scores: np.ndarray, west: float, north: float, east: float, south: float
+):
+    """Return the numbers of the places (n, 2) in a rectangle that have a finite score."""
+    inside = np.empty(len(places), np.int64)
+    count = 0
+    for i in range(len(places)):
+        x, y = places[i]
+        inside[count] = i
+        count += (x >= west) & (x <= east) & (y >= north) & (y <= south) & np.isfinite(scores[i])
+    return inside[:count]
+
+
+@numba.njit(**PLAIN)
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:
     """Return (h, w) area that each pixel covers of the plane on which the pixels lie at ``places_m`` (h, w, 2): of the
     parallelogram of the central differences, at the grid's edge of the one-sided ones. NaN beside a pixel that lies
     nowhere; h and w are 2 at least."""
-    down, across = np.gradient(places_m, axis=(0, 1))
-    return np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    h, w, _ = places_m.shape
+    areas = np.empty((h, w))
+    for v in range(h):
+        up, down = max(v - 1, 0), min(v + 1, h - 1)
+        for u in range(w):
+            left, right = max(u - 1, 0), min(u + 1, w - 1)
+            along, across = places_m[v, right] - places_m[v, left], places_m[down, u] - places_m[up, u]
+            area = abs(along[0] * across[1] - along[1] * across[0])
+            areas[v, u] = area / ((right - left) * (down - up))
+    return areas
