@@ -82,7 +82,6 @@ def perspectives(
         axes=MAP_AXES,
         noise=pd.DataFrame(),
         registrations=pd.concat(rows, ignore_index=True),
-        walls=walls(counts),
     )
 
 
@@ -97,7 +96,6 @@ def with_variation(
         joined(replace(found, noise=more.noise), more),
         axes=MAP_AXES,
         noise=pd.DataFrame(),
-        walls=found.walls,
         registrations=pd.concat([found.registrations, own], ignore_index=True),
     )
 
@@ -178,23 +176,6 @@ def registrations(
                         )
         known = max(known, views)
     return pd.DataFrame(rows)
-
-
-def walls(counts: Sequence[int]) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "views": views,
-                "hole": str(number),
-                "true_diameter_mm": diameter,
-                "depth_mm": 12.7,
-                "unseen_share": 0.6 / (1 + diameter / 10) / np.sqrt(views),
-                "shadowed_share": 0.7 / (1 + diameter / 10) / np.sqrt(views),
-            }
-            for views in counts
-            for number, diameter in enumerate(DIAMETERS_MM, start=1)
-        ]
-    )
 
 
 def circle(x_mm: float, y_mm: float, diameter_mm: float, label: str, kind) -> Circle3d:

@@ -24,7 +24,6 @@ class Tables:
     noise: pd.DataFrame
     axes: pd.DataFrame
     registrations: pd.DataFrame = field(default_factory=pd.DataFrame)
-    walls: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_tables import World, joined, tables
 
-from harness.evaluation.set_ups import Ladder, effect_costs, effects_table, found_limit_mm, half_size, ladder_of
+from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, ladder_of
 from harness.evaluation.summary import summarise_holes
 
 
@@ -99,33 +99,25 @@ def switched(first_found: dict[tuple[str, ...], int], names: tuple[str, ...]):
 
 def test_costs_are_differences_of_the_half_sizes():
     names = ("noise", "fixed_pattern")
-    together = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
-    few, many = effect_costs(together)
-    assert (few.frames, many.frames) == (1, 50)
-    noise, pattern = many.effects
-    assert (noise.effect, pattern.effect) == ("noise", "fixed pattern")
-    step = 25.4 / 16
-    assert noise.alone.mm == pytest.approx(2 * step)
-    assert noise.last.mm == pytest.approx(2 * step)
-    assert pattern.alone.mm == pytest.approx(step)
-    assert many.together.mm == pytest.approx(3 * step)
-    assert noise.alone.certain
-    assert noise.alone.interval.low == pytest.approx(noise.alone.interval.high)  # the same chance on both sides
-    rows = effects_table(together)
+    rows = effect_costs(switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names))
+    assert rows["frames"].tolist() == [1] * 5 + [50] * 5
     assert rows["effect"].tolist() == ["noise", "fixed pattern", "noise", "fixed pattern", "all"] * 2
     assert rows["against"].tolist() == ["nothing", "nothing", "all others", "all others", "nothing"] * 2
-    assert rows["loss_mm"].tolist()[5:] == pytest.approx([2 * step, step, 2 * step, step, 3 * step])
+    step = 25.4 / 16
+    assert rows["loss_mm"].tolist() == pytest.approx([2 * step, step, 2 * step, step, 3 * step] * 2)
+    assert rows["on_ladder"].all()
+    assert rows["loss_low_mm"][0] == pytest.approx(rows["loss_high_mm"][0])  # the same chance on both sides
 
 
 def test_a_size_off_the_ladder_gives_a_bound():
     names = ("noise", "fixed_pattern")
-    together = switched({(): 1, ("noise",): 99, ("fixed_pattern",): 4, names: 99}, names)
-    noise, pattern = effect_costs(together)[0].effects
-    assert noise.alone.mm == np.inf
-    assert np.isnan(pattern.last.mm) or pattern.last.mm == np.inf
-    assert not noise.alone.certain
-    assert not pattern.alone.certain  # nothing on finds the smallest hole already
+    rows = effect_costs(switched({(): 1, ("noise",): 99, ("fixed_pattern",): 4, names: 99}, names))
+    noise_alone, pattern_alone, _, pattern_last = rows["loss_mm"][:4]
+    assert noise_alone == np.inf
+    assert np.isnan(pattern_last) or pattern_last == np.inf
+    # nothing on finds the smallest hole already
+    assert not rows["on_ladder"][0] and not rows["on_ladder"][1] and np.isfinite(pattern_alone)
 
 
 def test_without_switches_there_are_no_costs():
-    assert effect_costs(tables()) == []
+    assert effect_costs(tables()).empty

@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from html import unescape
 
-import pandas as pd
 import pytest
 from synthetic_perspectives import MapWorld, map_example, name_of, perspectives, with_variation
 from synthetic_tables import provenance
@@ -108,8 +107,8 @@ def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
     assert "5 of 11 <small>7–11" in row
 
 
-def test_without_pictures_and_walls_the_page_says_so(small):
-    bare = perspectives_html(replace(small, walls=pd.DataFrame()), [], About(provenance(), YAML, "T"))
+def test_without_pictures_the_page_says_so(small):
+    bare = perspectives_html(small, [], About(provenance(), YAML, "T"))
     assert text_of(bare).count("No data for this figure were kept") == 1
     for name in ("merged",):
         assert f'<figure id="{name}">' not in bare

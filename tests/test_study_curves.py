@@ -13,7 +13,7 @@ from synthetic_study import PIXEL_GRID, RADIUS_MM, THRESHOLD, SetUp, Study, Tabl
 
 from harness.evaluation.intervals import false_call_rate
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curves
-from harness.evaluation.study.limit import SetUpLimit, limit_of, pod_at, surface_of
+from harness.evaluation.study.limit import SetUpLimit, limit_of, surface_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.result import FRAMES, axis_lines, difference
 
@@ -286,26 +286,6 @@ class TestSurface:
         hit = np.log(seen.diameter_mm) + 0.3 * np.log(seen.depth_mm) > 2.2
         surface, why = surface_of(dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit)))
         assert surface is None and "separation" in why
-
-
-class TestPodAtDiameters:
-    def test_curve_band_and_neighbours(self):
-        limit = limit_of(study_record(Study(hole_free_boards=0)).set_ups[0])
-        small, middle, large = pod_at(limit, [1.5875, limit.a90_95.value, 25.4])
-        assert (small.extrapolated, middle.extrapolated, large.extrapolated) == (False, False, True)
-        assert middle.lower == pytest.approx(0.9, abs=1e-3) and middle.lower < middle.pod < middle.upper
-        assert (large.near, np.isnan(large.near_rate), large.near_interval.known) == (0, True, False)
-        size, hit = limit.record.inspected.diameter_mm, limit.record.inspected.hit
-        near = np.abs(size - 1.5875) <= 0.15875
-        assert small.near == near.sum() and small.near_rate == hit[near].mean()
-
-    def test_no_curve_leaves_the_neighbours(self):
-        record = study_record(Study(hole_free_boards=0)).set_ups[0]
-        all_found = dataclasses.replace(record.inspected, hit=np.ones(480, bool))
-        row = pod_at(limit_of(dataclasses.replace(record, inspected=all_found)), [6.0])[0]
-        assert np.isnan(row.pod) and np.isnan(row.lower) and row.near_rate == 1.0
-        # Clopper and Pearson with all found: the lower end is 0.025 ^ (1 / n)
-        assert row.near_interval.low == pytest.approx(0.025 ** (1 / row.near))
 
 
 @pytest.fixture(scope="module")

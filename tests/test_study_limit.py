@@ -20,7 +20,6 @@ from harness.evaluation.study.limit import (
     design_effect,
     limit_of,
     median_over_boards,
-    pod_at,
     refitted_sizes,
     row_weights,
     targets_of,
@@ -66,7 +65,7 @@ class TestDepth:
         assert of_depth.a90_95 == of_diameter.a90_95 and of_depth.largest_mm == sizes.max()
         assert np.array_equal(of_depth.a90_draws_mm, of_diameter.a90_draws_mm)
         assert "mm deep is found" in limit_sentence(of_depth) and "deep" not in limit_sentence(of_diameter)
-        assert of_depth.statement.size_column == "depth" and pod_at(of_depth, [5.0]) == ()
+        assert of_depth.statement.read.size_column == "depth"
         assert not any("one curve over all depths" in note for note in of_depth.statement.notes)
 
     def test_without_several_depths_it_is_of_diameter(self, small):
@@ -89,7 +88,7 @@ class TestHeadline:
     def test_repeats_of_one_damage_are_one_target(self, repeated):
         limit, seen = limit_of(repeated), repeated.inspected
         assert limit.targets == 120 and limit.inspections == 360
-        assert limit.statement.targets == 120
+        assert limit.statement.read.targets == 120
         assert limit.a90_95.value > limit.statement.independent.value
         by_hand = choose_model(seen.diameter_mm, seen.hit, inspections=seen.board * 100 + seen.hole.astype(int))
         near = [fit for fit in by_hand if fit.deviance <= by_hand[0].deviance + 2 * 3]  # every target counts thrice

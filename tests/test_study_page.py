@@ -19,7 +19,6 @@ from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
 from harness.tables.text import text_of, unbroken
 from harness.vocabulary.errors import UserError
-from scenes.target.thesis import DIAMETERS_IN
 
 PROVENANCE = {
     "command": "python -m harness.sweep experiments/x.yaml",
@@ -38,7 +37,6 @@ SECTIONS = [
     "Signal against size",
     "Operating curves",
     "Examples",
-    "Common drills",
     "Limits of validity",
     "Failures",
     "Provenance",
@@ -48,7 +46,7 @@ SECTIONS = [
 def judged(study: Study, **changed: object) -> StudyResult:
     record, tables = study_record(study), study_tables(study)
     record = replace(record, **changed)  # type: ignore[arg-type]
-    return evaluate_study(record, tables, {}, diameters_mm=[25.4 * size for size in DIAMETERS_IN], draws=60)
+    return evaluate_study(record, tables, {}, draws=60)
 
 
 def small(*set_ups: SetUp, **changed: object) -> Study:
@@ -223,16 +221,6 @@ def test_an_axis_may_hold_mappings() -> None:
     assert "every target was missed" in words(page)
 
 
-def test_the_drills_of_the_thesis_have_their_chances(whole: StudyResult, page: str) -> None:
-    text = section(page, "Common drills")
-    assert len(re.findall(r"\b(?:1/16|1/8|3/16|1/4|5/16|3/8|7/16|1/2|5/8|3/4|1) in\b", text)) == 11 * 4
-    row = whole.set_ups[0].sizes[4]
-    assert row.diameter_mm == pytest.approx(7.9375)
-    assert f"{100 * row.pod:.0f} % (" in text
-    # 5/8, 3/4 and 1 inch lie beyond the 14 mm inspected, for each of four set-ups.
-    assert text.count(" yes ") == 3 * 4
-
-
 def test_validity_is_the_results_own(whole: StudyResult, page: str) -> None:
     text = section(page, "Limits of validity")
     for heading, sentences in whole.validity:
@@ -247,7 +235,6 @@ def test_where_nothing_is_found_the_page_says_so() -> None:
     left_out = ("Limits against what was varied", "Size and depth")
     assert headings(page) == [name for name in SECTIONS if name not in left_out]
     assert "a90/95 is not demonstrated: every target was missed" in words(page)
-    assert "–" in section(page, "Common drills")
     assert "No example was kept." in page
     assert "nan" not in words(page).split()
 
@@ -333,7 +320,6 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
     assert "No undamaged board was inspected" in text
     assert "none: given" in text
     assert "Thresholds were given, not calibrated" in text
-    assert "Common drills" not in headings(page)
 
 
 def test_the_same_input_gives_the_same_file(tmp_path: Path, single: StudyResult, single_page: str) -> None:

@@ -14,7 +14,6 @@ from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.result import StudyResult, difference, evaluate_study, validity_of
 
-DIAMETERS_MM = 25.4 * np.array([1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16]) / 16
 FACTS: dict[str, Any] = {
     "source": {
         "kind": "simulated",
@@ -48,7 +47,7 @@ def study() -> Study:
 
 @pytest.fixture(scope="module")
 def result(study) -> StudyResult:
-    return evaluate_study(study_record(study), study_tables(study), FACTS, diameters_mm=DIAMETERS_MM, draws=200)
+    return evaluate_study(study_record(study), study_tables(study), FACTS, draws=200)
 
 
 def section(result: StudyResult, heading: str) -> str:
@@ -61,7 +60,6 @@ class TestStudy:
         for one in result.set_ups:
             assert one.limit.statement is not None and one.surface is not None and one.chance.laid > 0
             assert len(one.roc) == 4 and one.free_response is not None and one.pixels is not None
-            assert [row.diameter_mm for row in one.sizes] == list(DIAMETERS_MM)
             assert one.limit.signals.signal.left == one.noise_floor < THRESHOLD
         assert [line.axis for line in result.axes] == ["capture.frames"]
         assert result.axes[0].steps[0].beyond_chance and result.axes[0].steps[0].ratio < 1
@@ -84,7 +82,7 @@ class TestStudy:
     def test_a_record_from_its_file_gives_the_same_limits(self, study, result, tmp_path):
         file = tmp_path / "study.json"
         file.write_text(record_text(study_record(study)))
-        again = evaluate_study(read_record(file), study_tables(study), FACTS, diameters_mm=DIAMETERS_MM, draws=200)
+        again = evaluate_study(read_record(file), study_tables(study), FACTS, draws=200)
         for one, other in zip(result.limits, again.limits, strict=True):
             assert one.a90_95 == other.a90_95 and np.array_equal(one.a90_draws_mm, other.a90_draws_mm)
         assert again.validity == result.validity

@@ -29,14 +29,12 @@ from harness.tables.text import Grid, show
 from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
-from harness.vocabulary.geometry import INCH, MM
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import in_words, names_of
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
-from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.thesis import DIAMETERS_IN
 
 MOST_FAILURES = 200  # failures that are listed; the journal has all
 MOST_VIEWS = 64  # views whose render noise is measured: evenly taken from all, 4 MB each
@@ -137,13 +135,7 @@ def _write_study(
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     provenance["warnings"] += without_limit(experiment.points, outcome, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
-    # where any set-up's damage is drilled holes, the diameters of the thesis' holes are looked at
-    targets = [point.config.simulated.target for point in experiment.points]
-    drilled = any(
-        isinstance(target, DrawnTargetConfig) and target.damage.kind in ("through", "blind") for target in targets
-    )
-    diameters_mm = [size_in * INCH / MM for size_in in DIAMETERS_IN] if drilled else []
-    result = evaluate_study(study, tables, experiment.data, diameters_mm=diameters_mm)
+    result = evaluate_study(study, tables, experiment.data)
     shown = list(shown_in(plan, result.limits))
     # of trials that were run on other machines the views may not be here
     lost = render_missing((job for damage in shown for job in damage.batch.renders), engine)

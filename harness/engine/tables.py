@@ -13,19 +13,15 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
-from harness.evaluation.profile import shadowed_shares
-from harness.evaluation.set_ups import compare_set_ups, effects_table, set_ups_of
+from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point
 from harness.experiment.unfold import FRAMES
 from harness.tables import trials
 from harness.tables.schema import Table, write_table
-from harness.vocabulary.geometry import MM, invert, transform_points
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import names_of, unit_of
 from harness.vocabulary.provenance import RESULTS_VERSION
-from scenes.perspectives import poses_of
-from scenes.sensor.camera import camera_of
-from scenes.target.truth import truth_of
 
 RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, "registrations": trials.REGISTRATIONS}
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
@@ -79,14 +75,12 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         }
         return pd.DataFrame(table, copy=False)
 
-    walls = _walls(experiment) if experiment.config.study is None else pd.DataFrame()
     return trials.ResultTables(
         **{name: with_axes(ordered(name, table)) for name, table in RECORDED.items()},
         **{name: ordered(name, table) for name, table in OF_STUDY.items()},
         probes=with_axes(_probes(probes)),
         variants=variants,
         axes=axes,
-        walls=walls,
     )
 
 
@@ -185,29 +179,6 @@ def _reason(experiment: Experiment, point: Point) -> str:
     return ""
 
 
-def _walls(experiment: Experiment) -> pd.DataFrame:
-    """The share of each hole's wall that no view sees in light, by number of views of the experiment's own set-ups
-    (columns: `harness.evaluation.profile`); empty where it has no views."""
-    set_ups = [point.config for point in experiment.points if not point.is_variation]
-    mappings = [config.mapping for config in set_ups if config.mapping is not None]
-    if not mappings:
-        return pd.DataFrame()
-    source = next(config.simulated for config in set_ups if config.mapping is not None)
-    assert source.views is not None
-    target, emitter_m = source.target.declare(), camera_of(source.camera).optics.emitter_m
-    boards = [invert(pose.T_camera_board) for pose in poses_of(source.views, target.pose)]
-    counts = sorted({mapping.views or len(boards) for mapping in mappings})
-    lenses = np.array([T_board_camera[:3, 3] for T_board_camera in boards])
-    emitters = np.array([transform_points(T_board_camera, emitter_m) for T_board_camera in boards])
-    rows = []
-    for damage in truth_of(target, invert(boards[0])):
-        if damage.kind in ("through", "blind"):
-            mouth = (damage.centre_board_m, damage.diameter_m, damage.depth_m)
-            shares = shadowed_shares(lenses, emitters, *mouth, counts)
-            rows += [{"hole": str(damage.id), **row} for row in shares]
-    return pd.DataFrame(rows)
-
-
 # ---------------------------------------------------------------- files
 
 
@@ -239,7 +210,7 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict
         verdicts = [verdict] if verdict else []
         posterior = posterior_of(summary[summary["variant"].isin(variants)], paths)
         found |= {} if posterior is None else {trials.POSTERIOR: posterior}
-        if not (effects := effects_table(tables)).empty:
+        if not (effects := effect_costs(tables)).empty:
             found[trials.EFFECTS] = effects
     else:
         verdicts = score_claims(tables, MAIN, examples, summary)

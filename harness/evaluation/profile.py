@@ -1,19 +1,11 @@
-"""The shape that a hole shows in an averaged cloud, and the share of its wall that no view can see.
-
-Walls are pure geometry: a straight bore with a circular mouth of radius r in the plane z = 0. A wall point at depth t
-and azimuth e (a unit vector) looks at a lens at height H above the mouth and L beside its centre through the point of
-the mouth at (1 - s) r e + s L with s = t / (t + H). That lies inside where s <= 2 r (r - e . L) / |L - r e|^2, so each
-azimuth is seen from the rim down to one depth, and the shares need an average over azimuths only."""
+"""The shape that a hole shows in an averaged cloud: a flat floor, or a bowl."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
-
-from harness.vocabulary.geometry import MM
 
 RINGS = (0.25, 0.5, 0.75)
 """Fractions of the hole's radius at which the depth reached is told; each ring is +-0.125 wide."""
@@ -39,34 +31,33 @@ class HoleInView:
     depth_mm: float
 
 
-class AveragedCloud(Protocol):
-    """The part of an example that the shape needs: residual and truth on one pixel grid (h, w)."""
+@dataclass(frozen=True)
+class ExampleCloud:
+    """One averaged cloud of one variant, on its pixel grid (h, w). ``residual_mm``: distance behind (+) or before (-)
+    the fitted surface, NaN where none; ``detected`` bool: pixels of the detector's clusters; ``inside`` bool: of the
+    crop; ``truth``: the holes on it; ``z_truth_mm``: true z along each pixel's central ray, NaN where it meets nothing;
+    ``outlines_px``: rims of ``truth``, (k, 2) columns and rows."""
 
-    @property
-    def residual_mm(self) -> np.ndarray: ...
-    @property
-    def z_truth_mm(self) -> np.ndarray: ...
-    @property
-    def inside(self) -> np.ndarray: ...
-    @property
-    def truth(self) -> Sequence[HoleInView]: ...
+    frames: int
+    variant: str
+    residual_mm: np.ndarray
+    detected: np.ndarray
+    inside: np.ndarray
+    truth: tuple[HoleInView, ...]
+    z_truth_mm: np.ndarray
+    outlines_px: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
 class HoleShape:
-    """One-parameter fits to the depth inside a hole's outline, mm: a flat floor, and the hemisphere on the same rim
-    scaled; ``seen_rms_mm``: misfit of the true hole as seen, scaled, NaN where the truth has gaps. ``true_*``: the same
-    of the true geometry, a control. ``reached``: median depth in the `RINGS` over the true floor's."""
+    """Root mean square misfits in mm of shapes scaled in depth to what is inside a hole's outline: a flat floor, and
+    the hemisphere on the same rim. ``true_*``: the same of the true geometry, a control. ``reached``: median depth in
+    the `RINGS` over the true floor's."""
 
     hole: str
-    diameter_mm: float
     pixels: int
-    cylinder_depth_mm: float
     cylinder_rms_mm: float
-    bowl_depth_mm: float
     bowl_rms_mm: float
-    seen_rms_mm: float
-    true_depth_mm: float
     true_cylinder_rms_mm: float
     true_bowl_rms_mm: float
     reached: tuple[float, ...]
@@ -79,14 +70,14 @@ class HoleShape:
         return "cylinder" if self.cylinder_rms_mm <= CLEARLY * self.bowl_rms_mm else "neither"
 
 
-def relative_radius(cloud: AveragedCloud, hole: HoleInView) -> np.ndarray:
+def relative_radius(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
     """(h, w): distance from the hole's centre over its radius, in the image plane. Not modelled: foreshortening; a tilt
     of the board by t squeezes one direction by cos t (1.5 % at 10 degrees)."""
     v, u = np.indices(cloud.residual_mm.shape)
     return np.hypot(u - hole.u_px, v - hole.v_px) / hole.radius_px
 
 
-def true_residual_mm(cloud: AveragedCloud, hole: HoleInView) -> np.ndarray:
+def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
     """(h, w): true z minus the undamaged face's, continued over the hole by a quadratic through its surroundings. The
     surroundings are the board's pixels from 1.2 to 3 radii (at least 4 pixels wide) that lie in no other hole. NaN
     everywhere where there are too few of them for six coefficients."""
@@ -103,7 +94,7 @@ def true_residual_mm(cloud: AveragedCloud, hole: HoleInView) -> np.ndarray:
     return cloud.z_truth_mm - terms @ coefficients
 
 
-def hole_shape(cloud: AveragedCloud, hole: HoleInView) -> HoleShape | None:
+def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
     """Fit both shapes to the measured residual inside the outline; None where too few of its pixels are valid."""
     radius = relative_radius(cloud, hole)
     outline = radius < 1
@@ -114,21 +105,13 @@ def hole_shape(cloud: AveragedCloud, hole: HoleInView) -> HoleShape | None:
     true_depth = true_residual_mm(cloud, hole)
     true_floor = _median(true_depth[(radius < 0.5) & np.isfinite(true_depth)])
     known = outline & np.isfinite(true_depth)
-    return HoleShape(
-        hole.hole,
-        hole.diameter_mm,
-        int(valid.sum()),
-        *_fit(measured, np.ones_like(rho)),
-        *_fit(measured, bowl(rho)),
-        seen_rms_mm=_fit(measured, true_depth[valid])[1],
-        true_depth_mm=true_floor,
-        true_cylinder_rms_mm=_fit(true_depth[known], np.ones(known.sum()))[1],
-        true_bowl_rms_mm=_fit(true_depth[known], bowl(radius[known]))[1],
-        reached=tuple(_median(measured[np.abs(rho - ring) <= 0.125]) / true_floor for ring in RINGS),
-    )
+    reached = tuple(_median(measured[np.abs(rho - ring) <= 0.125]) / true_floor for ring in RINGS)
+    flat, round_ = (_misfit(measured, shape) for shape in (np.ones_like(rho), bowl(rho)))
+    true_flat, true_round = (_misfit(true_depth[known], shape) for shape in (np.ones(known.sum()), bowl(radius[known])))
+    return HoleShape(hole.hole, int(valid.sum()), flat, round_, true_flat, true_round, reached)
 
 
-def hole_shapes(cloud: AveragedCloud) -> list[HoleShape]:
+def hole_shapes(cloud: ExampleCloud) -> list[HoleShape]:
     """The shapes of all holes large and valid enough, smallest first."""
     shapes = (hole_shape(cloud, hole) for hole in sorted(cloud.truth, key=lambda hole: hole.diameter_mm))
     return [shape for shape in shapes if shape is not None]
@@ -139,66 +122,12 @@ def bowl(rho: np.ndarray) -> np.ndarray:
     return np.sqrt(np.clip(1 - np.asarray(rho, float) ** 2, 0, None))
 
 
-def _fit(depth: np.ndarray, shape: np.ndarray) -> tuple[float, float]:
-    """Least-squares factor of ``shape`` and the rms misfit; NaN without data."""
-    if depth.size == 0 or not np.isfinite(shape).all() or not shape.any():
-        return float("nan"), float("nan")
-    factor = float(depth @ shape / (shape @ shape))
-    return factor, float(np.sqrt(np.mean((depth - factor * shape) ** 2)))
+def _misfit(depth: np.ndarray, shape: np.ndarray) -> float:
+    """Root mean square of depth less the least-squares multiple of ``shape``; NaN without data."""
+    if depth.size == 0 or not shape.any():
+        return float("nan")
+    return float(np.sqrt(np.mean((depth - (depth @ shape / (shape @ shape)) * shape) ** 2)))
 
 
 def _median(depth: np.ndarray) -> float:
     return float(np.median(depth)) if depth.size else float("nan")
-
-
-AZIMUTHS = 1440
-"""Directions around the wall; the mean over them is off by less than 1e-5 of the wall's area."""
-
-
-def shadowed_shares(
-    lens_board_m: np.ndarray,
-    emitter_board_m: np.ndarray,
-    centre_board_m: np.ndarray,
-    diameter_m: float,
-    depth_m: float,
-    counts: Iterable[int],
-) -> list[dict[str, float]]:
-    """Make one row for each of ``counts``, which takes the first so many views. ``lens_board_m``, ``emitter_board_m``
-    (n, 3): board frame (z out of the face). ``unseen_share``: of the wall's area that no lens sees through the mouth;
-    ``shadowed_share``: unseen or unlit in every view. Not modelled: the size of lens and emitter, the pixel's
-    footprint, light by another wall, a curved face. ValueError for a place not before the face, or too few views."""
-    lenses, emitters = (np.atleast_2d(np.asarray(places, float)) for places in (lens_board_m, emitter_board_m))
-    counts = list(counts)
-    if not all(1 <= count <= len(lenses) for count in counts):
-        raise ValueError(f"counts {counts} of {len(lenses)} views")
-    seen = _seen_depths(lenses - centre_board_m, diameter_m / 2)
-    lit = _seen_depths(emitters - centre_board_m, diameter_m / 2)
-    both = np.minimum(seen, lit)
-    return [
-        {
-            "views": count,
-            "true_diameter_mm": diameter_m / MM,
-            "depth_mm": depth_m / MM,
-            "unseen_share": _missing(seen[:count], depth_m),
-            "shadowed_share": _missing(both[:count], depth_m),
-        }
-        for count in counts
-    ]
-
-
-def _seen_depths(places_m: np.ndarray, radius_m: float) -> np.ndarray:
-    """(n, AZIMUTHS): down to which depth each place, relative to the mouth's centre, sees the wall; 0 where not."""
-    beside, height = places_m[:, None, :2], places_m[:, None, 2]
-    if not (height > 0).all():
-        raise ValueError("a lens or an emitter does not stand before the face")
-    turn = (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS
-    out = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    towards = (beside * out).sum(axis=-1)
-    apart2 = ((beside - radius_m * out) ** 2).sum(axis=-1)
-    share = np.maximum(2 * radius_m * (radius_m - towards), 0.0) / np.maximum(apart2, np.finfo(float).tiny)
-    with np.errstate(over="ignore"):
-        return np.where(share < 1, height * share / np.maximum(1 - share, np.finfo(float).tiny), np.inf)
-
-
-def _missing(depths_m: np.ndarray, depth_m: float) -> float:
-    return float(1 - np.minimum(depths_m.max(axis=0) / depth_m, 1.0).mean())

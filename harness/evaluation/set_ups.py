@@ -172,82 +172,44 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
     return row
 
 
-@dataclass(frozen=True)
-class SwitchCost:
-    """Change of the 50 % size in mm when a switch goes on (positive: only larger holes are found then). ``certain``:
-    whether both sizes lie on the ladder, so that the number is no mere bound."""
-
-    mm: float
-    interval: Interval
-    certain: bool
-
-
-@dataclass(frozen=True)
-class EffectCost:
-    """One switch: ``alone`` against nothing on, ``last`` against all others on."""
-
-    effect: str
-    alone: SwitchCost
-    last: SwitchCost
-
-
-@dataclass(frozen=True)
-class EffectCosts:
-    """All switches at one place (values of the experiment's other axes, as text) and number of frames, and everything
-    together against nothing."""
-
-    place: str
-    frames: int
-    effects: tuple[EffectCost, ...]
-    together: SwitchCost
-
-
-def effect_costs(tables: ResultTables) -> list[EffectCosts]:
-    """State the costs of every switch, for each place on the other axes and number of frames, if any."""
+def effect_costs(tables: ResultTables) -> pd.DataFrame:
+    """Return the table of effects: what each switch costs alone, against nothing on, and last, against all others on,
+    and what all cost together, for each place on the experiment's other axes and number of frames. Costs are paired
+    changes of the 50 % size; those of set-ups that were not finished with the same repeats are left out."""
     set_ups = tables.variants[tables.variants["switches"] != ""]
     if set_ups.empty:
-        return []
+        return EFFECTS.frame([])
     names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
-    others, found = list(tables.axes["path"])[1:], []
+    others, nothing, found = list(tables.axes["path"])[1:], frozenset[str](), list[dict[str, Any]]()
     for values, part in set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]:
         place = ", ".join(f"{names[path]}={value}" for path, value in zip(others, values, strict=True))
         switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
         by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
         everything = max(by_switches, key=len)
+        effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
+        asked = [(effect, "nothing", nothing, one) for effect, one in effects]
+        asked += [(effect, "all others", everything - one, everything) for effect, one in effects]
+        asked.append(("all", "nothing", nothing, everything))
         holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
         for frames, rows in holes.groupby("frames"):
             there = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
             ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
-            together, effects = _cost(ladders, frozenset(), everything), []
-            for name in switches[by_switches[everything]]:
-                alone = _cost(ladders, frozenset(), frozenset([name]))
-                last = _cost(ladders, everything - {name}, everything)
-                if alone and last:
-                    effects.append(EffectCost(name.replace("_", " "), alone, last))
-            if together is not None:
-                found.append(EffectCosts(place, int(str(frames)), tuple(effects), together))
-    return found
+            for effect, against, off, on in asked:
+                cost = _cost(ladders, off, on)
+                found += (
+                    [{"place": place, "frames": frames, "effect": effect, "against": against, **cost}] if cost else []
+                )
+    return EFFECTS.frame(found)
 
 
-def effects_table(tables: ResultTables) -> pd.DataFrame:
-    """Return `effect_costs` as rows of the table of effects."""
-    rows: list[dict[str, Any]] = []
-    for at in effect_costs(tables):
-        costs = [(one.effect, "nothing", one.alone) for one in at.effects]
-        costs += [(one.effect, "all others", one.last) for one in at.effects]
-        for effect, against, cost in (*costs, ("all", "nothing", at.together)):
-            ends = {"loss_low_mm": cost.interval.low, "loss_high_mm": cost.interval.high, "on_ladder": cost.certain}
-            named = {"place": at.place, "frames": at.frames, "effect": effect, "against": against}
-            rows.append({**named, "loss_mm": cost.mm, **ends})
-    return EFFECTS.frame(rows)
-
-
-def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> SwitchCost | None:
-    """The paired difference of two set-ups; None where either was not finished, or not with the same repeats."""
+def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> dict[str, Any]:
+    """The paired difference of two set-ups with its interval, and whether both sizes lie on the ladder, so that it is
+    no mere bound; empty where either was not finished, or not with the same repeats."""
     if off not in ladders or on not in ladders or ladders[off].detected.shape != ladders[on].detected.shape:
-        return None
+        return {}
     before, after = ladders[off], ladders[on]
     with np.errstate(invalid="ignore"):  # both off the ladder: a difference of infinities is unknown
-        draws = after.half_draws_mm - before.half_draws_mm
+        ends = percentiles(after.half_draws_mm - before.half_draws_mm)
         mm = float(np.subtract(after.half_mm, before.half_mm))
-    return SwitchCost(mm, percentiles(draws), certain=not (before.at_the_end or after.at_the_end))
+    on_ladder = not (before.at_the_end or after.at_the_end)
+    return {"loss_mm": mm, "loss_low_mm": ends.low, "loss_high_mm": ends.high, "on_ladder": on_ladder}

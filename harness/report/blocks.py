@@ -53,8 +53,8 @@ def template(name: str, folder: Path | None = None) -> Template:
         "style": Markup((HERE / "style.css").read_text(encoding="utf-8")),
         "script": Markup((HERE / "page.js").read_text(encoding="utf-8")),
         "figure": figure,
-        "warnings": (),
-        "closing": "",
+        **{"warnings": (), "figures": {}},
+        **dict.fromkeys(("closing", "conditions", "first", "caption", "scene"), ""),
     }
     return environment.get_template(name)
 

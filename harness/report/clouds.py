@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from harness.evaluation.profile import HoleInView
+from harness.evaluation.profile import ExampleCloud
 from harness.report.blocks import DAMAGE, INK, svg
 from harness.report.view3d import Scene3d
 from harness.tables.text import inches, many
@@ -23,23 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 Where = Literal["below", "at", "above"]
-
-
-@dataclass(frozen=True)
-class ExampleCloud:
-    """One averaged cloud of one variant, on its pixel grid (h, w). ``residual_mm``: distance behind (+) or before (-)
-    the fitted surface, NaN where none; ``detected`` bool: pixels of the detector's clusters; ``inside`` bool: of the
-    crop; ``truth``: the holes on it; ``z_truth_mm``: true z along each pixel's central ray, NaN where it meets nothing;
-    ``outlines_px``: rims of ``truth``, (k, 2) columns and rows."""
-
-    frames: int
-    variant: str
-    residual_mm: np.ndarray
-    detected: np.ndarray
-    inside: np.ndarray
-    truth: tuple[HoleInView, ...]
-    z_truth_mm: np.ndarray
-    outlines_px: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

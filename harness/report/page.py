@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.set_ups import LIMIT_RULE, EffectCosts, SwitchCost, compare_set_ups, effect_costs, set_ups_of
+from harness.evaluation.set_ups import LIMIT_RULE, compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import (
     MAIN,
     false_calls,
@@ -146,44 +146,52 @@ def noise_figure(noise: pd.DataFrame) -> str:
     return blocks.svg("noise", (10, 4.2), alt, draw)
 
 
-def cost_text(cost: SwitchCost) -> str:
-    """``+0.42 mm (0.30 to 0.55)``; a bound where a size lies off the ladder."""
-    if not np.isfinite(cost.mm):
-        return "off the ladder of sizes" if np.isnan(cost.mm) else f"{'+' if cost.mm > 0 else '−'}∞"
-    low, high = (f"{end:+.2f}" if np.isfinite(end) else "∞" for end in (cost.interval.low, cost.interval.high))
-    bound = "" if cost.certain else ", a bound: a size lies off the ladder"
-    return f"{cost.mm:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
+def cost_text(cost: sections.Row) -> str:
+    """``+0.42 mm (0.30 to 0.55)`` of a row of the table of effects; a bound where a size lies off the ladder."""
+    if not np.isfinite(cost["loss_mm"]):
+        return "off the ladder of sizes" if np.isnan(cost["loss_mm"]) else f"{'+' if cost['loss_mm'] > 0 else '−'}∞"
+    low, high = (f"{end:+.2f}" if np.isfinite(end) else "∞" for end in (cost["loss_low_mm"], cost["loss_high_mm"]))
+    bound = "" if cost["on_ladder"] else ", a bound: a size lies off the ladder"
+    return f"{cost['loss_mm']:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
 
 
-def effects_figure(costs: Sequence[EffectCosts]) -> str:
+def costs_by_place(costs: pd.DataFrame) -> dict[tuple[str, int], dict[tuple[str, str], sections.Row]]:
+    """The rows of the table of effects by place and frames, then by effect and what it is on against."""
+    found: dict[tuple[str, int], dict[tuple[str, str], sections.Row]] = {}
+    for row in sections.records(costs):
+        found.setdefault((row["place"], int(row["frames"])), {})[row["effect"], row["against"]] = row
+    return found
+
+
+def effects_figure(costs: pd.DataFrame) -> str:
     """Bars of every effect's cost with 95 % intervals, one panel for each place and number of frames."""
-    names = [one.effect for one in costs[0].effects]
+    names, places = list(dict.fromkeys(costs["effect"])), costs_by_place(costs)
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, len(costs), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, at in zip(panels, costs, strict=True):
-            for shift, colour, label, chosen in (
-                (-0.2, blocks.BLUE, "alone, against nothing on", [*(one.alone for one in at.effects), at.together]),
-                (0.2, blocks.ORANGE, "on top of all the others", [one.last for one in at.effects]),
+        panels = figure.subplots(1, len(places), squeeze=False, sharex=True, sharey=True)[0]
+        for axes, ((_, frames), at) in zip(panels, places.items(), strict=True):
+            for shift, colour, label, against in (
+                (-0.2, blocks.BLUE, "alone, against nothing on", "nothing"),
+                (0.2, blocks.ORANGE, "on top of all the others", "all others"),
             ):
-                places = np.arange(len(chosen)) + shift
-                sizes = np.array([one.mm if np.isfinite(one.mm) else 0.0 for one in chosen])
-                ends = np.array([[one.interval.low, one.interval.high] for one in chosen])
+                chosen = [(names.index(effect) + shift, row) for (effect, on), row in at.items() if on == against]
+                sizes = np.array([np.nan_to_num(row["loss_mm"], posinf=0.0, neginf=0.0) for _, row in chosen])
+                ends = np.array([[row["loss_low_mm"], row["loss_high_mm"]] for _, row in chosen])
                 errors = np.abs(np.where(np.isfinite(ends), ends, sizes[:, None]) - sizes[:, None]).T
-                axes.barh(places, sizes, 0.36, xerr=errors, color=colour, label=label, ecolor=blocks.INK, capsize=2)
-                for place, one in zip(places, chosen, strict=True):
-                    if not np.isfinite(one.mm):
+                style: dict[str, Any] = {"color": colour, "label": label, "ecolor": blocks.INK, "capsize": 2}
+                axes.barh([place for place, _ in chosen], sizes, 0.36, xerr=errors, **style)
+                for place, row in chosen:
+                    if not np.isfinite(row["loss_mm"]):
                         axes.text(0, place, " off the ladder", va="center", fontsize=8, color=blocks.GREY)
-            axes.set_title(many(at.frames, "frame"))
-            axes.set_xlabel("loss of the 50 % size (mm)")
+            axes.set(title=many(frames, "frame"), xlabel="loss of the 50 % size (mm)")
             axes.axvline(0, color=blocks.GREY, lw=1)
             axes.grid(axis="y", visible=False)
-        panels[0].set_yticks(range(len(names) + 1), [*names, "all together"])
+        panels[0].set_yticks(range(len(names)), [name.replace("all", "all together") for name in names])
         panels[0].invert_yaxis()
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
     alt = "Loss of the 50 per cent detectable diameter in millimetres to each effect, alone and on top of the others."
-    return blocks.svg("effects", (10, 0.42 * (len(names) + 1) + 1.6), alt, draw)
+    return blocks.svg("effects", (10, 0.42 * len(names) + 1.6), alt, draw)
 
 
 CAMERA = (
@@ -235,9 +243,9 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     figures: dict[str, str] = {}
     if len(compared) and layout.column_values and len(layout.rows) <= len(COLOURS):
         figures["limits"] = limits_figure(compared, layout, frames)
-    if not costs and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
+    if costs.empty and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
         figures["sights"] = sights_figure(sights)
-    figures |= {"effects": effects_figure(costs)} if costs else {}
+    figures |= {} if costs.empty else {"effects": effects_figure(costs)}
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
     everything = [str(name) for name in tables.variants["variant"]]
     everywhere = compare_set_ups(tables, summary, everything, half_sizes=False)
@@ -253,7 +261,7 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
         rule=sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule),
         posterior=blocks.joined(posterior_section(posterior)) if posterior is not None else "",
         found=sections.set_ups_grid(compared).html(),
-        costs=_costs_grid(costs).html() if costs else "",
+        costs="" if costs.empty else _costs_grid(costs).html(),
         sights_at=f" at {layout.columns[middle]}" if layout.columns else "",
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
@@ -263,9 +271,7 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
     )
 
 
-def set_ups_answer(
-    compared: pd.DataFrame, layout: Layout, costs: Sequence[EffectCosts], verdict: Verdict | None
-) -> str:
+def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdict: Verdict | None) -> str:
     """Say what the experiment found: each row's holes with the most frames, the dearest effect, C11."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
@@ -275,14 +281,17 @@ def set_ups_answer(
     rows = [f"{row} {', '.join(str(found.get(name, '–')) for name in names)}" for row, names in layout.rows.items()]
     where = f" at {', '.join(layout.columns)}" if layout.columns else ""
     said = [f"Found of {int(compared['holes'].max())} holes{where} with {_averaged(frames[-1])}: {'; '.join(rows)}."]
-    if costs:
-        said = []
-    for each in (costs_at for costs_at in costs if costs_at.frames in frames):
-        place = f"{each.place}, " if each.place else ""
-        moved = f"all effects together move the 50 % size by {cost_text(each.together)}"
-        dearest = max(each.effects, key=lambda one: np.nan_to_num(one.alone.mm, nan=-np.inf), default=None)
-        alone = f"; alone, {dearest.effect} does most: {cost_text(dearest.alone)}" if dearest else ""
-        said.append(f"With {place}{_averaged(each.frames)}, {moved}{alone}.")
+    said = said if costs.empty else []
+    for (named, count), at in costs_by_place(costs).items():
+        together = at.get(("all", "nothing"))
+        if together is None or count not in frames:
+            continue
+        place = f"{named}, " if named else ""
+        moved = f"all effects together move the 50 % size by {cost_text(together)}"
+        each = [row for (effect, against), row in at.items() if against == "nothing" and effect != "all"]
+        dearest = max(each, key=lambda row: np.nan_to_num(row["loss_mm"], nan=-np.inf), default=None)
+        alone = f"; alone, {dearest['effect']} does most: {cost_text(dearest)}" if dearest else ""
+        said.append(f"With {place}{_averaged(count)}, {moved}{alone}.")
     if verdict:
         said.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
     return " ".join(said)
@@ -292,14 +301,14 @@ def _averaged(frames: int) -> str:
     return "one frame" if frames == 1 else f"{frames} averaged frames"
 
 
-def _costs_grid(costs: Sequence[EffectCosts]) -> Grid:
-    places = [", ".join(part for part in (each.place, many(each.frames, "frame")) if part) for each in costs]
-    heads = ("effect", *(f"{place}: {which}" for place in places for which in ("alone", "on top of all others")))
-    rows = [
-        [one.effect, *(cost_text(cost) for each in costs for cost in (each.effects[at].alone, each.effects[at].last))]
-        for at, one in enumerate(costs[0].effects)
-    ]
-    rows.append(["all together", *(cell for each in costs for cell in (cost_text(each.together), "–"))])
+def _costs_grid(costs: pd.DataFrame) -> Grid:
+    places = costs_by_place(costs)
+    named = [", ".join(part for part in (place, many(frames, "frame")) if part) for place, frames in places]
+    heads = ("effect", *(f"{place}: {which}" for place in named for which in ("alone", "on top of all others")))
+    rows = []
+    for effect in dict.fromkeys(costs["effect"]):
+        cells = [at.get((effect, against)) for at in places.values() for against in ("nothing", "all others")]
+        rows.append([effect.replace("all", "all together"), *("–" if one is None else cost_text(one) for one in cells)])
     return Grid.of(heads, rows)
 
 

@@ -55,7 +55,7 @@ def pod_html(statement: PodStatement, command: str) -> str:
         "where the band's lower edge reaches 0.9."
     )
     chosen_by = (
-        f"Sorted by {statement.criterion}, smaller is nearer to the data. Unless one was asked for, that alone "
+        "Sorted by deviance, smaller is nearer to the data. Unless one was asked for, that alone "
         "chooses the curve, never the limit."
     )
     if len(statement.fits) > 1:
@@ -74,13 +74,15 @@ def pod_html(statement: PodStatement, command: str) -> str:
         body += [subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
     body += [heading("Notes"), bullets((*statement.notes, VALIDITY)), *command_of(command)]
     under = [note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
-    return page(f"Probability of detection: {statement.path.name}", answer(statement), body, under, statement.doubts)
+    return page(
+        f"Probability of detection: {statement.read.path.name}", answer(statement), body, under, statement.doubts
+    )
 
 
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
     """Return what a terminal shows: the page's tables and sentences."""
     parts: list[str | Grid] = [f"warning: {doubt}" for doubt in statement.doubts]
-    parts += [f"{statement.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
+    parts += [f"{statement.read.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
     parts += ["", models_grid(statement), "", sizes_grid(statement), "", fit_grid(statement)]
     if statement.tests:
         parts += ["", *(f"{what}: p = {p:.3g}, {reads}" for what, p, reads in statement.tests)]
@@ -104,7 +106,7 @@ MODELS = Table(
     "one row per model that was tried",
     (
         Column("", "model", lambda row: f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.near else ''}"),
-        Column("", "criterion", lambda row: f"{row.criterion:.2f}"),
+        Column("", "deviance", lambda row: f"{row.deviance:.2f}"),
         Column("", "a50", lambda row: sized(row.a50, "")),
         Column("", "a90", lambda row: sized(row.a90, "")),
         Column("", "a90/95", lambda row: _bound_text(row.bound, ""), tone=lambda row: "key" if row.chosen else ""),
@@ -117,7 +119,7 @@ def models_grid(statement: PodStatement) -> Grid:
     """The models that were tried; marked: that of the curve, and those whose bounds are compared with its own."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
     heads = {name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
-    return MODELS.grid(statement.models, heads={"criterion": statement.criterion, **heads})
+    return MODELS.grid(statement.models, heads=heads)
 
 
 def fit_grid(statement: PodStatement) -> Grid:
@@ -168,15 +170,15 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
         if statement.signal:
             draw_signals(panels[0], statement)
-            panels[0].set(ylabel=plain(statement.response_column), title="Signals")
+            panels[0].set(ylabel=plain(statement.read.response_column), title="Signals")
         draw_pod(panels[-1], statement)
         if statement.curve.log_size:
             _log_sizes(panels[-1], statement.sizes)
         panels[-1].set_ylabel("probability of detection")
-        panels[-1].set_title(f"Probability of detection, {statement.targets} targets")
+        panels[-1].set_title(f"Probability of detection, {statement.read.targets} targets")
         for axes in panels:
             axes.set_xlim(statement.sizes[0], statement.sizes[-1])
-            axes.set_xlabel(axis_text(statement.size_column, statement.unit))
+            axes.set_xlabel(axis_text(statement.read.size_column, statement.unit))
             axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
 
     return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
@@ -192,7 +194,7 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
     if statement.signal is None:
-        draw_hits(axes, statement.size, statement.response == 1, 0.6)
+        draw_hits(axes, statement.read.size, statement.read.response == 1, 0.6)
     for name, value, pod, colour in (
         ("a50", statement.a50, 0.5, GREEN),
         ("a90", statement.a90, POD, ORANGE),
@@ -240,13 +242,15 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
         if value is not None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
     left, right = -np.inf if model.left is None else model.left, np.inf if model.right is None else model.right
-    kept = (statement.response > left) & (statement.response < right)
+    kept = (statement.read.response > left) & (statement.read.response < right)
     many = len(kept) > MOST_MARKS
     marks: dict[str, Any] = {"s": 14, "color": INK, "alpha": 0.7, "lw": 0, "label": "signals", "rasterized": many}
-    axes.scatter(statement.size[kept], statement.response[kept], **marks)
+    axes.scatter(statement.read.size[kept], statement.read.response[kept], **marks)
     if ends:
         censored: dict[str, Any] = {"marker": "x", "color": PURPLE, "label": f"censored, {' or '.join(ends)}"}
-        axes.scatter(statement.size[~kept], statement.response[~kept], s=18, lw=1, rasterized=many, **censored)
+        axes.scatter(
+            statement.read.size[~kept], statement.read.response[~kept], s=18, lw=1, rasterized=many, **censored
+        )
     if model.log_signal:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)

@@ -12,12 +12,13 @@ from harness.evaluation.maps import compare_maps, label_of
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.study.result import conditions_of
 from harness.evaluation.summary import MAIN, found_rule, summarise_holes
-from harness.report.blocks import closing, heading, joined, note, paragraph, template
+from harness.report.blocks import closing, fold, heading, joined, note, paragraph, template
 from harness.report.scene import scene_svg
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
 from harness.tables.trials import CLAIMS, MARKS, SET_UPS, ResultTables
 from harness.thesis.claims import Verdict
+from harness.vocabulary.path_names import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,9 +94,9 @@ VARIED = Table(
     "variations",
     "one row per variation and number of frames, beside the set-up that it changes",
     (
-        Column("", "variation", lambda one: one.variant["variant"]),
+        Column("", "variation", lambda one: in_words(one.variant["variant"])),
         Column("", "why", _why),
-        Column("", "changes", lambda one: one.variant["reference"] or "–"),
+        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–").replace(MAIN, "the main set-up")),
         Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
         Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
         *(
@@ -135,8 +136,11 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
     """A heading and the table of claims; nothing without verdicts. Pages of other targets hold none of it."""
-    rows = [vars(verdict) for verdict in verdicts]
-    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows).html()] if rows else [])
+    if not verdicts:
+        return Markup("")
+    rows, told = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
+    criteria = fold("Criteria, fixed beforehand", CLAIMS.grid(rows, only=("claim", "criterion")).html())
+    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=told).html(), criteria])
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:

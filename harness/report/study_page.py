@@ -324,7 +324,6 @@ def study_html(
         operating=table(study.OPERATING),
         operating_notes=study.operating_notes(result.set_ups),
         examples=named,
-        sizes=table(study.SIZES),
         validity=result.validity,
         figures=figures,
         closing=joined(closing(provenance, resolved_yaml)),

@@ -301,7 +301,7 @@ def notes_of(limit: SetUpLimit) -> list[str]:
             size = text.size(wrong.value, limit.largest_mm)
             claimed = f"would be {size} mm" if wrong.demonstrated else "would not be demonstrated either"
             said.append(
-                f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.targets} "
+                f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.read.targets} "
                 "targets"
             )
     if limit.a50_mm <= 0:

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.evaluation.intervals import Interval
 from harness.evaluation.pod.statement import CONFIDENCE
 from harness.evaluation.study.curves import PRO_LIMIT, PixelCurves, Roc
-from harness.evaluation.study.limit import SetUpLimit, SizeRow
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.result import FRAMES, AxisLine, Difference, SetUpResult, StudyResult
 from harness.tables import text
@@ -48,7 +47,7 @@ def _share_text(pod: float | None) -> str:
 
 def _pod_at_smallest(result: SetUpResult) -> float | None:
     stated = result.limit.statement
-    return None if stated is None else float(stated.curve.pod(np.array(stated.size.min())))
+    return None if stated is None else float(stated.curve.pod(np.array(stated.read.size.min())))
 
 
 SHUFFLED, UNFLAWED = ("chance.probability", "chance.interval"), ("chance.of_sites", "chance.sites_interval")
@@ -209,7 +208,7 @@ SIGNALS = Table(
         SET_UP,
         Column("model", "model", "signals.model", "the regression chosen"),
         Column("", "tests speak against", _against),
-        Column("signals", "signals", lambda one: len(one.signals.size), "signals in the regression"),
+        Column("signals", "signals", lambda one: len(one.signals.read.size), "signals in the regression"),
         Column("a50_mm", "a50 (mm)", lambda one: Estimate(one.signals.a50, most=one.largest_mm), FOUND_50),
         Column("a90_mm", "a90 (mm)", lambda one: Estimate(one.signals.a90, most=one.largest_mm), FOUND_90),
         Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one, one.signals.bound), BOUND, bound_text),
@@ -450,35 +449,7 @@ DEPTH_LIMITS = Table(
 )
 
 
-class KnownSize(NamedTuple):
-    """POD of one set-up at a known hole: its number, its row, the bounds of its POD."""
-
-    limit: SetUpLimit
-    number: int
-    row: SizeRow
-    ends: Interval
-
-
-def _pod_text(pod: Estimate) -> str:
-    ends = f" ({text.percent(pod.low)} to {text.percent(pod.high)})"
-    return text.UNKNOWN_TEXT if np.isnan(pod.value) else f"{text.percent(pod.value)} %{ends}"
-
-
-SIZES = Table(
-    "known_sizes",
-    "one row per set-up, number of frames and hole of the thesis' board: probability of detection at its diameter",
-    (
-        SET_UP_OF,
-        Column("hole", "hole", "number", "number of the hole"),
-        Column("", "drill", lambda one: text.inches(one.row.diameter_mm)),
-        Column("diameter_mm", "mm", "row.diameter_mm", "its diameter"),
-        Column("pod", "POD (95 %)", ("row.pod", "ends"), "from the curve, with one-sided 95 % bounds", _pod_text),
-        Column("extrapolated", "outside", "row.extrapolated", "outside the sizes inspected"),
-        Column("near", "targets near", "row.near", "targets within 10 % of the diameter"),
-        Column("near_rate", "found", ("row.near_rate", "row.near_interval"), "share of them found", _pod_text),
-    ),
-)
-STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, DEPTH_LIMITS, SIZES)
+STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, DEPTH_LIMITS)
 
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
@@ -498,9 +469,4 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         SURFACES: [one for one in set_ups if one.surface is not None],
         DEPTH_LIMITS: depths_at(set_ups),
-        SIZES: [
-            KnownSize(one.limit, number, row, Interval(row.lower, row.upper))
-            for one in set_ups
-            for number, row in enumerate(one.sizes, 1)
-        ],
     }

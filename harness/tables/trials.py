@@ -203,19 +203,6 @@ REGISTRATIONS = Table(
     ),
     ("variant", "role", "frames", "repeat", "view"),
 )
-WALLS = Table(
-    "walls",
-    "one row per hole and number of views: how much of its wall no view sees",
-    _columns(
-        hole="number of the hole",
-        views="number of views",
-        true_diameter_mm="diameter",
-        depth_mm="depth",
-        unseen_share="share of the wall that no lens sees",
-        shadowed_share="share that is unseen or unlit in every view",
-    ),
-    formats=("parquet",),
-)
 SITES = Table(
     "sites",
     "one row per place of left-out damage on a hole-free board, and repeat",
@@ -492,7 +479,7 @@ EFFECTS = Table(
         Column("on_ladder", note="whether both sizes lie on the ladder of sizes; the loss is a bound otherwise"),
     ),
 )
-STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, WALLS, SITES, FINDINGS, OPERATING, PIXELS)
+STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
 STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
 SUMMARISED = (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS, SET_UPS, REGISTRATION_ERRORS, CLAIMS, POSTERIOR, EFFECTS)
 
@@ -516,7 +503,6 @@ class ResultTables:
     noise: pd.DataFrame
     axes: pd.DataFrame
     registrations: pd.DataFrame = field(default_factory=_empty)
-    walls: pd.DataFrame = field(default_factory=_empty)
     sites: pd.DataFrame = field(default_factory=_empty)
     findings: pd.DataFrame = field(default_factory=_empty)
     operating: pd.DataFrame = field(default_factory=_empty)

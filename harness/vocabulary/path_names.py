@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Iterable
@@ -59,10 +60,18 @@ def camera_title(name: str) -> str:
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m"."""
+    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m",
+    and ``source.target.distance_m=0.5``, a variation's, "distance 0.5 m"."""
     parts = [part.partition("=") for part in re.split(r", (?=[^=,]+=)", variant)]
-    said = (camera_title(value) if name in NAMED else f"{name} {value}".strip() for name, _, value in parts)
-    return ", ".join(said)
+    return ", ".join(_said(name, value) for name, _, value in parts)
+
+
+def _said(name: str, text: str) -> str:
+    if re.fullmatch(r"\w+(\.\w+)+", name):
+        with contextlib.suppress(ValueError):
+            text = {"true": "on", "false": "off", "null": "none"}.get(text) or value_text(name, json.loads(text))
+        name = _split(name)[0]
+    return camera_title(text) if name in NAMED else f"{name} {text}".strip()
 
 
 def differing(value: Any, others: Iterable[Any]) -> Any:

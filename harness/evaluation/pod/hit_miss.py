@@ -13,7 +13,7 @@ that the data hardly tell from the best (`near_models`): 95.6 to 99 % (``tests/v
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import optimize, stats
 from scipy.optimize import elementwise
-from scipy.special import xlogy
 
 from harness.evaluation.pod.curve import (
     CELLS,
@@ -199,40 +198,30 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """The likeliest curve (4,) with floor and ceiling in these ranges, from a grid's best and three steps."""
-    z = data.z
+    """The likeliest curve (4,) with floor and ceiling in these ranges, climbed to from the best of a coarse grid."""
     floors = sorted({float(np.clip(f, *floor)) for f in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (0.75, 0.9, 0.98)})
-    middles = np.unique(np.append(np.quantile(z, np.linspace(0.04, 0.96, 16)), -plain[0] / plain[1]))
-    likeliest = []
-    for middle, b1 in product(middles, plain[1] * np.array([1.0, 3.0, 12.0, 50.0])):
-        places = [np.array([-b1 * middle, min(b1, STEEPEST), f, c]) for f, c in product(floors, ceilings)]
-        likeliest.append(max(((value_and_gradient(data, at)[0], at) for at in places), key=lambda pair: pair[0]))
-    starts = [at for _, at in sorted(likeliest, key=lambda pair: -pair[0])[:STARTS]]
-
-    order = np.argsort(z, kind="stable")
-    sizes, first = np.unique(z[order], return_index=True)
-    counts = np.stack([data.hits, data.hits + data.misses])
-    (below, n_below), (hits, n) = np.cumsum(counts[:, order], axis=1)[:, first[1:] - 1], counts.sum(axis=1)
-    n_above = n - n_below
-    low, high = np.clip(below / n_below, *floor), np.clip((hits - below) / n_above, *ceiling)
-    value = xlogy(below, low) + xlogy(n_below - below, 1.0 - low)
-    value += xlogy(hits - below, high) + xlogy(n_above - (hits - below), 1.0 - high)
-    slope, middle = np.minimum(6.0 / np.diff(sizes), STEEPEST), 0.5 * (sizes[1:] + sizes[:-1])
-    steps = np.stack([-slope * middle, slope, low, high], axis=1)
+    middles = np.append(np.quantile(data.z, np.linspace(0.04, 0.96, 16)), -plain[0] / plain[1])
+    sizes = np.unique(data.z)
+    # curves of several widths through these middles, and steps between neighbouring sizes
+    rises = [*product(middles, plain[1] * np.array([1.0, 3.0, 12.0, 50.0]))]
+    rises += [*zip(0.5 * (sizes[1:] + sizes[:-1]), 6.0 / np.diff(sizes), strict=True)]
 
     def loss(place: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = value_and_gradient(data, place)
         return -value, -gradient
 
+    def least(places: Iterable[np.ndarray]) -> tuple[float, list[float]]:
+        return min((loss(at)[0], at.tolist()) for at in places)
+
+    levels = list(product(floors, ceilings))
+    best = sorted(least(np.array([-b1 * m, min(b1, STEEPEST), f, c]) for f, c in levels) for m, b1 in rises)
     limits = ((-STEEPEST * 10, STEEPEST * 10), (1e-6, STEEPEST), floor, ceiling)
-    exactness = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 500}
-    found, largest = plain, float("-inf")
-    for start in [*starts, *steps[np.argsort(-value, kind="stable")[:3]]]:
-        end = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=limits, options=exactness)
-        if -end.fun > largest + 1e-9:
-            found, largest = end.x, -float(end.fun)
-    return found, largest
+    how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": limits}
+    how["options"] = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 500}
+    ends = (optimize.minimize(loss, start, **how) for _, start in best[:STARTS])
+    likeliest = min(ends, key=lambda end: end.fun)
+    return likeliest.x, -float(likeliest.fun)
 
 
 def _information(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:

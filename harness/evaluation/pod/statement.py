@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,11 +45,11 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model that was tried: its name, how far from the data (``criterion``, smaller is better), its sizes;
-    ``near``: its bound is one of those of which the statement's is the largest."""
+    """One model that was tried: its name, how far from the data (``deviance``, smaller is nearer), its sizes; ``near``:
+    its bound is one of those of which the statement's is the largest."""
 
     name: str
-    criterion: float
+    deviance: float
     a50: float
     a90: float
     bound: Bound
@@ -59,23 +59,15 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class PodStatement:
-    """Sizes are in ``unit``. ``size``, ``response`` (n,) as read; ``sizes``, ``lower``, ``upper`` (m,) the band to be
-    drawn; ``independent``: the bound had every row been a target of its own, None where it was. ``numbers``: what else
-    the fit says; ``tests``: (what, p-value, how it reads); ``signal``: the regression, None of hits. ``fits``: of hits,
-    the models over which bounds and band are the widest, that of ``curve`` first."""
+    """What inspections, as ``read``, say; sizes are in ``unit``. ``fits``: the models over which bound and band are the
+    widest, that of the curve first; ``models``: all that were tried; ``independent``: the bound had every row been a
+    target of its own, None where it was; ``sizes``, ``lower``, ``upper`` (m,) the band to be drawn; ``numbers``: what
+    else the fit says; ``tests``: (what, p-value, how it reads)."""
 
-    path: Path
+    read: Inspections
     kind: str
     unit: str
-    size_column: str
-    response_column: str
-    size: np.ndarray
-    response: np.ndarray
-    targets: int
-    curve: PodCurve
-    a50: float
-    a90: float
-    model: str
+    fits: tuple[HitMissFit, ...] | tuple[AhatFit]
     models: tuple[ModelRow, ...]
     bound: Bound
     independent: Bound | None
@@ -84,24 +76,46 @@ class PodStatement:
     upper: np.ndarray
     numbers: dict[str, float]
     notes: tuple[str, ...]
-    signal: AhatFit | None
     tests: tuple[tuple[str, float, str], ...]
-    fits: tuple[HitMissFit, ...] = ()
-    criterion: str = "deviance"
+
+    @property
+    def curve(self) -> PodCurve:
+        """The curve that is stated."""
+        return self.fits[0].curve
+
+    @property
+    def signal(self) -> AhatFit | None:
+        """The regression of signals; None of hits."""
+        return self.fits[0] if isinstance(self.fits[0], AhatFit) else None
+
+    @property
+    def a50(self) -> float:
+        """Size found 50 % of the time."""
+        return self.curve.size_at(0.5)
+
+    @property
+    def a90(self) -> float:
+        """Size found 90 % of the time."""
+        return self.curve.size_at(POD)
+
+    @property
+    def model(self) -> str:
+        """Name of the model of the curve."""
+        return next(row.name for row in self.models if row.chosen)
 
     @property
     def counts(self) -> str:
         """Numbers of rows, targets and hits of the statement."""
-        rows = f"{len(self.size)} inspections of {self.targets} targets"
-        return rows if self.signal else f"{rows}, {int(self.response.sum())} hits"
+        rows = f"{len(self.read.size)} inspections of {self.read.targets} targets"
+        return rows if self.signal else f"{rows}, {int(self.read.response.sum())} hits"
 
     @property
     def doubts(self) -> list[str]:
         """Return warnings where a90/95 of models that fit about equally well differ by more than `APART`, and where the
         data speak for a floor or a ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
-        most = min(row.criterion for row in self.models) + NEAR_DEVIANCE * len(self.size) / self.targets
-        limits = [row.bound.value for row in self.models if row.criterion <= most]
+        most = min(row.deviance for row in self.models) + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
+        limits = [row.bound.value for row in self.models if row.deviance <= most]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
         texts = [f"{one:.4g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
@@ -109,18 +123,19 @@ class PodStatement:
 
     def to_data(self) -> dict[str, Any]:
         """The statement as JSON's types; an infinite size becomes None, and ``why`` says so."""
-        curve, names = self.curve, ("kind", "unit", "size_column", "response_column", "targets", "model")
+        curve, read = self.curve, self.read
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
-            {"model": row.name, self.criterion: finite(row.criterion), "a50": finite(row.a50), "a90": finite(row.a90)}
+            {"model": row.name, **{name: finite(getattr(row, name)) for name in ("deviance", "a50", "a90")}}
             | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
             for row in self.models
         ]
         return {
-            "file": str(self.path),
-            **{name: getattr(self, name) for name in names},
-            "inspections": len(self.size),
-            "hits": None if self.signal else int(self.response.sum()),
+            "file": str(read.path),
+            **{"kind": self.kind, "unit": self.unit, "size_column": read.size_column},
+            **{"response_column": read.response_column, "targets": read.targets, "model": self.model},
+            "inspections": len(read.size),
+            "hits": None if self.signal else int(read.response.sum()),
             "curve": {**of_curve, "covariance_mu_sigma": np.asarray(curve.covariance).tolist()},
             "a50": finite(self.a50),
             "a90": finite(self.a90),
@@ -185,8 +200,8 @@ def state_hits(
     numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
-    drawn = (sizes, lower, upper)
-    return _statement(read, "hit/miss", unit, near, models, (limit, independent), drawn, numbers, notes, said)
+    rows, told = _models(models, near), (numbers, tuple(notes), tuple(said))
+    return PodStatement(read, "hit/miss", unit, near, rows, limit, independent, sizes, lower, upper, *told)
 
 
 def state_signals(
@@ -217,47 +232,29 @@ def state_signals(
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
     numbers |= false_positives(read, fit)
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
-    drawn = (sizes, *ahat_band(fit, sizes, CONFIDENCE))
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
-    kind, bounds = "signal against size", (limit, rows)
-    return _statement(read, kind, unit, (fit,), models, bounds, drawn, numbers, [*read.notes, *fit.notes], said)
+    kind, told = "signal against size", (numbers, (*read.notes, *fit.notes), tuple(said))
+    band = ahat_band(fit, sizes, CONFIDENCE)
+    return PodStatement(read, kind, unit, (fit,), _models(models, (fit,)), limit, rows, sizes, *band, *told)
 
 
-def _statement(
-    read: Inspections,
-    kind: str,
-    unit: str,
-    fits: tuple[Any, ...],
-    models: list[tuple[Any, Bound]],
-    bounds: tuple[Bound, Bound | None],
-    drawn: tuple[np.ndarray, np.ndarray, np.ndarray],
-    numbers: dict[str, float],
-    notes: list[str],
-    tests: list[tuple[str, float, str]],
-) -> PodStatement:
-    """The statement of the first of ``fits``, all of them among ``models`` (fits with their limits). ``bounds``: limit,
-    of rows."""
-    fit: HitMissFit | AhatFit = fits[0]
+def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:
+    """Rows of fits with their limits; the first of those that are ``near`` is the one of the curve."""
 
-    def name(one: HitMissFit | AhatFit) -> str:
-        size = "ln size" if one.curve.log_size else "size"
-        if isinstance(one, AhatFit):
-            return f"{'ln signal' if one.log_signal else 'signal'} against {size}"
-        return f"{one.curve.link}, {size}"
+    def name(fit: HitMissFit | AhatFit) -> str:
+        size = "ln size" if fit.curve.log_size else "size"
+        if isinstance(fit, AhatFit):
+            return f"{'ln signal' if fit.log_signal else 'signal'} against {size}"
+        return f"{fit.curve.link}, {size}"
 
-    rows = [
+    return tuple(
         ModelRow(
-            name(one), one.deviance, one.curve.size_at(0.5), one.curve.size_at(POD), limit, one is fit, one in fits
+            *(name(fit), fit.deviance, fit.curve.size_at(0.5), fit.curve.size_at(POD)),
+            *(limit, fit is near[0], any(fit is one for one in near)),
         )
-        for one, limit in models
-    ]
-    a50, a90, signal = fit.curve.size_at(0.5), fit.curve.size_at(POD), fit if isinstance(fit, AhatFit) else None
-    columns = (read.size_column, read.response_column, read.size, read.response, read.targets)
-    what = (fit.curve, a50, a90, name(fit), tuple(rows))
-    of_hits = fits if signal is None else ()
-    first = (read.path, kind, unit, *columns, *what)
-    return PodStatement(*first, *bounds, *drawn, numbers, tuple(notes), signal, tuple(tests), of_hits)
+        for fit, limit in tried
+    )
 
 
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:

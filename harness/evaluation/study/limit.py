@@ -11,13 +11,13 @@ Hinkley 1997, section 3.8)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, false_call_rate, percentiles
+from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, false_call_rate, percentiles
 from harness.evaluation.pod.curve import (
     CELLS,
     Bound,
@@ -29,7 +29,7 @@ from harness.evaluation.pod.curve import (
     penalised_maxima,
     slopes_of_link,
 )
-from harness.evaluation.pod.hit_miss import METHOD, largest_bound, widest_band
+from harness.evaluation.pod.hit_miss import METHOD, largest_bound
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
@@ -298,8 +298,6 @@ def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
 
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
 """29: with a POD below 90 % as many targets are all found in less than 5 % of studies (0.9^29 = 0.047)."""
-NEAR = 0.1
-"""Targets whose diameter differs by at most this share are near."""
 WIDER = 1.1
 """Boards matter where the limit over boards is larger than a90/95 by more than this factor."""
 
@@ -482,39 +480,3 @@ def _all_found(size_mm: np.ndarray, what: str) -> Bound:
         return Bound(POD, CONFIDENCE, method, float(np.sort(size_mm)[ALL_FOUND - 1]))
     reason = f"not demonstrated: all of {len(size_mm)} {what} were found, and it takes {ALL_FOUND}"
     return Bound(POD, CONFIDENCE, method, np.inf, reason)
-
-
-@dataclass(frozen=True)
-class SizeRow:
-    """POD of one diameter: ``pod`` from the curve, ``lower`` and ``upper`` each one-sided at 95 % by the likelihood
-    ratio (NaN without a curve). ``extrapolated``: outside the sizes inspected. ``near`` targets are within 10 % of it;
-    ``near_rate``: their share of hits, with Clopper and Pearson's ``near_interval``."""
-
-    diameter_mm: float
-    pod: float
-    lower: float
-    upper: float
-    extrapolated: bool
-    near: int
-    near_rate: float
-    near_interval: Interval
-
-
-def pod_at(limit: SetUpLimit, diameters_mm: Sequence[float]) -> tuple[SizeRow, ...]:
-    """State POD at given diameters, such as those of a board that one has: one row each, in the given order; none where
-    the limit is of depth."""
-    seen = limit.record.inspected
-    sizes = np.asarray(diameters_mm if seen.limit_of == "diameter" else (), float)
-    of_curve = np.full((3, len(sizes)), np.nan)
-    if limit.statement is not None and len(sizes):
-        of_curve = np.array([limit.statement.curve.pod(sizes), *widest_band(limit.statement.fits, sizes)])
-    low, high = seen.diameter_mm.min(initial=np.inf), seen.diameter_mm.max(initial=-np.inf)
-    names, rows = target_names(seen), []
-    for size, pod, lower, upper in np.vstack([sizes, of_curve]).T.tolist():
-        near = np.abs(seen.diameter_mm / size - 1) <= NEAR
-        targets = len(np.unique(names[near]))
-        rate = float(seen.hit[near].mean()) if targets else np.nan
-        ends = clopper_pearson(rate * targets if targets else 0, targets)
-        of_near = (targets, rate, Interval(*map(float, ends)))
-        rows.append(SizeRow(size, pod, lower, upper, not low <= size <= high, *of_near))
-    return tuple(rows)

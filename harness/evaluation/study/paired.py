@@ -23,15 +23,13 @@ Tails = tuple[float, float]
 @dataclass(frozen=True)
 class HitsChange:
     """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``. ``only_first``,
-    ``only_second``: found by one alone. ``mcnemar_p``: McNemar's exact test (two-sided), which takes inspections as
-    independent. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so few (many) hits of the
-    second are if each board's two sums of hits might as well be exchanged."""
+    ``only_second``: found by one alone. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so
+    few (many) hits of the second are if each board's two sums of hits might as well be exchanged."""
 
     boards: int
     inspections: int
     only_first: int
     only_second: int
-    mcnemar_p: float
     fewer_p: float
     more_p: float
 
@@ -50,8 +48,7 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
     names, board = np.unique(first.board[one], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
-    p = mcnemar(only_first, only_second)
-    return HitsChange(len(names), len(one), only_first, only_second, p, *sign_flip(gained))
+    return HitsChange(len(names), len(one), only_first, only_second, *sign_flip(gained))
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
@@ -60,14 +57,6 @@ def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.nda
     at, there = ({key: row for row, key in enumerate(one)} for one in keys)
     shared = [key for key in at if key in there]
     return np.array([at[key] for key in shared], int), np.array([there[key] for key in shared], int)
-
-
-def mcnemar(only_first: int, only_second: int) -> float:
-    """Exact two-sided p: discordant pairs fall on either side with equal chance (McNemar 1947, exact by Liddell)."""
-    from scipy.stats import binomtest
-
-    discordant = only_first + only_second
-    return float(binomtest(only_first, discordant, 0.5).pvalue) if discordant else 1.0
 
 
 def sign_flip(gained: np.ndarray) -> Tails:

@@ -30,11 +30,9 @@ from harness.evaluation.study.limit import (
     DRAWS,
     PodSurface,
     SetUpLimit,
-    SizeRow,
     depth_varies,
     limit_of,
     median_over_boards,
-    pod_at,
     surface_of,
 )
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
@@ -276,8 +274,9 @@ CONDITIONS = (
     ("source.target.material.albedo_850", "albedo {:g}"),
     ("source.target.plywood_albedo_850", "albedo {:g}"),
     ("detector.name", "detector {}"),
-    ("threshold.calibrate.false_calls_per_m2", "threshold for {:g} false calls per m²"),
     ("threshold.k", "threshold {:g} deviations"),
+    ("threshold.calibrate.false_calls_per_m2", "threshold for {:g} false calls per m²"),
+    ("threshold.calibrate.repeats", "threshold the highest score of {:g} hole-free runs"),
 )
 """Settings that every set-up shares, in words, where no axis varies them."""
 
@@ -291,8 +290,10 @@ def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -
         for key in path.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
-        if value is not None and not varied:
-            said.append(words.format(camera_title(value) if isinstance(value, str) else value))
+        told = words.startswith("threshold") and any(one.startswith("threshold") for one in said)
+        if value is not None and not varied and not told:
+            text = words.format(camera_title(value) if isinstance(value, str) else value)
+            said.append(text.replace(" 1 false calls", " 1 false call"))
     drawn = facts.get("source", {}).get("target", {}).get("damage", {}).get("per_board", 0)
     drawn *= (facts.get("study") or {}).get("boards", 0)
     fewest = min((limit.targets for limit in limits), default=drawn)
@@ -309,7 +310,7 @@ NOISE_SHARE = 0.95
 class SetUpResult:
     """One set-up: ``limit``; ``chance`` hits (None: nothing to lay them over); ``roc`` over sites by classes of size;
     ``free_response``; ``pixels`` (None where not counted); ``surface`` over diameter and depth, or ``surface_why``
-    there is none; ``sizes``: POD at the diameters that were asked for; ``noise_floor``: signal of unflawed places."""
+    there is none; ``noise_floor``: signal of unflawed places."""
 
     limit: SetUpLimit
     chance: ChanceHits | None
@@ -318,7 +319,6 @@ class SetUpResult:
     pixels: PixelCurves | None
     surface: PodSurface | None
     surface_why: str
-    sizes: tuple[SizeRow, ...]
     noise_floor: float
 
 
@@ -341,24 +341,17 @@ class StudyResult:
 
 
 def evaluate_study(
-    record: StudyRecord,
-    tables: ResultTables,
-    facts: Mapping[str, Any],
-    *,
-    diameters_mm: Sequence[float] = (),
-    draws: int = DRAWS,
+    record: StudyRecord, tables: ResultTables, facts: Mapping[str, Any], *, draws: int = DRAWS
 ) -> StudyResult:
-    """Judge a study. ``facts``: its resolved experiment as plain data; ``diameters_mm``: where POD is wanted in a
-    table. Deterministic; a set-up without a curve is no error (its limit says why)."""
-    set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, diameters_mm, draws) for one in record.set_ups)
+    """Judge a study. ``facts``: its resolved experiment as plain data. Deterministic; a set-up without a curve is no
+    error (its limit says why)."""
+    set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)
     validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
     return StudyResult(record, set_ups, limits, axis_lines(limits), validity, facts)
 
 
-def _set_up(
-    record: SetUpRecord, tables: ResultTables, radius_mm: float, diameters_mm: Sequence[float], draws: int
-) -> SetUpResult:
+def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: int) -> SetUpResult:
     def own(table: pd.DataFrame) -> pd.DataFrame:
         if table.empty:
             return table
@@ -381,15 +374,8 @@ def _set_up(
     chance = None
     if not holes.empty and not runs.empty:
         chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls, draws)
-    roc = roc_curves(
-        holes,
-        sites,
-        record.threshold,
-        a50,
-        a90,
-        draws,
-        by="depth" if record.inspected.limit_of == "depth" else "diameter",
-    )
+    by = "depth" if record.inspected.limit_of == "depth" else "diameter"
+    roc = roc_curves(holes, sites, record.threshold, a50, a90, draws, by=by)
     response = free_response(own(tables.operating), runs, holes, draws)
-    pixels, sizes = pixel_curves(own(tables.pixels), draws), pod_at(limit, diameters_mm)
-    return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws), sizes, floor)
+    pixels = pixel_curves(own(tables.pixels), draws)
+    return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws), floor)
