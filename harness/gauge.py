@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 DICTIONARY, CODES = "DICT_6X6_50", 50
 MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
 """Side of a mark, step of the drills that there are, and the seed of which size goes where."""
-CLEAR_MM = 6.0
-"""White around a mark, without which a code cannot be read, and between marks and holes."""
+CLEAR_MM, EDGE_MM = 6.0, 18.0
+"""White around a mark, without which a code cannot be read, and between marks and holes; and least distance of a hole's
+rim from the board's edge, for which the automatic crop would take it."""
 HIT_SHARE = 0.4
 """Hit radius as a share of the distance between holes, so that no finding can count for two."""
 
@@ -123,10 +124,10 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         )
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
-    rim = options.diameters[1] / 2 + CLEAR_MM + 4
+    rim = options.diameters[1] / 2 + EDGE_MM
     room = [size - 2 * rim for size in (width, height)]
     xs, ys = (np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist() for size in room)
-    clear = side / 2 + rim - 4
+    clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
     places = [
         (x, y) for y in ys for x in xs if all(max(abs(x - cx), abs(y - cy)) >= clear for cx, cy in corners.tolist())
     ]
