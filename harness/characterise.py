@@ -11,6 +11,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
+REPEATED = 0.15
+"""Relative error of the simulated noise from which on the camera file counts as wrong."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -45,6 +47,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    import numpy as np
+
     from harness.evaluation.study.record import read_record
     from harness.inspection.arguments import read_poses
     from harness.inspection.told import print_notes, print_warnings
@@ -64,23 +68,19 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
-    captures = []
-    for path in options.paths:
-        recording = opened_as(options.like, [path], options.intrinsics, unit=options.unit)
-        captures.append(read_still(recording))
-        print(f"{recording.name}: {len(captures[-1].z_m)} frames, {recording.unit_text}", flush=True)
-        print_notes(recording.notes)
-        print_warnings(recording.warnings)
+    recordings = [opened_as(options.like, [path], options.intrinsics, unit=options.unit) for path in options.paths]
+    captures = list(map(read_still, recordings))
+    if options.like:
+        with_lens(options.like, captures[0].lens)  # of another size it cannot be refitted
     found = characteristics(captures, poses)
-    print_warnings(found.doubts)
     told = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
     if options.like and not options.rate:
         told = (load_camera(options.like).unit.frames_per_second.value, f"of {options.like}", "M")
     rate = Stated("unit", "frames_per_second", *told)
     names = ", ".join(capture.name for capture in captures)
-    print("fitting the camera file ..", flush=True)
+    print("fitting the camera file ..", file=sys.stderr)
     camera = write_camera(options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate)
-    print("simulating the captures from it ..", flush=True)
+    print("simulating the captures from it ..", file=sys.stderr)
     twin = characteristics(simulated(camera, found, options.albedo), poses)
     sources = {MEASURED: found, SIMULATED: twin}
     known = options.like
@@ -91,11 +91,21 @@ def main(options: argparse.Namespace, command: str) -> int:
     rows = beside(found, twin, sources.get(KNOWN))
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
-    worst = max((abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"), default=0.0)
-    answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %." if noise else ""
+    off = [abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"]
+    worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
+    warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
+    if worst > REPEATED:
+        warnings.insert(0, f"{CAMERA_FILE} does not repeat the captures' noise, which it has wrong by up to"
+                           f" {100 * worst:.0f} %: limits that are simulated with it are wrong, too")  # fmt: skip
+    elif noise:
+        answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %."
+    print_warnings(warnings)
+    for recording, capture in zip(recordings, captures, strict=True):
+        print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")
+        print_notes(recording.notes)
     page, title = options.out / "characterise.html", f"{options.title}, characterised"
     facts = {"like": options.like, "camera_file": CAMERA_FILE}
-    write_page(page, sources, rows, title, answer, known or "", command, facts)
+    write_page(page, sources, rows, title, answer, known or "", command, facts, warnings)
     if options.certificate:
         lens = captures[0].lens
         size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 DICTIONARY, CODES = "DICT_6X6_50", 50
 MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
 """Side of a mark, step of the drills that there are, and the seed of which size goes where."""
-CLEAR_MM = 6.0
-"""White around a mark, without which a code cannot be read, and between marks and holes."""
+CLEAR_MM, EDGE_MM = 6.0, 18.0
+"""White around a mark, without which a code cannot be read, and between marks and holes; and least distance of a hole's
+rim from the board's edge, for which the automatic crop would take it."""
 HIT_SHARE = 0.4
 """Hit radius as a share of the distance between holes, so that no finding can count for two."""
 
@@ -45,15 +46,16 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Design gauge boards: how many holes of which sizes, as harness.design plans them, on boards with "
-    "coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each board, and gauge.json, "
-    "the truth that harness.detect --gauge reads.",
+    "Design gauge boards: holes of sizes spread evenly over a range, with the limit that harness.design expects of "
+    "them, on boards with coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each "
+    "board, and gauge.json, the truth that harness.detect --gauge reads.",
     epilog="example: python -m harness.gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
     "gauge, then drill, record, and python -m harness.detect captures/gauge --gauge gauge/gauge.json --out found",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.pod import design as plan
+    from harness.evaluation.pod.transfer import PRIOR_SIZE
     from harness.inspection.gauge import GAUGE_VERSION
     from harness.report.gauge import template_pdf, template_svg, tiles_of
     from harness.vocabulary.files import write_bytes, write_text
@@ -63,8 +65,14 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--diameters {low:g}:{high:g}", legal=f"FROM < TO, and FROM at least {DRILLS_MM:g}")
     if not 10 <= options.targets <= 600:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
-    plans = plan.design(_curve(options), [options.targets], (low, high), studies=100, seed=SEED)
-    chosen = plan.recommend(plans).plan
+    curve = _curve(options)
+    # evenly spread: sizes crowded where the study's curve rises tell nothing where the real curve rises elsewhere
+    (chosen,) = plan.design(curve, [options.targets], (low, high), placements=("uniform",), studies=100, seed=SEED)
+    if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
+        print(
+            f"warning: were the curve's a90 too small by a factor of {PRIOR_SIZE:g}, it would be {wrong_mm:.3g} mm, "
+            f"and no hole of {low:g} to {high:g} mm would show it: choose other --diameters"
+        )
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
     write_text(options.out / "gauge.json", text + "\n")
@@ -116,10 +124,10 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         )
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
-    rim = options.diameters[1] / 2 + CLEAR_MM + 4
+    rim = options.diameters[1] / 2 + EDGE_MM
     room = [size - 2 * rim for size in (width, height)]
     xs, ys = (np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist() for size in room)
-    clear = side / 2 + rim - 4
+    clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
     places = [
         (x, y) for y in ys for x in xs if all(max(abs(x - cx), abs(y - cy)) >= clear for cx, cy in corners.tolist())
     ]

@@ -8,6 +8,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,11 @@ import recorded_plane as plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from detectors.interface import Detection, Evidence, Measurement
 from harness import detect
 from harness.inspection.arguments import crop_from_text
+from harness.inspection.told import print_findings
+from harness.report.findings import finding_of
 from harness.tables.trials import FINDINGS_OF_CAPTURE
 from harness.vocabulary.errors import UserError
 
@@ -116,7 +120,8 @@ def test_it_finds_the_hole_and_writes_everything(
     )
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
-    assert header == "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,findings_version\n"
+    columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,length_mm,width_mm"
+    assert header == f"{columns},angle_deg,findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"
     number = {key: float(value) for key, value in row.items() if key != "kind"}
@@ -127,6 +132,21 @@ def test_it_finds_the_hole_and_writes_everything(
     assert number["depth_mm"] == pytest.approx(plane.HOLE_DEPTH_MM, rel=0.05)
     area = np.pi / 4 * TRUE_DIAMETER_MM**2
     assert number["volume_mm3"] == pytest.approx(area * plane.HOLE_DEPTH_MM, rel=0.1)
+
+
+def test_long_damage_is_told_with_length_width_and_angle(capsys: pytest.CaptureFixture[str]) -> None:
+    """A scratch of 24 x 4 mm that runs down to the right at 30 degrees, beside a round hole."""
+    evidence = Evidence(np.zeros((2, 2)), np.full((2, 2), 5e-3), np.ones((2, 2)), 1e-3)
+    found = Detection(9.0, np.arange(4), np.zeros(3))
+    turned = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
+    measured = Measurement(3.0, 4.0, 4, 9.0, 0.02, np.zeros(3), length_m=0.024, width_m=0.004, along=-turned)
+    scratch, hole = (finding_of(n, evidence, found, replace(measured, width_m=w)) for n, w in ((1, 0.004), (2, 0.02)))
+    assert (scratch.length_mm, scratch.width_mm) == pytest.approx((24, 4)) and scratch.angle_deg == pytest.approx(30)
+    print_findings([scratch, hole])
+    head, first, second = capsys.readouterr().out.splitlines()
+    assert "long damage" in head and first.endswith("24.0 x 4.0, 30") and second.endswith("-")
+    print_findings([hole])
+    assert "long" not in capsys.readouterr().out
 
 
 def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Path) -> None:

@@ -132,14 +132,8 @@ class RawLoader:
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> None:
         """Raise UserError where neighbours differ as no surface's do, or the planes are no frames of one scene."""
-
-        def apart(first: np.ndarray, second: np.ndarray) -> float:
-            """Return the median relative difference where both have a number; infinity where none has."""
-            both = (first > 0) & (second > 0)
-            return float(np.median(np.abs(first - second)[both] / first[both])) if both.any() else float("inf")
-
-        first, last = (frames[i].astype(np.float64) for i in (0, -1))
-        rough, changed = apart(first[:, 1:], first[:, :-1]), apart(first, last)
+        first, last = frames[0], frames[-1]
+        rough, changed = _apart(first[:, 1:], first[:, :-1]), _apart(first, last)
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
             raise UserError(f"{path}: {what}: the layout is another", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
@@ -171,8 +165,8 @@ LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, with
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
-Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool]
-"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid."""
+Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
+"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a note on the axes."""
 
 
 def open_arrays(path: Path, asked: Asked) -> Recording:
@@ -180,7 +174,7 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     load = RawLoader.stated(asked.raw) if asked.raw is not None else LOADERS[path.suffix.lower()]
     if asked.pitch is not None:
         return _open_height_map(path, load, asked)
-    distances, _, _, organised = _stack(path, load, asked)
+    distances, _, _, organised, note = _stack(path, load, asked)
     if isinstance(load, RawLoader):
         load.refuse_doubtful(path, distances)
     height, width = distances.shape[1:3]
@@ -193,13 +187,14 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
 
     def read() -> Iterator[Frame]:
         # ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole
-        distances, *beside, _ = _stack(path, load, asked)
+        distances, *beside, _, _ = _stack(path, load, asked)
         for i, stored in enumerate(distances):
             rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
             yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
 
     is_whole = distances.dtype.kind in "iu"
-    return Recording.begun(path.name, read, scale_m, is_whole, files=(path, *files), lens=lens, organised=organised)
+    more = {"files": (path, *files), "lens": lens, "organised": organised, "notes": (note,)}
+    return Recording.begun(path.name, read, scale_m, is_whole, **more)
 
 
 def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
@@ -208,6 +203,10 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     name, array = _named_array(str(path), arrays, DISTANCE_NAMES, asked.array)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
+    note = ""
+    if _frames_are_last(array):
+        note = f"{name} {array.shape}: the frames are taken to lie along the last axis"
+        array = np.moveaxis(array, -1, 0)
     has_points, shape, organised = _axes(name, array.shape, asked.lens)
     refuse_pixels(name, shape[2], shape[1])
     beside = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
@@ -222,7 +221,22 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
             rgb = np.nan_to_num(np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255))
         rgb = rgb.astype(np.uint8).reshape(*shape, 3)
     amplitude = None if amplitude is None else amplitude.reshape(shape).astype(np.float32)
-    return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised
+    return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised, note
+
+
+def _frames_are_last(array: np.ndarray) -> bool:
+    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. Of three planes
+    the content tells: x, y and z of points are not nearly equal everywhere, repeated distances are."""
+    if array.ndim != 3 or not 2 * array.shape[2] <= min(array.shape[:2]):
+        return False
+    return array.shape[2] != 3 or all(_apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1))
+
+
+def _apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the median relative difference where both have a number; infinity where none has."""
+    both = (first > 0) & (second > 0)
+    one, other = (plane[both].astype(np.float64) for plane in (first, second))
+    return float(np.median(np.abs(one - other) / one)) if both.any() else float("inf")
 
 
 def _named_array(

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
+SIDES = 8
+"""Directions in which judged points must lie within the hit radius of a hole's rim: else the crop took the hole for the
+edge, or an object covers it, and a miss would say nothing of its size."""
 WORST_FIT_MM = 2.0
 """Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
 Length = Annotated[float, Field(gt=0, le=5e3)]
@@ -83,8 +86,8 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """One hole of a board in a capture. ``found``: "hit", "miss", or "NA" where the detector judged nothing within the
-    hit radius; ``offset_mm`` and ``score`` of the finding that hit it, None of others."""
+    """One hole of a board in a capture. ``found``: "hit", "miss", or "NA" where not all around it was judged;
+    ``offset_mm`` and ``score`` of the finding that hit it, None of others."""
 
     board: str
     hole: GaugeHole
@@ -105,7 +108,7 @@ HITS_AND_MISSES = Table(
         Column("target", "hole", lambda row: f"{row.board}:{row.hole.id}", "board and number of the hole"),
         Column("diameter_mm", "diameter (mm)", "hole.diameter_mm", "of the drill"),
         Column("depth_mm", "depth (mm)", "hole.depth_mm", "none where it goes through", text=_number),
-        Column("found", "found", "found", "hit, miss, or NA where nothing was judged", text=str),
+        Column("found", "found", "found", "hit, miss, or NA where not all around it was judged", text=str),
         Column("offset_mm", "offset (mm)", "offset_mm", "of the finding's centre from the hole's", text=_number),
         Column("score", "score", "score", "of that finding", text=_number),
     ),
@@ -165,6 +168,9 @@ def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
                 f"{board.name}: its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
             )
         own, beside = _matched(board, gauge.hit_radius_mm * MM, judged, invert(T_camera_board))
+        if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
+            told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"
+            warnings.append(f"{board.name}: hole {', '.join(unjudged)} {told}")
         rows += own
         calls += beside
     if not rows:
@@ -191,13 +197,17 @@ def _matched(
     seen = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
     rows = []
     for number, (hole, centre) in enumerate(zip(board.holes, centres, strict=True)):
-        if number in pairs:
+        away = seen - centre
+        away = away[np.linalg.norm(away, axis=-1) < radius_m + hole.diameter_mm / 2 * MM]
+        sides = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi / SIDES)).astype(int) % SIDES
+        if len(np.unique(sides)) < SIDES:
+            rows.append(GaugeRow(board.name, hole, "NA", None, None))
+        elif number in pairs:
             finding = judged.detections[pairs[number]]
             offset_mm = float(np.linalg.norm(places[pairs[number]] - centre)) / MM
             rows.append(GaugeRow(board.name, hole, "hit", offset_mm, finding.score))
         else:
-            was_judged = (np.linalg.norm(seen - centre, axis=-1) < radius_m).any()
-            rows.append(GaugeRow(board.name, hole, "miss" if was_judged else "NA", None, None))
+            rows.append(GaugeRow(board.name, hole, "miss", None, None))
     inside = (np.abs(places) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(axis=-1)
     for mark in board.marks:
         inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)

@@ -194,6 +194,10 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
     for f in findings:
         sizes = (number(f.diameter_mm, 1), f.size_from, number(f.depth_mm, 2), number(f.volume_mm3, 1))
         rows.append((f.id, f.kind, *(number(getattr(f, key), 1) for key in places), *sizes, f.points, f"{f.score:.2f}"))
+    if any(f.is_long for f in findings):
+        heads += ("long damage: mm, degrees",)
+        long = [f"{f.length_mm:.1f} x {f.width_mm:.1f}, {f.angle_deg:.0f}" if f.is_long else "-" for f in findings]
+        rows = [(*row, text) for row, text in zip(rows, long, strict=True)]
     show([Grid.of(heads, rows, left=0)])
 
 

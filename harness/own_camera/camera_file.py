@@ -67,8 +67,8 @@ def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None,
         if camera is None or intrinsics is not None:
             raise
         recording = opened(paths, None, lens=load_camera(camera).nominal_lens, **reading)
-        print(f"note: the capture names no lens; the nominal one of {camera} counts")
-        return recording
+        note = f"the capture names no lens; the nominal one of {camera} counts"
+        return replace(recording, notes=(*recording.notes, note))
 
 
 def camera_of_size(lens: Lens) -> str:

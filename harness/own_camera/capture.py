@@ -35,8 +35,9 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
         fix = "check the lens (--intrinsics), or leave disturbing things out with --mask"
         raise UserError(f"{capture.name}: no flat surface in it", legal=legal, fix=fix)
+    warnings = (*recording.warnings, *found.doubts)
+    print_warnings(warnings)
     print_notes(recording.notes)
-    print_warnings((*recording.warnings, *found.doubts))
     twin = characteristics(simulated(camera, found, options.albedo))
     rows = beside(found, twin, None)
     ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
@@ -44,7 +45,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     title = f"{capture.name} beside the simulated {camera.title}"
     facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
     sources = {MEASURED: found, SIMULATED: twin}
-    write_page(options.out / "capture.html", sources, rows, title, answer, "", command, facts)
+    write_page(options.out / "capture.html", sources, rows, title, answer, "", command, facts, warnings)
     return 0
 
 

@@ -44,6 +44,8 @@ JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
 """A frame jumps if it is displaced by more than both: ten times the wander of a static Azure Kinect."""
 ASSUMED = np.array([0.0, 2.0, -0.5])
 """Exponents where captures do not tell them: of range (read noise, a disparity's error), of brightness (shot noise)."""
+UNSURE = 0.5
+"""Standard error beyond which an exponent is not told."""
 SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
 """Correlation of successive frames, reach of neighbours' correlation, and noise by rounding steps, beyond which the
 recording was averaged, smoothed or rounded before it was stored."""
@@ -249,16 +251,24 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     light_at_1m = float(np.average(np.log(light) - np.log(np.cos(np.radians(angle_deg))), weights=weight))
     columns = np.stack([np.ones(len(y)), log_r, np.log(light) - light_at_1m], axis=-1)
     told = np.array([True, *(np.ptp(columns[:, 1:], axis=0) > np.log(TELLING_RATIO))])
-    law, errors = ASSUMED.copy(), np.full(3, np.nan)
-    root = np.sqrt(weight)
-    design, rest = columns[:, told] * root[:, None], (y - columns[:, ~told] @ ASSUMED[~told]) * root
-    law[told] = np.linalg.lstsq(design, rest, rcond=None)[0]
-    spread = float(((rest - design @ law[told]) ** 2).sum() / max(len(y) - told.sum(), 1))
-    errors[told] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
+    law, root, signs = ASSUMED.copy(), np.sqrt(weight), np.sign(ASSUMED)
+    while True:
+        errors = np.full(3, np.nan)
+        design, rest = columns[:, told] * root[:, None], (y - columns[:, ~told] @ law[~told]) * root
+        law[told] = np.linalg.lstsq(design, rest, rcond=None)[0]
+        spread = float(((rest - design @ law[told]) ** 2).sum() / max(len(y) - told.sum(), 1))
+        errors[told] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
+        doubtful = (errors > UNSURE) | (told & (law * signs < 0))
+        doubtful[0] = False
+        if not doubtful.any():
+            break
+        # on one slanted surface range and brightness change together: the one that is known less is not told
+        worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
+        told[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
     facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
     groups = [number == one for one in np.unique(number)]
     at, level = (np.exp([np.average(v[g], weights=weight[g]) for g in groups]) for v in (log_r, facing))
-    return RangeLaw(at, level, np.maximum([law[1], -law[2]], 0.0), errors[1:], float(np.exp(light_at_1m)))
+    return RangeLaw(at, level, law[1:] * signs[1:], errors[1:], float(np.exp(light_at_1m)))
 
 
 def correlations(capture: StillCapture) -> np.ndarray:
@@ -429,12 +439,13 @@ class Characteristics:
             said.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are not told")
         if np.isnan(law.errors[0]):
             near, far = law.range_m.min(), law.range_m.max()
-            said.append(f"all surfaces lie between {near:.2f} and {far:.2f} m: how the noise grows with range is not"
-                        f" told, and the power {ASSUMED[1]:g} is assumed")  # fmt: skip
+            said.append(f"surfaces between {near:.2f} and {far:.2f} m do not tell how the noise grows with range: the"
+                        f" power {law.exponents[0]:g} is assumed")  # fmt: skip
         if not self.has_amplitude:
             said.append("no amplitude is recorded: noise and dropouts of darker surfaces are not told")
         if np.isnan(law.errors[1]):
-            said.append("brightness hardly varies: how noise depends on it is not told, and shot noise is assumed")
+            said.append("brightness hardly varies, or only together with range: how noise depends on it is not told,"
+                        f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
         noise, sigma_m = first.noise_m[:, first.steady], float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
         if alike > SLOW:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,6 +117,7 @@ def write_page(
     known: str,
     command: str,
     facts: Mapping[str, Any],
+    warnings: Sequence[str],
 ) -> None:
     """Print the figures; write a page, and beside it the tables' files and provenance.json with further ``facts``.
     ``sources``: what was measured, simulated and, where there is one, the ``known`` camera's by their names. Raises
@@ -139,8 +140,8 @@ def write_page(
         OWN_FIGURES.grid(rows, heads=heads).html(),
         *command_of(command),
     ]
-    write_text(path, page(title, answer, body, warnings=found.doubts))
-    origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": found.doubts}
+    write_text(path, page(title, answer, body, warnings=warnings))
+    origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": warnings}
     write_text(folder / "provenance.json", json.dumps(origin, indent=2) + "\n")
     print(f"wrote {path} and the tables")
 

@@ -26,14 +26,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
+ELONGATED = 2.0
+"""Length over width from which a finding counts as long; a width below 1 mm, which is noise, counts as 1 mm."""
 
 
 @dataclass(frozen=True)
 class Finding:
     """One row: the best of both measures, camera frame. NaN where nothing could be measured. ``kind``: ``hole``,
-    ``bump`` or ``no return``. ``size_from``: ``model`` (blurred hole, with standard errors), ``contour`` (half depth),
-    ``extent`` (extreme points) or ``area`` (of pixels without return). ``depth_from``: likewise, ``extreme residual``
-    of the cluster's points, or ``none``."""
+    ``bump`` or ``no return``. ``length_mm``, ``width_mm``, ``angle_deg``: sides of a rectangle with the second moments
+    of the residual, and the longer one's angle from x towards y, -90 to 90, across the line of sight. ``size_from``:
+    ``model`` (blurred hole, with standard errors), ``contour`` (half depth), ``extent`` (extreme points) or ``area``
+    (of pixels without return). ``depth_from``: likewise, ``extreme residual`` of the cluster's points, or ``none``."""
 
     id: int
     kind: str
@@ -47,8 +50,16 @@ class Finding:
     volume_mm3: float
     points: int
     score: float
+    length_mm: float
+    width_mm: float
+    angle_deg: float
     size_from: str
     depth_from: str
+
+    @property
+    def is_long(self) -> bool:
+        """True where it is `ELONGATED`: its diameter then says little."""
+        return self.length_mm > ELONGATED * max(self.width_mm, 1.0)
 
 
 @dataclass(frozen=True)
@@ -84,7 +95,9 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     kind = detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole"
     place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
     sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
-    return Finding(number, kind, *place, *sizes, measured.points, measured.score, size_from, depth_from)
+    x, y, _ = measured.along
+    sides = (measured.length_m / MM, measured.width_m / MM, float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90))
+    return Finding(number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from)
 
 
 def write_findings(

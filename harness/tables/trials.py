@@ -515,7 +515,7 @@ class ResultTables:
 
 # ---------------------------------------------------------------- real captures
 
-FINDINGS_VERSION = 2
+FINDINGS_VERSION = 3
 """Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
 FINDINGS_OF_CAPTURE = Table(
     outputs.FINDINGS.name.removesuffix(".csv"),
@@ -533,6 +533,9 @@ FINDINGS_OF_CAPTURE = Table(
         Column("volume_mm3", "", "volume_mm3", "volume behind the surface"),
         Column("points", "", "points", "points of the cluster"),
         Column("score", "", "score", "the detector's score"),
+        Column("length_mm", "", "length_mm", "of the rectangle with the second moments of the residual, less the blur"),
+        Column("width_mm", "", "width_mm", "its width"),
+        Column("angle_deg", "", "angle_deg", "of its length, from x towards y (down), -90 to 90"),
         Column("findings_version", "", lambda finding: FINDINGS_VERSION, "version of the table's meaning"),
     ),
     formats=("csv",),
