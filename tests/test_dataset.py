@@ -64,6 +64,22 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
             assert mask.any() == (label != "good")
 
 
+def test_anomalib_reads_it_unchanged(home):
+    """By anomalib's own loader, where it is installed."""
+    loader = pytest.importorskip("anomalib.data.datasets.depth.mvtec_3d").MVTec3DDataset
+    for split, count in (("train", 3), ("test", 5)):
+        data = loader(root=home / "set", category="tiny", split=split)
+        assert len(data) == count
+        for item in data:
+            folder, stem = Path(item.image_path).parents[1], Path(item.image_path).stem
+            points = tiff_floats(folder / "xyz" / f"{stem}.tiff")
+            np.testing.assert_array_equal(np.moveaxis(np.asarray(item.depth_map), 0, -1), points)
+            assert np.asarray(item.image).shape == (3, *points.shape[:2]) and item.gt_label == (folder.name != "good")
+            if split == "test":
+                mask = arrays_of(home / "set", f"tiny/{split}/{folder.name}/{stem}")["damage"] > 0
+                np.testing.assert_array_equal(np.asarray(item.gt_mask, bool).squeeze(), mask)
+
+
 def test_coco_masks_are_the_damages(home):
     folder = home / "set"
     data = json.loads((folder / "coco" / "tiny_test.json").read_text())

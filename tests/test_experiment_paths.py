@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
-from harness.experiment.unfold import PathError, get_path, key_path, overridden, set_path
+from harness.experiment.unfold import PathError, key_path, overridden, set_path
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import KeyPath, Source, parse_yaml
@@ -64,13 +64,13 @@ def paths_in(data: Any, above: KeyPath = ()) -> list[KeyPath]:
 @given(data=st.dictionaries(keys, trees, min_size=1, max_size=4), value=trees, draw=st.data())
 def test_set_then_get_and_nothing_else_changes(data: dict[str, Any], value: Any, draw: st.DataObject) -> None:
     path = draw.draw(st.sampled_from(paths_in(data)))
-    before, old = copy.deepcopy(data), get_path(data, path)
+    before, old = copy.deepcopy(data), shape.get(data, path)
     changed = set_path(data, path, value)
-    assert get_path(changed, path) == value
+    assert shape.get(changed, path) == value
     assert data == before
     assert set_path(changed, path, old) == before
     others = [other for other in paths_in(data) if other[: len(path)] != path and path[: len(other)] != other]
-    assert all(get_path(changed, other) is get_path(data, other) for other in others)
+    assert all(shape.get(changed, other) is shape.get(data, other) for other in others)
     assert key_path(".".join(map(str, path))) == path
 
 

@@ -5,9 +5,8 @@ other than the number of frames."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
@@ -18,6 +17,7 @@ from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Place, Problem, Source, parse_yaml
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
 
@@ -26,12 +26,8 @@ NOT_VARIED = ("sweep", "sensitivity")
 """Keys that hold dotted paths themselves."""
 
 
-class PathError(Exception):
+class PathError(UserError):
     """A dotted path that leads nowhere in the data."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
-        self.message = message
 
 
 def key_path(text: str) -> KeyPath:
@@ -40,16 +36,6 @@ def key_path(text: str) -> KeyPath:
     if head == "sweep" and rest:
         return (head, rest)
     return tuple(int(part) if part.isascii() and part.isdigit() else part for part in text.split("."))
-
-
-def get_path(data: Any, path: KeyPath) -> Any:
-    """Return the value at a path. Raises PathError where there is none."""
-    for depth, key in enumerate(path):
-        try:
-            data = data[_index(data, key, path[:depth])]
-        except LookupError:
-            raise PathError(f"there is no `{key}`") from None
-    return data
 
 
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
@@ -185,15 +171,6 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
     return _points([*_drafts(axes, telling, variations, config)], telling, config, source)
 
 
-def _sameness(value: Any) -> str:
-    """Return the same text for values that YAML writes in two ways, such as 1 and 1.0; true is not 1."""
-    if isinstance(value, Mapping):
-        return canonical_json({key: _sameness(inner) for key, inner in value.items()})
-    if isinstance(value, list | tuple):
-        return canonical_json([_sameness(inner) for inner in value])
-    return repr(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
-
-
 def _written_variations(data: Any) -> Iterator[Draft]:
     """Yield the variations as they are written, without the study's numbers of frames."""
     vary = shape.get(data, ("sensitivity", "vary"))
@@ -236,10 +213,7 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
 def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting], list[Problem]]:
     """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, all."""
     path, place, problems = config.switches or "", source.place_of((SWITCHES,)), []
-    try:
-        found = get_path(config.to_data(), key_path(path))
-    except PathError:
-        found = None
+    found = shape.get(config.to_data(), key_path(path))
     names = [*found] if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values()) else []
     if len(names) < 2:
         legal = "a mapping of at least two keys that are true or false, such as source.camera.effects"
@@ -248,14 +222,15 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
         if f"{axis}.".startswith(f"{path}.") or f"{path}.".startswith(f"{axis}."):
             message = f"the switches `{path}` and the axis `{axis}` set the same key"
             problems.append(Problem(message, place, fix="sweep other keys, or leave the switches out"))
-    on = {frozenset[str](): "none", **{frozenset({name}): f"{name} alone" for name in names}}
-    for label, chosen in [(f"all but {name}", frozenset(names) - {name}) for name in names] + [
-        ("all", frozenset(names))
-    ]:
-        on.setdefault(chosen, label)
-    settings = ({name: name in chosen for name in names} for chosen in on)
-    labels = (label.replace("_", " ") for label in on.values())
-    return [Setting(path, each, (SWITCHES,), label) for each, label in zip(settings, labels, strict=True)], problems
+    alone, whole = [frozenset({name}) for name in names], frozenset(names)
+
+    def label(on: frozenset[str]) -> str:
+        few = {0: "none", len(whole): "all", 1: f"{''.join(on)} alone"}
+        return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
+
+    chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - one for one in alone), whole])
+    axis = [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen]
+    return axis, problems
 
 
 def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -343,12 +318,12 @@ def _points(
 ) -> tuple[tuple[Point, ...], list[Problem]]:
     points: list[Point] = []
     problems: list[Problem] = []
-    called: dict[str, list[str]] = {}
+    called: dict[str, list[Any]] = {}
     known: dict[tuple[str, str], Draft] = {}
     set_ups: dict[str, str] = {}
     for draft in drafts:
         # a set-up and a variation, or two set-ups whose long values are shortened alike, could not be told apart
-        values = [_sameness(setting.value) for setting in draft.settings if setting.path != FRAMES]
+        values = [setting.value for setting in draft.settings if setting.path != FRAMES]
         if called.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
             return (), [Problem(message, source.place_of(draft.named_at), fix="give one another label")]
@@ -366,17 +341,14 @@ def _points(
             threshold = config.threshold.model_copy(update={"calibrate": calibrate})
             config = config.model_copy(update={"repeats": study.repeats, "threshold": threshold})
         # the resolved values of the axes tell set-ups apart, and which of them a variation is to be compared with
-        data, placed = json.loads(json.dumps(config.to_data())) if axes else {}, dict[str, Any]()
-        for path in axes:
-            with contextlib.suppress(PathError):
-                placed[path] = None
-                placed[path] = get_path(data, key_path(path))
+        data = json.loads(json.dumps(config.to_data())) if axes else {}
+        placed = {path: shape.get(data, key_path(path)) for path in axes}
         point = point_of(draft.label, draft.variant, {s.path: s.value for s in draft.settings}, config)
         reference = draft.variant
         if draft.is_variation:
-            reference = set_ups.get(_sameness(placed), "")
+            reference = set_ups.get(canonical_json(placed), "")
         else:
-            set_ups.setdefault(_sameness(placed), draft.variant)
+            set_ups.setdefault(canonical_json(placed), draft.variant)
         twin = known.setdefault((point.digest, draft.variant if draft.is_variation else ""), draft)
         if twin is not draft and experiment.draws is not None:
             continue
