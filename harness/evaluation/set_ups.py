@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
@@ -95,8 +96,6 @@ def found_limit_mm(summary: pd.DataFrame) -> float:
 def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Find (n,) where rates (n, s), made monotone, first reach one half: by linear interpolation between sizes, in mm.
     The least size where its rate does already, infinity where none does."""
-    from scipy.optimize import isotonic_regression
-
     monotone = np.array([isotonic_regression(row).x for row in np.asarray(rates, float)])
     reached = monotone >= HALF - 1e-12
     last = np.argmax(reached, axis=1)

@@ -26,12 +26,13 @@ from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.posterior import posterior_section
 from harness.report.view3d import write_view3d
 from harness.tables.outputs import REPORT
+from harness.tables.study import axis_value
 from harness.tables.text import Grid, inches, many
 from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict, claim_c11, score_claims
 from harness.thesis.inference import borne_out_if, posterior_of
 from harness.vocabulary.files import write_text
-from harness.vocabulary.path_names import value_text
+from harness.vocabulary.path_names import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +92,7 @@ def rates_figure(main: pd.DataFrame) -> str:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     return blocks.svg(
-        "rates", (7.0, 4.2), "Detection rate of each hole against its diameter, by number of frames.", draw
+        "rates", (5.4, 4.0), "Detection rate of each hole against its diameter, by number of frames.", draw
     )
 
 
@@ -111,7 +112,9 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_title(many(n, "frame"))
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
 
-    return blocks.svg("limits", (10, 3.8), "Smallest diameter found by each set-up, in millimetres.", draw)
+    return blocks.svg(
+        "limits", (1 + 3.2 * len(frames), 3.6), "Smallest diameter found by each set-up, in millimetres.", draw
+    )
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -218,14 +221,14 @@ class Layout:
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
         rows: dict[str, list[str]] = {}
         for _, row in set_ups.iterrows():
-            title = ", ".join(value_text(path, row[path]) for path in paths[:-1])
+            title = ", ".join(axis_value(path, row[path]) for path in paths[:-1])
             rows.setdefault(title, []).append(str(row["variant"]))
         if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
-            return Layout({str(name): [str(name)] for name in set_ups["variant"]})
+            return Layout({in_words(str(name)): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
         last = tables.axes.iloc[-1]
         unit = f" ({last['unit']})" if last["unit"] else ""
-        return Layout(rows, tuple(value_text(paths[-1], v) for v in values), last["name"] + unit, numbers)
+        return Layout(rows, tuple(axis_value(paths[-1], v) for v in values), last["name"] + unit, numbers)
 
 
 def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About) -> str:

@@ -98,7 +98,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     return blocks.svg(
-        "found", (7.0, 4.4), "Number of holes found against the number of views, by way of merging.", draw
+        "found", (5.4, 4.4), "Number of holes found against the number of views, by way of merging.", draw
     )
 
 

@@ -96,7 +96,7 @@ VARIED = Table(
     (
         Column("", "variation", lambda one: in_words(one.variant["variant"])),
         Column("", "why", _why),
-        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–").replace(MAIN, "the main set-up")),
+        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–")),
         Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
         Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
         *(
@@ -122,16 +122,23 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
     for variant in records(tables.variants[tables.variants["is_variation"].astype(bool)]):
         variant["reference"] = variant["reference"] or of
         others = there.get(variant["reference"], [])
-        for one in there.get(str(variant["variant"]), [None]):
+        for number, one in enumerate(there.get(str(variant["variant"]), [None])):
             alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
-            rows.append(Varied(variant, one, next(iter([*alike, *others[-1:]]), None)))
+            said = {"reason": "", "settings": ""} if number else {}  # why is said once
+            rows.append(Varied({**variant, **said}, one, next(iter([*alike, *others[-1:]]), None)))
     if not rows:
         return Markup("")
     said = (
         "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
-    return joined([heading("If facts were otherwise"), paragraph(said), VARIED.grid(rows).html()])
+    return joined(
+        [
+            heading("If facts were otherwise"),
+            paragraph(said),
+            VARIED.grid(rows, heads={"changes": ""} if of else None).html(),
+        ]
+    )
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:

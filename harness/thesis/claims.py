@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.stats import permutation_test, rankdata
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
 from harness.evaluation.maps import CAMERA_UNIT, MANY, span
@@ -265,8 +266,6 @@ def score_claims(
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows", by permutation: exact up to 8 pairs, 20000
     fixed random ones beyond. A constant input has rho 0, p 1."""
-    from scipy.stats import permutation_test, rankdata
-
     ranks, other = rankdata(x), rankdata(y)
     if np.ptp(ranks) == 0 or np.ptp(other) == 0:
         return 0.0, 1.0
