@@ -41,6 +41,10 @@ class Interval:
         """Return whether the whole interval lies below ``value``; False where unknown."""
         return bool(self.high < value)
 
+    def over(self, value: float) -> bool | None:
+        """Return whether what is estimated surely exceeds ``value``; None where the interval has room for both."""
+        return True if self.low > value else False if self.high <= value else None
+
     def within(self, low: float, high: float) -> bool:
         """Return whether the whole interval lies in [low, high]; False where unknown."""
         return bool(self.low >= low and self.high <= high)

@@ -115,13 +115,14 @@ def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
     """Make one row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
-    ``half_*`` need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single diameters of found holes
-    against the truth, ``<measure>_place_*`` of distances from the largest hole (none where several are); noise of the
-    averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
+    ``half_*``, of set-ups alone, need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single
+    diameters of found holes against the truth, ``<measure>_place_*`` of distances from the largest hole (none where
+    several are); noise of the averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
     import pandas as pd
 
-    summary = summary[summary["variant"].isin(variants)]
-    table = pd.DataFrame([_row(tables, part, half_sizes) for _, part in summary.groupby(KEYS, sort=False)])
+    summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
+    groups = summary.groupby(KEYS, sort=False)
+    table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
     if table.empty:
         return table
     noise = noise_against_frames(tables.probes)[[*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]]

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
-from harness.evaluation.maps import compare_maps, label_of
-from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.maps import label_of
+from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.study.result import conditions_of
-from harness.evaluation.summary import MAIN, found_rule, summarise_holes
+from harness.evaluation.summary import MAIN, found_rule
 from harness.report.blocks import closing, fold, heading, joined, note, paragraph, template
 from harness.report.scene import scene_svg
+from harness.report.summaries import Summaries, of_set_ups
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
-from harness.tables.trials import CLAIMS, MARKS, SET_UPS, ResultTables
+from harness.tables.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
 from harness.vocabulary.path_names import in_words
 
@@ -192,15 +193,13 @@ TONES: dict[Any, Tone] = {"found": "key", "missed": "bad", "undecided": "open"}
 SHOWN = ("set-up", "frames", "found", "from (mm)", "50 % size (mm)")
 
 
-def final_tables(tables: ResultTables) -> list[str | Grid]:
+def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
     """Return what a terminal shows at the end, by the kind of experiment."""
-    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
     if not tables.registrations.empty:
-        return [ways_grid(compare_maps(tables, summary))]
+        return [ways_grid(found[SET_UPS])]
     if len(set_ups_of(tables)) > 1:
-        compared = compare_set_ups(tables, summary, set_ups_of(tables), half_sizes=False)
-        return [set_ups_grid(compared, terminal=True)]
-    return [holes_grid(summary, terminal=True)]
+        return [set_ups_grid(of_set_ups(found[SET_UPS], tables), terminal=True)]
+    return [holes_grid(found[SUMMARY], terminal=True)]
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
