@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,16 +60,16 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
-    titles, warnings = _cameras(surfaces)
+    titles = _titles(surfaces)
     if asked:
-        _answer(options, surfaces, titles, warnings, about)
+        _answer(options, surfaces, titles, about)
     if options.out is not None:
         from harness.report.atlas import atlas_html, save_atlas_png
         from harness.vocabulary.files import write_text
 
         rows = curves(surfaces, titles)
         write_table(options.out, ATLAS, ATLAS.frame(rows), about)
-        write_text(options.out / ATLAS_PAGE.name, atlas_html(rows, list(warnings.values()), about, command))
+        write_text(options.out / ATLAS_PAGE.name, atlas_html(rows, _warnings(titles), about, command))
         save_atlas_png(options.out / ATLAS_PICTURE.name, rows)
         print(f"wrote {options.out / ATLAS_PAGE.name}, {ATLAS_PICTURE.name}, {', '.join(ATLAS.files)}")
     return 0
@@ -97,22 +97,26 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
 
 
-def _cameras(surfaces: Sequence[LimitSurface]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the cameras' titles, and warnings on those whose precision is a guess."""
+def _titles(surfaces: Sequence[LimitSurface]) -> dict[str, str]:
+    """Return the cameras' titles by their names."""
+    from scenes.sensor.camera import load_camera
+
+    return {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
+
+
+def _warnings(cameras: Iterable[str]) -> list[str]:
+    """Return warnings on those of the cameras whose precision is a guess, one for all that are guessed alike."""
     from scenes.sensor.camera import guessed_precision, load_camera
 
-    cameras = {surface.camera: load_camera(surface.camera) for surface in surfaces}
-    warnings = {name: guessed_precision(camera) for name, camera in cameras.items()}
-    return {name: camera.title for name, camera in cameras.items()}, {k: text for k, text in warnings.items() if text}
+    alike: dict[str, list[str]] = {}
+    for camera in map(load_camera, dict.fromkeys(cameras)):
+        if text := guessed_precision(camera):
+            alike.setdefault(text.replace(camera.title, "{}"), []).append(camera.title)
+    whose = {text: text if len(of) == 1 else text.replace("its noise", "their noise") for text, of in alike.items()}
+    return [whose[text].format("; ".join(of)) for text, of in alike.items()]
 
 
-def _answer(
-    options: argparse.Namespace,
-    surfaces: Sequence[LimitSurface],
-    titles: dict[str, str],
-    warnings: dict[str, str],
-    about: Any,
-) -> None:
+def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], titles: dict[str, str], about: Any) -> None:
     import numpy as np
 
     from harness.tables.atlas import ATLAS, damage_words, rows_at
@@ -142,9 +146,8 @@ def _answer(
         refused += [reason for reason in why if reason not in refused]
     if not rows:
         raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix="run a study: tofpod sweep atlas")
-    for text in dict.fromkeys(warnings.get(row.surface.camera) for row in rows):
-        if text:
-            print(f"warning: {text}")
+    for text in _warnings(row.surface.camera for row in rows):
+        print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
     said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
     answer = (
@@ -172,7 +175,8 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
         there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
         if unknown := [one for one in wanted if one not in there]:
             option = "--damage" if name == "kind" else f"--{name}"
-            raise UserError(f"{option} {', '.join(unknown)}: not in the atlas", legal=", ".join(there))
+            words = [word for word, kind in KINDS.items() if name == "kind" and kind in there]
+            raise UserError(f"{option} {', '.join(unknown)}: not in the atlas", legal=", ".join((*words, *there)))
     cameras = options.camera or [surface.camera for surface in surfaces]
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 

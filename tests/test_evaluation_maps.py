@@ -146,8 +146,8 @@ def test_holes_are_in_the_order_of_their_size():
 )
 def test_a_change_is_certain_or_open(values, above, below):
     change = change_of(np.array(values))
-    assert (change.is_above, change.is_below) == (above, below)
-    assert change_of(np.array(values[:1])).is_above is None
+    assert (change.interval.over(0), change.is_below) == (above, below)
+    assert change_of(np.array(values[:1])).interval.over(0) is None
 
 
 def test_noise_is_compared_as_a_ratio():

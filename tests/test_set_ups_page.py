@@ -17,6 +17,7 @@ from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.report.page import Layout, set_ups_html, write_report
 from harness.report.sections import About, set_ups_grid
+from harness.vocabulary.path_names import camera_title, in_words
 
 AXES = ["source.camera.name", "source.target.distance_m"]
 SMALLEST = {"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)}
@@ -82,7 +83,8 @@ def test_a_page_of_another_target_does_not_mention_the_thesis():
 
 def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
-    assert "Found of 11 holes at 0.5 m, 1 m with 50 averaged frames: azure_kinect_nfov 9, 8; kinect_v2 8, 7" in answer
+    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned 9, 8; Kinect v2 8, 7; RealSense L515 XGA 8, 8."
+    assert f"Found of 11 holes at 0.5 m, 1 m {said}" in answer
     # one unit of each camera
     assert "is undecided" in answer
 
@@ -90,7 +92,7 @@ def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
 def test_a_variation_is_shown_beside_its_set_up(page):
     row = page[page.index("L515 at 0.5 m, beam of 0.7 mrad</th>") :]
     row = row[: row.index("</tr>")]
-    assert set_up_name("realsense_l515", 0.5) in row
+    assert in_words(set_up_name("realsense_l515", 0.5)) in row
     assert ">≠<" in row and "9 of 11 <small>3–11" in row
     assert "7 of 11 <small>5–11" in row  # the set-up's own, with one frame
 
@@ -99,13 +101,13 @@ def test_the_table_has_the_counts_of_both_numbers_of_frames():
     found = cameras(SMALLEST)
     compared = compare_set_ups(found, summarise_holes(found.holes, AXES), set_ups_of(found))
     layout = Layout.of(found)
-    assert list(layout.rows) == list(CAMERAS)
+    assert list(layout.rows) == [camera_title(camera) for camera in CAMERAS]
     assert (layout.columns, layout.column_name, layout.column_values) == (("0.5 m", "1 m"), "distance (m)", (0.5, 1.0))
     rows = [[cell.text for cell in row] for row in set_ups_grid(compared).rows]
-    assert rows[4][:4] == ["camera=kinect_v2, distance=0.5 m", "1", "7 of 11\n5–11", "7.94"]
+    assert rows[4][:4] == ["Kinect v2, distance 0.5 m", "1", "7 of 11\n5–11", "7.94"]
     lines = set_ups_grid(compared, terminal=True).lines()
     assert len(lines) == 1 + 12
-    assert re.match(r"camera=kinect_v2, distance=0.5 m +50 +8 of 11 4–11 +6.35$", lines[6])
+    assert re.match(r"Kinect v2, distance 0.5 m +50 +8 of 11 4–11 +6.35$", lines[6])
 
 
 def test_failures_and_missing_set_ups_are_told():

@@ -19,7 +19,7 @@ from harness.report.study_page import MOST_CURVES, axis_figure, overlay_figure, 
 from harness.tables.limits import LIMITS, is_within_sizes, limit_notes, limit_sentence, notes_of, study_answer
 from harness.tables.schema import Estimate
 from harness.tables.study import axis_grid, axis_groups
-from harness.tables.text import Grid, interval, text_of, unbroken, unmeasured, with_interval
+from harness.tables.text import Grid, interval, size, text_of, unbroken, unmeasured, with_interval
 
 
 def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
@@ -29,7 +29,7 @@ def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
 
 def result_of(limits: list[SetUpLimit]) -> StudyResult:
     """A result of limits alone."""
-    set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", (), np.nan) for one in limits)
+    set_ups = tuple(SetUpResult(one, None, (), None, None, None, "", np.nan) for one in limits)
     return StudyResult(study_record(), set_ups, tuple(limits), (), (), {})
 
 
@@ -61,23 +61,26 @@ def everything_found() -> SetUpLimit:
 def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
     for limit in two:
         said = limit_sentence(limit)
-        assert said.startswith(f"{limit.record.label}: damage of {limit.a90_95.value:.2f} mm is found 90 % of the time")
+        assert said.startswith(
+            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the time"
+        )
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
         assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in said
     second = limit_sentence(two[1], again=True)
-    assert second.startswith(f"{two[1].record.label}: {two[1].a90_95.value:.2f} mm, at ")
+    assert second.startswith(f"{two[1].record.label}: {size(two[1].a90_95.value)} mm, at ")
     assert study_answer(two) == f"One unit of the camera: {limit_sentence(two[0])} {second}"
 
 
 def test_of_many_set_ups_the_span_and_those_without_a_limit(two: list[SetUpLimit], nothing_found: SetUpLimit) -> None:
     said = study_answer([*two, *two, nothing_found])
     assert said.startswith(
-        f"One unit of the camera: Of 5 set-ups, the smallest limit (a90/95) is {two[1].a90_95.value:.2f} mm (50 frames)"
+        "One unit of the camera: of 5 set-ups, the smallest limit (a90/95) is "
+        f"{size(two[1].a90_95.value)} mm (50 frames)"
     )
-    assert f"the largest {two[0].a90_95.value:.2f} mm (1 frame)" in said
+    assert f"the largest {size(two[0].a90_95.value)} mm (1 frame)" in said
     assert said.endswith("; 1 of 5 set-ups demonstrates no limit within the sizes inspected.")
-    none = "None of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
+    none = "none of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
     assert study_answer([nothing_found] * 4) == f"One unit of the camera: {none}"
     assert study_answer([]) == "No set-up was inspected, so there is no answer."
 
@@ -144,7 +147,7 @@ def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLi
     row = row_of(everything_found)
     # the smallest of 160 sizes from 1 to 14 mm: an upper limit of both estimates, and none of them has an interval
     assert row["a50 (mm)"] == row["a90 (mm)"] == "≤\u00a01.00"
-    assert row["a90/95 (mm)"] == f"{everything_found.a90_95.value:.2f}"
+    assert row["a90/95 (mm)"] == size(everything_found.a90_95.value)
     assert notes_of(everything_found)[0].startswith("all found: binomial")
     assert row["found"] == "160 of 160"
 
@@ -201,7 +204,7 @@ def test_repeats_are_no_targets_and_both_limits_are_told() -> None:
     assert wrong < limit.a90_95.value
     why = "; ".join(notes_of(limit))
     assert "480 inspections of 160 targets count as 160" in why
-    assert f"were every inspection a target of its own, a90/95 would be {wrong:.2f} mm: wrong" in why
+    assert f"were every inspection a target of its own, a90/95 would be {size(wrong)} mm: wrong" in why
 
 
 def test_few_targets_are_told() -> None:

@@ -18,7 +18,7 @@ from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
 from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
 from harness.engine.run import render_missing, run_plan
-from harness.engine.tables import summaries, tables_of, write_tables
+from harness.engine.tables import tables_of, write_tables
 from harness.engine.work import STATES, EngineOptions, Failure, JobEngine, Outcome, engine_of, locked
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
 from harness.experiment.load import resolved_yaml
@@ -159,11 +159,14 @@ def _write_report(
     """Write the summaries and the report of what is no study. Returns what a terminal shows of it."""
     from harness.report.page import write_report
     from harness.report.sections import final_tables
+    from harness.report.summaries import as_files, is_thesis, summaries
 
-    write_tables(folder, summaries(tables, outcome.examples), provenance)
-    title, facts = title_of(experiment), experiment.data
-    write_report(folder, tables, outcome.examples, provenance, resolved_yaml(experiment), title, facts)
-    return final_tables(tables)
+    facts = experiment.data
+    found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
+    write_tables(folder, as_files(found), provenance)
+    told = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
+    write_report(folder, tables, outcome.examples, *told, found=found)
+    return final_tables(tables, found)
 
 
 # ---------------------------------------------------------------- failures, provenance

@@ -12,16 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
-from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
-from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.experiment.schema import MAIN, Experiment, LabelledVariation, Point
 from harness.experiment.unfold import FRAMES
 from harness.tables import trials
 from harness.tables.schema import Table, write_table
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import names_of, unit_of
-from harness.vocabulary.provenance import RESULTS_VERSION
 
 RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, "registrations": trials.REGISTRATIONS}
 """Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
@@ -187,35 +183,3 @@ def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance:
     keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")
     for table, frame in tables.items():
         write_table(folder, table, frame, {key: provenance[key] for key in keys})
-
-
-def summaries(tables: trials.ResultTables, examples: Sequence[Any] = ()) -> dict[Table, pd.DataFrame]:
-    """Return the summaries of an experiment that is no study: all that its page shows. ``examples``: pictures that
-    claims are scored with."""
-    from harness.thesis.claims import claim_c11, score_claims
-    from harness.thesis.inference import posterior_of
-    from harness.thesis.views import score_views
-
-    paths, variants = list(tables.axes["path"]), set_ups_of(tables)
-    summary = summarise_holes(tables.holes, paths)
-    found = {trials.NOISE_BY_FRAMES: noise_against_frames(tables.probes), trials.FALSE_CALLS: false_calls(tables.runs)}
-    if not tables.registrations.empty:
-        own = tables.registrations[tables.registrations["variant"].isin(variants)]
-        found[trials.SET_UPS] = compare_maps(tables, summary)
-        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
-        verdicts = score_views(map_cases(tables, summary))
-    elif len(variants) > 1:
-        verdict = claim_c11(summary, paths)
-        found[trials.SET_UPS] = compare_set_ups(tables, summary, variants)
-        verdicts = [verdict] if verdict else []
-        posterior = posterior_of(summary[summary["variant"].isin(variants)], paths)
-        found |= {} if posterior is None else {trials.POSTERIOR: posterior}
-        if not (effects := effect_costs(tables)).empty:
-            found[trials.EFFECTS] = effects
-    else:
-        verdicts = score_claims(tables, MAIN, examples, summary)
-    found[trials.CLAIMS] = trials.CLAIMS.frame(map(vars, verdicts))
-    for frame in found.values():
-        for name in {"found", "undecided", "reasons"} & set(frame.columns):
-            frame[name] = frame[name].map("; ".join)
-    return {trials.SUMMARY: summary.assign(results_version=RESULTS_VERSION), **found}

@@ -41,6 +41,10 @@ class Interval:
         """Return whether the whole interval lies below ``value``; False where unknown."""
         return bool(self.high < value)
 
+    def over(self, value: float) -> bool | None:
+        """Return whether what is estimated surely exceeds ``value``; None where the interval has room for both."""
+        return True if self.low > value else False if self.high <= value else None
+
     def within(self, low: float, high: float) -> bool:
         """Return whether the whole interval lies in [low, high]; False where unknown."""
         return bool(self.low >= low and self.high <= high)
@@ -52,10 +56,8 @@ UNKNOWN = Interval(np.nan, np.nan)
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Coverage is
     near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
-    from scipy.stats import norm
-
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    z2 = norm.ppf(UPPER) ** 2
+    z2 = stats.norm.ppf(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
@@ -66,11 +68,9 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
-    from scipy.stats import beta
-
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    low = np.where(k == 0, 0.0, beta.ppf(1 - UPPER, k, n - k + 1))
-    high = np.where(k == n, 1.0, beta.ppf(UPPER, k + 1, n - k))
+    low = np.where(k == 0, 0.0, stats.beta.ppf(1 - UPPER, k, n - k + 1))
+    high = np.where(k == n, 1.0, stats.beta.ppf(UPPER, k + 1, n - k))
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
@@ -78,51 +78,43 @@ def poisson_rate(
     count: ArrayLike, exposure: ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Garwood's exact interval of a Poisson rate, ``count`` events in ``exposure`` (runs, areas), NaN where 0."""
-    from scipy.stats import chi2
-
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
     tail = (1 - confidence) / 2
-    low = np.where(k == 0, 0.0, chi2.ppf(tail, 2 * k) / 2)
-    high = chi2.ppf(1 - tail, 2 * k + 2) / 2
+    low = np.where(k == 0, 0.0, stats.chi2.ppf(tail, 2 * k) / 2)
+    high = stats.chi2.ppf(1 - tail, 2 * k + 2) / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
 
 
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
-    from scipy.stats import t
-
     m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
     size = np.where(k >= 2, k, np.nan)
-    half = t.ppf(UPPER, size - 1) * s / np.sqrt(size)
+    half = stats.t.ppf(UPPER, size - 1) * s / np.sqrt(size)
     return m - half, m + half
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     """Welch's interval of mean(first) - mean(second); a point where neither varies, unknown below two values each."""
-    from scipy.stats import ttest_ind
-
     a, b = np.asarray(first, float), np.asarray(second, float)
     if min(len(a), len(b)) < 2:
         return UNKNOWN
     if np.ptp(a) == np.ptp(b) == 0:
         return Interval(float(a[0] - b[0]), float(a[0] - b[0]))
-    ends = ttest_ind(a, b, equal_var=False).confidence_interval(CONFIDENCE)
+    ends = stats.ttest_ind(a, b, equal_var=False).confidence_interval(CONFIDENCE)
     return Interval(float(ends.low), float(ends.high))
 
 
 def standardised_bias(bias: float, std: float, n: int) -> Interval:
     """Interval of bias / standard deviation (an effect size) from ``n`` normal values, by the large-sample variance
     1/n + d^2/(2n) (Hedges and Olkin 1985). Exact (0 or infinite) where they do not vary; unknown below two values."""
-    from scipy.stats import norm
-
     if n < 2 or not (np.isfinite(bias) and np.isfinite(std)):
         return UNKNOWN
     if std == 0:
         ratio = 0.0 if bias == 0 else float(np.copysign(np.inf, bias))
         return Interval(ratio, ratio)
     ratio = bias / std
-    half = float(norm.ppf(UPPER) * np.sqrt(1 / n + ratio**2 / (2 * n)))
+    half = float(stats.norm.ppf(UPPER) * np.sqrt(1 / n + ratio**2 / (2 * n)))
     return Interval(ratio - half, ratio + half)
 
 

@@ -99,14 +99,9 @@ class Change:
     n: int
 
     @property
-    def is_above(self) -> bool | None:
-        """True where surely above zero, False where surely not, None where the interval has room for both."""
-        return True if self.interval.above(0) else False if self.interval.high <= 0 else None
-
-    @property
     def is_below(self) -> bool | None:
         """True where surely below zero, False where surely not, None where the interval has room for both."""
-        return True if self.interval.below(0) else False if self.interval.low >= 0 else None
+        return Interval(-self.interval.high, -self.interval.low).over(0)
 
 
 def change_of(differences: np.ndarray) -> Change:

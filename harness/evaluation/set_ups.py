@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
@@ -95,8 +96,6 @@ def found_limit_mm(summary: pd.DataFrame) -> float:
 def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Find (n,) where rates (n, s), made monotone, first reach one half: by linear interpolation between sizes, in mm.
     The least size where its rate does already, infinity where none does."""
-    from scipy.optimize import isotonic_regression
-
     monotone = np.array([isotonic_regression(row).x for row in np.asarray(rates, float)])
     reached = monotone >= HALF - 1e-12
     last = np.argmax(reached, axis=1)
@@ -116,13 +115,14 @@ def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
     """Make one row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
-    ``half_*`` need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single diameters of found holes
-    against the truth, ``<measure>_place_*`` of distances from the largest hole (none where several are); noise of the
-    averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
+    ``half_*``, of set-ups alone, need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single
+    diameters of found holes against the truth, ``<measure>_place_*`` of distances from the largest hole (none where
+    several are); noise of the averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
     import pandas as pd
 
-    summary = summary[summary["variant"].isin(variants)]
-    table = pd.DataFrame([_row(tables, part, half_sizes) for _, part in summary.groupby(KEYS, sort=False)])
+    summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
+    groups = summary.groupby(KEYS, sort=False)
+    table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
     if table.empty:
         return table
     noise = noise_against_frames(tables.probes)[[*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]]

@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.optimize import nnls
 
 from harness.evaluation import intervals
 from harness.evaluation.intervals import Interval, bootstrap
@@ -213,8 +214,6 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
 def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> FloorFit | None:
     """Fit least squares of total^2 on 1/N with both parts non-negative, weighted to equal relative error. None below
     two different numbers of frames (the two parts cannot be told apart)."""
-    from scipy.optimize import nnls
-
     n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
     usable = np.isfinite(total2) & (total2 > 0)
     if len(np.unique(n[usable])) < 2:

@@ -10,7 +10,7 @@ import numpy as np
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.verdict import MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
-from harness.report.blocks import command_of, heading, note, page
+from harness.report.blocks import command_of, fold, heading, note, page
 from harness.tables.schema import Column, Table, jsonable
 from harness.tables.text import Grid, Tone, mm, p_value
 
@@ -67,6 +67,7 @@ COMPARED = Table(
     ),
     formats=(),
     left=3,
+    kind="limits compared",
 )
 TESTS = (
     "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
@@ -87,8 +88,7 @@ def compare_html(comparison: Comparison, command: str) -> str:
     body = [
         heading("Set-ups"),
         COMPARED.grid(comparison.rows).html(),
-        note(rule(comparison)),
-        note(TESTS),
+        fold("What verdicts and columns say", note(rule(comparison)), note(TESTS)),
         heading("Origin"),
         Grid.of(("", "first", "second"), origins, left=3).html(),
         *command_of(command),
@@ -175,7 +175,7 @@ def _row_data(row: ComparedSetUps) -> dict[str, Any]:
     if row.signal is not None:
         data["signal"] = {**vars(row.signal), "decides": dict(zip(sides, row.signal_p, strict=True))}
     if row.calls is not None:
-        data["false_calls"] = {**vars(row.calls), "ratio": row.calls.ratio}
+        data["false_calls"] = {**vars(row.calls), "ratio": row.calls.ratio, "rates_per_m2": row.calls.rates_per_m2}
         data["false_calls"]["decides"] = dict(zip(sides, row.calls_p, strict=True))
     return data
 

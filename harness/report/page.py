@@ -9,29 +9,37 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.set_ups import LIMIT_RULE, compare_set_ups, effect_costs, set_ups_of
+from harness.evaluation.set_ups import LIMIT_RULE, set_ups_of
 from harness.evaluation.summary import (
     MAIN,
-    false_calls,
     fit_floor,
     found_holes,
     hole_list,
-    noise_against_frames,
-    summarise_holes,
 )
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure, sights_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.posterior import posterior_section
+from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
 from harness.report.view3d import write_view3d
 from harness.tables.outputs import REPORT
+from harness.tables.study import axis_value
 from harness.tables.text import Grid, inches, many
-from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
-from harness.thesis.claims import Verdict, claim_c11, score_claims
-from harness.thesis.inference import borne_out_if, posterior_of
+from harness.tables.trials import (
+    EFFECTS,
+    ERRORS,
+    FALSE_CALLS,
+    NOISE_BY_FRAMES,
+    POSTERIOR,
+    SET_UPS,
+    SUMMARY,
+    ResultTables,
+)
+from harness.thesis.claims import Verdict
+from harness.thesis.inference import borne_out_if
 from harness.vocabulary.files import write_text
-from harness.vocabulary.path_names import value_text
+from harness.vocabulary.path_names import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +99,7 @@ def rates_figure(main: pd.DataFrame) -> str:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     return blocks.svg(
-        "rates", (7.0, 4.2), "Detection rate of each hole against its diameter, by number of frames.", draw
+        "rates", (5.4, 4.0), "Detection rate of each hole against its diameter, by number of frames.", draw
     )
 
 
@@ -111,7 +119,9 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_title(many(n, "frame"))
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
 
-    return blocks.svg("limits", (10, 3.8), "Smallest diameter found by each set-up, in millimetres.", draw)
+    return blocks.svg(
+        "limits", (1 + 3.2 * len(frames), 3.6), "Smallest diameter found by each set-up, in millimetres.", draw
+    )
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -218,25 +228,24 @@ class Layout:
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
         rows: dict[str, list[str]] = {}
         for _, row in set_ups.iterrows():
-            title = ", ".join(value_text(path, row[path]) for path in paths[:-1])
+            title = ", ".join(axis_value(path, row[path]) for path in paths[:-1])
             rows.setdefault(title, []).append(str(row["variant"]))
         if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
-            return Layout({str(name): [str(name)] for name in set_ups["variant"]})
+            return Layout({in_words(str(name)): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
         last = tables.axes.iloc[-1]
         unit = f" ({last['unit']})" if last["unit"] else ""
-        return Layout(rows, tuple(value_text(paths[-1], v) for v in values), last["name"] + unit, numbers)
+        return Layout(rows, tuple(axis_value(paths[-1], v) for v in values), last["name"] + unit, numbers)
 
 
-def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About) -> str:
+def set_ups_html(
+    tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About, found: Summaries | None = None
+) -> str:
     """The page of several set-ups as text; see `write_report`."""
-    axes = [str(path) for path in tables.axes["path"]]
-    summary, variants = summarise_holes(tables.holes, axes), set_ups_of(tables)
-    compared = compare_set_ups(tables, summary, variants)
-    layout, costs, frames = Layout.of(tables), effect_costs(tables), sections.shown_frames(compared)
-    verdict = claim_c11(summary, axes) if about.with_claims else None
-    own = summary[summary["variant"].isin(variants)]
-    posterior = posterior_of(own, axes) if about.with_claims else None
+    found = found or summaries(tables, examples, with_claims=about.with_claims)
+    compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[EFFECTS], found.get(POSTERIOR)
+    verdict = next(iter(verdicts_of(found)), None)
+    layout, frames = Layout.of(tables), sections.shown_frames(compared)
     middle = max(0, (len(layout.columns) - 1) // 2)
     clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
     sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}
@@ -247,10 +256,8 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
         figures["sights"] = sights_figure(sights)
     figures |= {} if costs.empty else {"effects": effects_figure(costs)}
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
-    everything = [str(name) for name in tables.variants["variant"]]
-    everywhere = compare_set_ups(tables, summary, everything, half_sizes=False)
-    calls = false_calls(tables.runs)
-    calls = calls[(calls["role"] == "damaged") & calls["variant"].isin(variants) & calls["frames"].isin(frames)]
+    calls = of_set_ups(found[FALSE_CALLS], tables)
+    calls = calls[(calls["role"] == "damaged") & calls["frames"].isin(frames)]
     rule = "Each set-up has hole-free runs and a threshold of its own."
     return sections.sweep_page(
         "set_ups.html",
@@ -266,7 +273,7 @@ def set_ups_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: 
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
         claims=sections.claims_section("The thesis' claim", [verdict] if verdict else []),
-        varied=sections.varied_section(tables, everywhere, frames),
+        varied=sections.varied_section(tables, found[SET_UPS], frames),
         calls=FALSE_CALLS.grid(sections.records(calls)).html(),
     )
 
@@ -320,20 +327,20 @@ def write_report(
     experiment_yaml_text: str,
     title: str,
     facts: Mapping[str, Any] | None = None,
+    found: Summaries | None = None,
 ) -> Path:
     """Write ``folder/report.html`` and return its path: the page of one set-up, that of several side by side, or that
     of maps, with a page beside it for each map of ``examples`` that turns in the browser. ``provenance``: see
-    `harness.report.blocks.closing`; ``facts``: the resolved experiment as plain data. Claims of the thesis are scored
-    where the target is the thesis'. The same input gives the same bytes. Raises UserError where the folder cannot be
-    written."""
-    is_thesis = ((facts or {}).get("source", {}).get("target") or {}).get("name") == "thesis"
-    about = sections.About(provenance, experiment_yaml_text, title, is_thesis, facts or {})
+    `harness.report.blocks.closing`; ``facts``: the resolved experiment as plain data; ``found``: of
+    `summaries`. Claims of the thesis are scored where the target is the thesis'. The same input gives the same bytes.
+    Raises UserError where the folder cannot be written."""
+    about = sections.About(provenance, experiment_yaml_text, title, is_thesis(facts or {}), facts or {})
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
     if len(tables.registrations):
-        text = perspectives_html(tables, maps, about)
+        text = perspectives_html(tables, maps, about, found)
     else:
-        text = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, about)
+        text = (set_ups_html if len(set_ups_of(tables)) > 1 else report_html)(tables, clouds, about, found)
     for name, example in map_files(maps).items():
         write_view3d(Path(folder) / name, example.scene, map_text(example))
     path = Path(folder) / REPORT.name
@@ -341,21 +348,19 @@ def write_report(
     return path
 
 
-def report_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About) -> str:
+def report_html(
+    tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About, found: Summaries | None = None
+) -> str:
     """The page of an experiment with one set-up as text; see `write_report`."""
-    summary = summarise_holes(tables.holes)
-    main = summary[summary["variant"] == MAIN]
+    found = found or summaries(tables, examples, with_claims=about.with_claims)
+    main, noise, calls = (found[of][found[of]["variant"] == MAIN] for of in (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS))
+    verdicts = verdicts_of(found)
     frames = sorted(int(n) for n in main["frames"].unique())
-    noise = noise_against_frames(tables.probes[tables.probes["variant"] == MAIN])
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
     last = main[main["frames"] == main["frames"].max()]
     figures = {"rates": rates_figure(main), "errors": errors_figure(last)} if frames else {}
     figures |= {"residual": residual_figure(clouds)} if clouds else {}
     figures |= {"noise": noise_figure(noise)} if len(noise) and (noise["temporal_rms_mm"] > 0).all() else {}
-    verdicts = score_claims(tables, MAIN, examples, summary) if about.with_claims else []
-    calls = false_calls(tables.runs)
-    variants = [MAIN, *(str(name) for name in tables.variants["variant"] if name != MAIN)]
-    compared = compare_set_ups(tables, summary, variants, half_sizes=False)
     return sections.sweep_page(
         "sweep.html",
         tables,
@@ -363,12 +368,12 @@ def report_html(tables: ResultTables, examples: Sequence[ExampleCloud], about: s
         answer_sentence(main, verdicts),
         figures,
         rule=sections.rule_note(int(main["n"].max()) if len(main) else 0),
-        holes=sections.holes_grid(summary).html(),
+        holes=sections.holes_grid(main).html(),
         sizes=SUMMARY.grid(sections.records(last)).html(),
         noise=NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
         claims=sections.claims_section("The thesis' claims", verdicts),
-        varied=sections.varied_section(tables, compared, (*frames[:1], *frames[-1:]), of=MAIN),
-        calls=FALSE_CALLS.grid(sections.records(calls[calls["variant"] == MAIN]), heads={"set-up": ""}).html(),
+        varied=sections.varied_section(tables, found[SET_UPS], (*frames[:1], *frames[-1:]), of=MAIN),
+        calls=FALSE_CALLS.grid(sections.records(calls), heads={"set-up": ""}).html(),
     )
 
 

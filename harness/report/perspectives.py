@@ -12,16 +12,15 @@ from markupsafe import Markup
 
 from harness.evaluation import maps
 from harness.evaluation.set_ups import set_ups_of
-from harness.evaluation.summary import summarise_holes
 from harness.report import blocks, sections
 from harness.report.clouds import MappedExample
+from harness.report.summaries import Summaries, summaries, verdicts_of
 from harness.report.view3d import KINDS, SEVERAL, VIEW_COLOURS
 from harness.tables.outputs import MAPS
 from harness.tables.schema import Table
 from harness.tables.text import many
-from harness.tables.trials import REGISTRATION_ERRORS, SET_UPS, ResultTables
+from harness.tables.trials import REGISTRATION_ERRORS, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
-from harness.thesis.views import score_views
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,14 +34,15 @@ MAPS_SHOWN = (
 )
 
 
-def perspectives_html(tables: ResultTables, examples: Sequence[MappedExample], about: sections.About) -> str:
+def perspectives_html(
+    tables: ResultTables, examples: Sequence[MappedExample], about: sections.About, found: Summaries | None = None
+) -> str:
     """The page as text; see `harness.report.page.write_report`."""
-    summary = summarise_holes(tables.holes, [str(path) for path in tables.axes["path"]])
-    compared, cases = maps.compare_maps(tables, summary), maps.map_cases(tables, summary)
-    verdicts = score_views(cases) if about.with_claims else []
+    found = found or summaries(tables, with_claims=about.with_claims)
+    compared, errors, verdicts = found[SET_UPS], found[REGISTRATION_ERRORS], verdicts_of(found)
+    cases = maps.map_cases(tables, found[SUMMARY])
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     own = tables.registrations[tables.registrations["variant"].isin(set_ups_of(tables))]
-    errors = maps.by_views(own, sorted({one.views for one in maps.maps_of(tables)}))
     frames = sections.shown_frames(set_ups)[::-1]
     several = [example for example in _in_order(examples) if example.views > 1]
     figures: dict[str, str] = {}
@@ -98,7 +98,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     return blocks.svg(
-        "found", (7.0, 4.4), "Number of holes found against the number of views, by way of merging.", draw
+        "found", (5.4, 4.4), "Number of holes found against the number of views, by way of merging.", draw
     )
 
 

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
-from harness.evaluation.maps import compare_maps, label_of
-from harness.evaluation.set_ups import compare_set_ups, set_ups_of
+from harness.evaluation.maps import label_of
+from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.study.result import conditions_of
-from harness.evaluation.summary import MAIN, found_rule, summarise_holes
+from harness.evaluation.summary import MAIN, found_rule
 from harness.report.blocks import closing, fold, heading, joined, note, paragraph, template
 from harness.report.scene import scene_svg
+from harness.report.summaries import Summaries, of_set_ups
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
-from harness.tables.trials import CLAIMS, MARKS, SET_UPS, ResultTables
+from harness.tables.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
 from harness.vocabulary.path_names import in_words
 
@@ -96,7 +97,7 @@ VARIED = Table(
     (
         Column("", "variation", lambda one: in_words(one.variant["variant"])),
         Column("", "why", _why),
-        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–").replace(MAIN, "the main set-up")),
+        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–")),
         Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
         Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
         *(
@@ -122,16 +123,23 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
     for variant in records(tables.variants[tables.variants["is_variation"].astype(bool)]):
         variant["reference"] = variant["reference"] or of
         others = there.get(variant["reference"], [])
-        for one in there.get(str(variant["variant"]), [None]):
+        for number, one in enumerate(there.get(str(variant["variant"]), [None])):
             alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
-            rows.append(Varied(variant, one, next(iter([*alike, *others[-1:]]), None)))
+            said = {"reason": "", "settings": ""} if number else {}  # why is said once
+            rows.append(Varied({**variant, **said}, one, next(iter([*alike, *others[-1:]]), None)))
     if not rows:
         return Markup("")
     said = (
         "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
-    return joined([heading("If facts were otherwise"), paragraph(said), VARIED.grid(rows).html()])
+    return joined(
+        [
+            heading("If facts were otherwise"),
+            paragraph(said),
+            VARIED.grid(rows, heads={"changes": ""} if of else None).html(),
+        ]
+    )
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
@@ -185,15 +193,13 @@ TONES: dict[Any, Tone] = {"found": "key", "missed": "bad", "undecided": "open"}
 SHOWN = ("set-up", "frames", "found", "from (mm)", "50 % size (mm)")
 
 
-def final_tables(tables: ResultTables) -> list[str | Grid]:
+def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
     """Return what a terminal shows at the end, by the kind of experiment."""
-    summary = summarise_holes(tables.holes, list(tables.axes["path"]))
     if not tables.registrations.empty:
-        return [ways_grid(compare_maps(tables, summary))]
+        return [ways_grid(found[SET_UPS])]
     if len(set_ups_of(tables)) > 1:
-        compared = compare_set_ups(tables, summary, set_ups_of(tables), half_sizes=False)
-        return [set_ups_grid(compared, terminal=True)]
-    return [holes_grid(summary, terminal=True)]
+        return [set_ups_grid(of_set_ups(found[SET_UPS], tables), terminal=True)]
+    return [holes_grid(found[SUMMARY], terminal=True)]
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:

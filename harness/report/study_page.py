@@ -46,7 +46,7 @@ def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
     names = [name_of(limit) for limit in limits]
     lines = sum(-(-len(name) // LONGEST_NAME) for name in names) / _names_across(names)
     said = " ".join(limit_sentence(limit) for limit in limits)
-    return svg("overlay", (7.0, 3.9 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
+    return svg("overlay", (5.4, 3.4 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
 
 
 def _names_across(names: Sequence[str]) -> int:

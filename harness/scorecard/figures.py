@@ -327,6 +327,16 @@ def _tone(score: Score) -> Tone:
     return "good" if score.passes else "bad"
 
 
+def _ratio(score: Score) -> float:
+    return score.figure.published.ratio(score.simulated.value)
+
+
+def _ratio_text(score: Score) -> str:
+    """The ratio, or why a score passes whose ratio looks as if it failed: both values are nearly nothing."""
+    ratio, tolerance = _ratio(score), score.figure.published.tolerance
+    return "within tolerance" if tolerance and score.passes and not 0.5 <= ratio <= 2 else number(ratio)
+
+
 SIMULATED = _reading("simulated", "low", "high", "simulated value", "simulated")
 VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
 SCORES = Table(
@@ -349,13 +359,8 @@ SCORES = Table(
             lambda tolerance: f"±{tolerance:g}" if tolerance else "–",
         ),
         Column("", "unit", lambda score: score.figure.measures.unit or "–"),
-        Column(
-            "ratio",
-            "ratio",
-            lambda score: score.figure.published.ratio(score.simulated.value),
-            "simulated by published, or by the nearer bound",
-            number,
-        ),
+        Column("ratio", "", _ratio, "simulated by published, or by the nearer bound"),
+        Column("", "ratio", _ratio_text),
         Column("passes_from", "", lambda score: score.figure.limits[0], "lowest value that passes"),
         Column("passes_to", "", lambda score: score.figure.limits[1], "highest value that passes"),
         Column("verdict", "verdict", "verdict", "whether the simulated value passes", tone=_tone),

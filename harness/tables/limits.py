@@ -44,7 +44,7 @@ def bound_estimate(limit: SetUpLimit, bound: Bound) -> Estimate:
 
 def bound_text(bound: Estimate) -> str:
     """Return a bound in mm without its unit, or that there is none."""
-    return NOT_DEMONSTRATED if np.isnan(bound.value) else bound.text()
+    return NOT_DEMONSTRATED if np.isnan(bound.value) else text.size(bound.value, bound.most)
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
@@ -230,7 +230,10 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
     camera it says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
-    return _answer(limits) if any(limit.over_units for limit in limits) else f"{ONE_UNIT}: {_answer(limits)}"
+    said = _answer(limits)
+    if any(limit.over_units for limit in limits):
+        return said
+    return f"{ONE_UNIT}: {said[0].lower() if said.startswith(('Of ', 'None ')) else said[0]}{said[1:]}"
 
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:

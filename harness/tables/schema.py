@@ -56,7 +56,7 @@ class Estimate:
     def text(self, digits: int = 2) -> str:
         """Return ``3.20 (2.90 to 3.60)``, ``> 15.9``, ``≤ 2.05`` or ``none``."""
         if self.at_most:
-            return f"≤\u00a0{text.size(self.value)}"
+            return f"≤\u00a0{self.value:#.3g}".removesuffix(".")
         return text.with_interval(self.value, self.low, self.high, digits, self.most)
 
 

@@ -40,10 +40,11 @@ def plus_minus(mean: float, std: float, sign: str = "") -> str:
 
 
 def size(value: float, most: float = np.inf) -> str:
-    """Return a size in mm; ``> 15.9`` beyond ``most``, the largest size inspected; ``none`` for NaN."""
+    """Return a limit in mm with two digits, as a study knows it no better; ``> 15.9`` beyond ``most``, the largest size
+    inspected; ``none`` for NaN."""
     if np.isnan(value) or value > most:
         return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
-    return "∞" if np.isinf(value) else f"{value:.2f}" if abs(value) < 100 else f"{value:.3g}"
+    return "∞" if np.isinf(value) else f"{value:#.2g}".removesuffix(".") if abs(value) < 99.5 else f"{value:.3g}"
 
 
 def percent(share: float) -> str:

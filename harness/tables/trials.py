@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from harness.tables import outputs, text
 from harness.tables.schema import Column, Table
 from harness.tables.text import Cell, Tone
+from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import RESULTS_VERSION
 
 if TYPE_CHECKING:
@@ -339,7 +340,7 @@ FALSE_CALLS = Table(
     "false_calls",
     "one row per set-up, number of frames and role of the board",
     (
-        Column("variant", "set-up", note="name of the set-up"),
+        Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("frames", "frames", note="frames averaged"),
         Column("role", "board", note=ROLE[0].note, text=lambda role: role.replace("_", "-")),
         CALLS_OF,
@@ -356,7 +357,7 @@ SET_UPS = Table(
     "set_ups",
     "one row per set-up and number of frames: holes found, errors of size and place, noise, threshold",
     (
-        Column("variant", "set-up", note="name of the set-up"),
+        Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("registration", "registration", note="of maps: method of registration", text=_word),
         Column("merge", "merge", note="of maps: how views are merged", text=_word),
         Column("views", "views", note="of maps: number of views"),
@@ -458,7 +459,7 @@ POSTERIOR = Table(
     "one row per set-up and per value of an axis: how well it agrees with the thesis' outcome (of 20 set-ups and more)",
     (
         Column("axis", note="the fact that the thesis does not state; `set-up` for all of them together"),
-        Column("value", "set-up", note="its value; of a set-up its name"),
+        Column("value", "set-up", None, "its value; of a set-up its name", in_words),
         Column("prior_share", note="probability beforehand"),
         Column("likelihood", "likelihood", note="probability of exactly the thesis' holes with 1 and 50 frames; mean"),
         Column("posterior_share", "posterior", note="probability afterwards"),

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.stats import permutation_test, rankdata
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
 from harness.evaluation.maps import CAMERA_UNIT, MANY, span
@@ -67,11 +68,6 @@ def decide(parts: Iterable[bool | None]) -> Answer:
     return "borne out" if values and all(value is True for value in values) else "undecided"
 
 
-def is_above_zero(interval: Interval) -> bool | None:
-    """Return whether a difference is surely above zero; None where its interval has room for both."""
-    return True if interval.above(0) else (False if interval.high <= 0 else None)
-
-
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
 FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_HOLES[4:])
 RULER_MM = 25.4 / 16
@@ -116,7 +112,7 @@ def _c2(case: Case) -> tuple[Answer, str]:
     if not interval.known:
         return decide([set_agrees, None]), f"{evidence} The thresholds cannot be compared: too few runs."
     threshold = f"Threshold {few.mean():.2f} mm with 1 frame, {many.mean():.2f} mm with 50"
-    return decide([set_agrees, is_above_zero(interval)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
+    return decide([set_agrees, interval.over(0)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
 
 
 def _c3(case: Case) -> tuple[Answer, str]:
@@ -179,7 +175,7 @@ def _c5(case: Case) -> tuple[Answer, str]:
     agrees = off <= np.maximum(rows["extent_offset_std_mm"].fillna(0.0), RULER_MM)
     many = case.holes[(case.holes["frames"] == MANY) & case.holes["hole"].isin(rows["hole"])]
     ratio, interval = scatter_ratio(many, "extent_offset_mm", "extent_diameter_mm")
-    larger = True if interval.above(1) else (False if interval.below(1) else None)
+    larger = interval.over(1)
     worst = rows.iloc[int(off.to_numpy().argmax())]
     evidence = (
         f"{int(agrees.sum())} of {len(rows)} mean positions agree"
@@ -223,7 +219,7 @@ def _c9(case: Case) -> tuple[Answer, str]:
     low, high = -0.5 - SLOPE_MARGIN, -0.5 + SLOPE_MARGIN
     slope, ratio = law.slope_interval, law.systematic_ratio_interval
     falls = True if slope.within(low, high) else (False if slope.below(low) or slope.above(high) else None)
-    stays = True if ratio.above(UNCHANGED) else (False if ratio.below(UNCHANGED) else None)
+    stays = ratio.over(UNCHANGED)
     evidence = (
         f"Temporal noise goes as N to the power {law.slope:.3f} ({span(slope, 3)}); the systematic error with "
         f"{law.many_frames} frames is {law.systematic_ratio:.2f} times that with {law.few_frames} ({span(ratio)}); "
@@ -265,8 +261,6 @@ def score_claims(
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows", by permutation: exact up to 8 pairs, 20000
     fixed random ones beyond. A constant input has rho 0, p 1."""
-    from scipy.stats import permutation_test, rankdata
-
     ranks, other = rankdata(x), rankdata(y)
     if np.ptp(ranks) == 0 or np.ptp(other) == 0:
         return 0.0, 1.0

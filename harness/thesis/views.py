@@ -15,7 +15,7 @@ import numpy as np
 from harness.evaluation import intervals, maps
 from harness.evaluation.summary import hole_list
 from harness.tables.text import many
-from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Verdict, decide, is_above_zero, verdict_of
+from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Verdict, decide, verdict_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,9 +65,8 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     if len(across) < FEWEST_PAIRS:
         return None
     interval = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
-    if interval.known and interval.high <= noise_mm:
-        return True
-    return False if interval.above(noise_mm) else None
+    over = interval.over(noise_mm)
+    return None if over is None else not over
 
 
 def _c8(case: maps.MapCase) -> tuple[Answer, str]:
@@ -75,7 +74,7 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     if found is None:
         why = "one and two views, registered by CPD and merged on the grid, were not both finished"
         return "undecided", f"Not judged: {why}."
-    small = True if not found.small.n and found.lost else found.small.is_above
+    small = True if not found.small.n and found.lost else found.small.interval.over(0)
     parts = [
         f"With {maps.frames_text(found.frames)}, two views less one, |size error| of holes from 3/8 in on "
         f"{maps.change_text(found.large)}, of smaller ones {maps.change_text(found.small)}.",
@@ -83,7 +82,7 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     ]
     parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
     parts += [f"Found by two views only: {hole_list(found.gained)}."] if found.gained else []
-    return decide([found.large.is_below, small, found.threshold.is_above]), " ".join(parts)
+    return decide([found.large.is_below, small, found.threshold.interval.over(0)]), " ".join(parts)
 
 
 def _c10(case: maps.MapCase) -> tuple[Answer, str]:
@@ -121,7 +120,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     ):
         if what == "surface noise" or values[0].size:
             gaps = [gap(values[0], other) for other in values[1:]]
-            parts += [is_above_zero(interval) for interval in gaps]
+            parts += [interval.over(0) for interval in gaps]
             sizes = [size(each) for each in values]
             more = " and ".join(map(maps.span, gaps))
             said.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
@@ -203,7 +202,7 @@ def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: s
     sure = low == high == rival_low == rival_high
     standings: tuple[Standing, ...] = (
         "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
-        *("ahead" if one.is_below else "behind" if one.is_above else "open" for one in (sizes, noise)),
+        *("ahead" if one.is_below else "behind" if one.interval.over(0) else "open" for one in (sizes, noise)),
     )
     said = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
     text = (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
 from harness.evaluation.pod.curve import Bound, PodCurve
@@ -261,8 +262,6 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
     """Return the probability of a false positive at unflawed sites by names, nothing where there are none: the share of
     calls with its upper bound (Clopper and Pearson), and of signals also by the normal law that fits the noise best, on
     the fit's axis, signals at or below its left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
-    from scipy import stats
-
     sites = read.unflawed
     if not sites.size:
         return {}

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
 
 from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, clopper_pearson, percentiles
 from harness.evaluation.study.limit import DRAWS, weights_in_blocks
@@ -70,8 +71,6 @@ def _shuffled(
 ) -> tuple[float, int, np.ndarray]:
     """The share of places with a finding near, the number of places laid, and the share of boards drawn again. A
     board's places are not laid over its own runs; damaged boards without places have no weight among boards drawn."""
-    from scipy.sparse import coo_array
-
     names, of_place, size = np.unique(places["board"].to_numpy(), return_inverse=True, return_counts=True)
     at = places[["true_x_mm", "true_y_mm"]].to_numpy(float)
     near, runs_of, boards_of = [], [], []

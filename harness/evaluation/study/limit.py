@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linprog
+from scipy.stats import chi2
 
 from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, false_call_rate, percentiles
 from harness.evaluation.pod.curve import (
@@ -208,8 +210,6 @@ def depth_varies(depth_mm: np.ndarray) -> bool:
 
 def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | None, str]:
     """Fit the surface; None, and why, where there is none."""
-    from scipy.stats import chi2
-
     seen = record.inspected
     hit = seen.hit
     if not len(hit) or hit.all() or not hit.any():
@@ -288,8 +288,6 @@ def _coefficients(
 def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
     """Return whether a plane parts hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
     programming: the largest sum of one-sided margins, which is 0 where hits and misses overlap."""
-    from scipy.optimize import linprog
-
     scaled = np.column_stack([np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)])
     signed = np.where(hit, 1.0, -1.0)[:, None] * scaled
     found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1), method="highs")

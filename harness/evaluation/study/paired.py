@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import betabinom, binomtest, hypergeom, norm
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, maxima
@@ -23,13 +24,15 @@ Tails = tuple[float, float]
 @dataclass(frozen=True)
 class HitsChange:
     """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``. ``only_first``,
-    ``only_second``: found by one alone. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so
-    few (many) hits of the second are if each board's two sums of hits might as well be exchanged."""
+    ``only_second``: found by one alone. ``mcnemar_p``: McNemar's exact test (two-sided), which takes inspections as
+    independent. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so few (many) hits of the
+    second are if each board's two sums of hits might as well be exchanged."""
 
     boards: int
     inspections: int
     only_first: int
     only_second: int
+    mcnemar_p: float
     fewer_p: float
     more_p: float
 
@@ -48,7 +51,8 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
     names, board = np.unique(first.board[one], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
-    return HitsChange(len(names), len(one), only_first, only_second, *sign_flip(gained))
+    p = mcnemar(only_first, only_second)
+    return HitsChange(len(names), len(one), only_first, only_second, p, *sign_flip(gained))
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
@@ -57,6 +61,12 @@ def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.nda
     at, there = ({key: row for row, key in enumerate(one)} for one in keys)
     shared = [key for key in at if key in there]
     return np.array([at[key] for key in shared], int), np.array([there[key] for key in shared], int)
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Exact two-sided p: discordant pairs fall on either side with equal chance (McNemar 1947, exact by Liddell)."""
+    discordant = only_first + only_second
+    return float(binomtest(only_first, discordant, 0.5).pvalue) if discordant else 1.0
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
@@ -239,8 +249,6 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     """Compare signals on the inspections that both have. It sees what hits hardly show: signals change with all of the
     noise and the threshold, hits only near the limit. Damages count whose two signals, each over what is needed, exceed
     1 in the geometric mean: smaller ones are noise. None where fewer than two boards have any, or for two detectors."""
-    from scipy.stats import norm
-
     one, two = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(one):
         return None
@@ -327,8 +335,6 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     distribution. On identical frames with the same threshold the signs of each board's difference are tossed, which
     shows smaller changes; where anything moved the threshold on identical frames, both tests must agree. None where
     either has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
-    from scipy.stats import betabinom, binomtest, hypergeom
-
     one, two = first.unflawed, second.unflawed
     areas = (float(one.area_m2.sum()), float(two.area_m2.sum()))
     if not min(areas) > 0:

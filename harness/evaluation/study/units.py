@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t
 
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
@@ -45,8 +46,6 @@ def over_units(
     """Judge inspections, one a row (n,): ``hit`` bool, names of what was inspected (``target``), and ``unit`` numbers.
     ``curve`` is that of all units together, ``limit`` its a90/95 over boards. A unit that found all or nothing has no
     limit of its own, and then none is demonstrated for a new one."""
-    from scipy.stats import t
-
     found = []
     for number in np.unique(unit):
         own = unit == number

@@ -13,21 +13,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.stats import ks_2samp, kstwobign
 
+from harness.evaluation.study import paired
 from harness.evaluation.study.limit import SetUpLimit, limit_of
-from harness.evaluation.study.paired import (
-    CallsChange,
-    HitsChange,
-    LimitChange,
-    SignalChange,
-    SwapChange,
-    Tails,
-    calls_change,
-    hits_change,
-    limit_change,
-    signal_change,
-    swap_change,
-)
+from harness.evaluation.study.paired import Tails
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
@@ -65,11 +55,11 @@ class ComparedSetUps:
     first: SetUpLimit | None
     second: SetUpLimit | None
     changed: tuple[str, ...] = ()
-    limit: LimitChange | None = None
-    hits: HitsChange | None = None
-    calls: CallsChange | None = None
-    signal: SignalChange | None = None
-    swap: SwapChange | None = None
+    limit: paired.LimitChange | None = None
+    hits: paired.HitsChange | None = None
+    calls: paired.CallsChange | None = None
+    signal: paired.SignalChange | None = None
+    swap: paired.SwapChange | None = None
     limit_p: Tails = (1.0, 1.0)
     calls_p: Tails = (1.0, 1.0)
     signal_p: Tails = (1.0, 1.0)
@@ -128,10 +118,10 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
             rows.append(ComparedSetUps(before, now, changed, mark="not comparable", why=why))
             continue
         same = one.targets_digest == other.targets_digest
-        hits = hits_change(one.inspected, other.inspected) if same else None
-        calls = calls_change(one, other, first.false_calls_per_m2)
-        signal = signal_change(one, other) if same else None
-        rows.append(ComparedSetUps(before, now, changed, limit_change(before, now, same), hits, calls, signal))
+        hits = paired.hits_change(one.inspected, other.inspected) if same else None
+        calls = paired.calls_change(one, other, first.false_calls_per_m2)
+        signal = paired.signal_change(one, other) if same else None
+        rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
     questions = sum(p is not None for row in rows for p in _p_values(row))
     rows = [_with_swap(row, questions, alpha) for row in rows]
     # A question that was not asked is no member of the family.
@@ -182,8 +172,6 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
     """Say why the two were not measured in the same way (hit radius, wanted false calls, damage), empty where they
     were. Damage of other boards is compared by Kolmogorov and Smirnov's test with as many values as there are boards,
     since damages of one board may be alike: cautious where they are not."""
-    from scipy.stats import ks_2samp, kstwobign
-
     if first.hit_radius_mm != second.hit_radius_mm:
         return f"hits within {first.hit_radius_mm:g} mm there, within {second.hit_radius_mm:g} mm here"
     if first.hit_overlap != second.hit_overlap:
@@ -220,7 +208,7 @@ def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _of_limit(hits: HitsChange, swap: SwapChange | None) -> tuple[Tails, Tails]:
+def _of_limit(hits: paired.HitsChange, swap: paired.SwapChange | None) -> tuple[Tails, Tails]:
     """(worse, better) by hits and by a90 itself, on the same boards."""
     return (hits.fewer_p, hits.more_p), (swap.grown_p, swap.shrunk_p) if swap else (1.0, 1.0)
 
@@ -235,7 +223,7 @@ def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSet
     if not any(beyond) or LIMIT_TESTS * questions * p[beyond.index(True)] < alpha:
         return row
     tosses = min(TOSSES_PER_QUESTION * questions, MOST_TOSSES) - 1
-    return replace(row, swap=swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
+    return replace(row, swap=paired.swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
 
 
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
@@ -276,7 +264,7 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     return ("as good", "") if 1 / MARGIN <= growth <= MARGIN else ("not significant", grown)
 
 
-def limit_margin(signal: SignalChange | None) -> float:
+def limit_margin(signal: paired.SignalChange | None) -> float:
     """Widen the margin of a90 by two standard errors of the signals over the threshold, where these are known: a depth
     limit moves as they do, and no test of hits has the luck of two calibrations."""
     return MARGIN * float(np.exp(2 * signal.error)) if signal else MARGIN

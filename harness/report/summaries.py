@@ -1,0 +1,75 @@
+"""Summaries of an experiment that is no study, computed once: files hold them, pages and the terminal show them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
+from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
+from harness.evaluation.summary import MAIN, false_calls, noise_against_frames, summarise_holes
+from harness.tables import trials
+from harness.tables.schema import Table
+from harness.thesis.claims import Verdict, claim_c11, score_claims
+from harness.thesis.inference import posterior_of
+from harness.thesis.views import score_views
+from harness.vocabulary.provenance import RESULTS_VERSION
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Summaries = Mapping[Table, "pd.DataFrame"]
+LISTS = ("found", "undecided", "reasons")
+"""Columns whose values are lists, until they are written."""
+
+
+def is_thesis(facts: Mapping[str, Any]) -> bool:
+    """Return whether the target is the thesis' own, whose claims are scored; ``facts``: the resolved experiment."""
+    return (facts.get("source", {}).get("target") or {}).get("name") == "thesis"
+
+
+def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True) -> Summaries:
+    """Return all tables that a page shows. ``examples``: pictures that claims are scored with; without
+    ``with_claims`` there are no claims and no posterior."""
+    paths, set_ups = [str(path) for path in tables.axes["path"]], set_ups_of(tables)
+    summary, everything = summarise_holes(tables.holes, paths), [str(name) for name in tables.variants["variant"]]
+    found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}
+    found[trials.NOISE_BY_FRAMES] = noise_against_frames(tables.probes)
+    verdicts: Sequence[Verdict] = ()
+    if not tables.registrations.empty:
+        own = tables.registrations[tables.registrations["variant"].isin(set_ups)]
+        found[trials.SET_UPS] = compare_maps(tables, summary)
+        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
+        verdicts = score_views(map_cases(tables, summary)) if with_claims else ()
+    else:
+        several = len(set_ups) > 1
+        compared = compare_set_ups(tables, summary, everything, half_sizes=several)
+        varies = ~compared["variant"].isin(set_ups) if len(compared) else []
+        found[trials.SET_UPS] = compared.assign(is_variation=varies)
+        found[trials.EFFECTS] = effect_costs(tables)
+        if with_claims and several:
+            verdict, posterior = claim_c11(summary, paths), posterior_of(of_set_ups(summary, tables), paths)
+            verdicts = [verdict] if verdict else ()
+            found |= {} if posterior is None else {trials.POSTERIOR: posterior}
+        elif with_claims:
+            verdicts = score_claims(tables, MAIN, examples, summary)
+    return {**found, trials.CLAIMS: trials.CLAIMS.frame(map(vars, verdicts))}
+
+
+def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
+    """Select the rows of the experiment's set-ups, variations left out."""
+    return rows[rows["variant"].isin(set_ups_of(tables))] if len(rows) else rows
+
+
+def verdicts_of(found: Summaries) -> list[Verdict]:
+    """Return the claims that were scored."""
+    return [Verdict(**row) for row in found[trials.CLAIMS].to_dict("records")]
+
+
+def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
+    """Return the tables as files hold them, with lists as text."""
+    written = {
+        table: frame.assign(**{name: frame[name].map("; ".join) for name in LISTS if name in frame})
+        for table, frame in found.items()
+    }
+    return written | {trials.SUMMARY: written[trials.SUMMARY].assign(results_version=RESULTS_VERSION)}
