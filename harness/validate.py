@@ -16,8 +16,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
     add("--figures", type=Path, metavar="FILE", help="other published figures")
-    add("--baseline", type=Path, metavar="FILE", help="another baseline")
-    add("--update-baseline", action="store_true", help="write down which figures pass now")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
@@ -34,15 +32,14 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Measure the simulated cameras as one measures real ones, and set each published figure beside "
     "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
     "planes and edges in it.",
-    epilog="Exit code 1: a figure that passes in the committed baseline fails now.",
+    epilog="Exit code 1: a figure fails whose entry in the file of figures does not say why.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where a figure that passed in the baseline fails, 2 on a mistake of the user, 130 after
+    """Returns 0, 1 where a figure fails and its entry does not say why, 2 on a mistake of the user, 130 after
     Ctrl-C."""
     if options.capture or options.board:
-        for name in ("update_baseline", "figures", "baseline"):
-            if getattr(options, name):
-                raise UserError(f"--{name.replace('_', '-')} belongs to the scorecard, not to a capture")
+        if options.figures:
+            raise UserError("--figures belongs to the scorecard, not to a capture")
         if options.board is None:
             from harness.own_camera.capture import run_capture
 
@@ -58,13 +55,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     for name in ("unit", "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
-    if options.figures and options.update_baseline and not options.baseline:
-        raise UserError(
-            "--figures and --update-baseline would write other figures into the committed baseline",
-            fix="name a --baseline of their own",
-        )
-    if options.baseline and not options.update_baseline and not options.baseline.is_file():
-        raise UserError(f"--baseline {options.baseline}: no such file", fix="write one with --update-baseline")
     from harness.scorecard.program import run_scorecard
 
     return run_scorecard(options, command)

@@ -18,7 +18,7 @@ QUIET = CameraConfig(
 )
 PATCH = Region(372, 422, 500, 560)
 RAW: dict[str, float | list[float]] = {
-    **{"engine.window_px": [1, 1], "engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
+    **{"engine.smoothing_px": [0.0, 0.0], "engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
 }
 """No smoothing and no gate that looks at neighbours."""
 FINE = {"engine.output_step_mm": 1e-3}

@@ -51,7 +51,7 @@ def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def numbers_of(name: str) -> dict[str, float]:
     """A Kinect v2 with a finer converter: by its own, dark pixels' noise hides no steps and frames are drawn singly."""
-    return {"photons.electrons_per_unit": 3.0} if name.startswith("kinect") else {}
+    return {"photons.electrons_per_unit": 3.0, "scatter.blur_px": 0.0} if name.startswith("kinect") else {}
 
 
 @lru_cache

@@ -20,7 +20,9 @@ from scenes.sensor.source import SimulatedUnit
 f4 = np.float32
 V2 = load_camera("kinect_v2_libfreenect2")
 NEAR_AXIS = Region(170, 240, 210, 300)
-QUIET = CameraConfig(name="kinect_v2_libfreenect2", effects=NO_EFFECTS.model_copy(update={"multipath": True}))
+SHARP = {"scatter.blur_px": 0.0}
+"""A lens without blur: steps that can be worked out by hand."""
+QUIET = CameraConfig(name=V2.name, effects=NO_EFFECTS.model_copy(update={"multipath": True}), numbers=SHARP)
 NOISY = QUIET.model_copy(update={"effects": NO_EFFECTS.model_copy(update={"noise": True, "multipath": True})})
 FINE = {"converter.knee_units": 10**6, "photons.electrons_per_unit": 0.1}
 """A converter whose rounding hides nothing."""
@@ -148,7 +150,7 @@ def gate_open(config: CameraConfig) -> CameraConfig:
 )
 def test_flying_pixels_die_over_a_far_step_and_live_over_a_near_one(share, step_m, dead):
     """The rule by hand on the range image without it: more than 50 mm behind, 30 before, 100 either."""
-    unrounded = QUIET.model_copy(update={"numbers": {"engine.output_step_mm": 1e-3}})
+    unrounded = QUIET.model_copy(update={"numbers": SHARP | {"engine.output_step_mm": 1e-3}})
     z, _ = middle(two_planes(0.8, step_m, share, gate_open(unrounded)))
     assert np.isfinite(z).all()
     near, far = z[1:-1] - np.minimum(z[:-2], z[2:]), np.maximum(z[:-2], z[2:]) - z[1:-1]
@@ -160,7 +162,7 @@ def test_flying_pixels_die_over_a_far_step_and_live_over_a_near_one(share, step_
 
 def test_even_amplitudes_hide_a_flying_pixel():
     """The gate asks for amplitudes that scatter by 5 %: raised to 200 %, it kills none."""
-    lenient = QUIET.model_copy(update={"numbers": {"engine.flying_pixels.relative_deviation": 2.0}})
+    lenient = QUIET.model_copy(update={"numbers": SHARP | {"engine.flying_pixels.relative_deviation": 2.0}})
     z, _ = middle(two_planes(0.8, 0.3, 0.3, lenient))
     assert np.isfinite(z).all() and 0.9 < z[38] < 1.0
 
@@ -169,7 +171,7 @@ def test_the_edge_flag_needs_half_a_wavelength():
     """Three neighbours sum 3 (1 - cos dphi)/2 >= 2.5 from 132 degrees on: 457 mm of step at 120 MHz."""
     limit_m = np.arccos(-2 / 3) / (4 * np.pi * 120e6) * SPEED_OF_LIGHT_AIR
     assert limit_m == pytest.approx(0.457, abs=0.001)
-    only_edges = QUIET.model_copy(update={"numbers": {"engine.flying_pixels.most_mm": 1e6}})
+    only_edges = QUIET.model_copy(update={"numbers": SHARP | {"engine.flying_pixels.most_mm": 1e6}})
     for step_m, flagged in ((limit_m - 0.02, []), (limit_m + 0.02, [37, 38])):
         _, reason = middle(two_planes(0.8, step_m, 0.0, only_edges))
         assert np.flatnonzero(reason == Reason.EDGE).tolist() == flagged

@@ -19,7 +19,6 @@ from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import assign, read_poses
 from harness.own_camera.capture import read_mask
-from harness.scorecard.figures import read_baseline
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import bounded_bytes, inside, strict_json, write_text
@@ -195,10 +194,9 @@ def sparse(path: Path) -> Path:
     [
         (lambda path: read_inspections(path, "size", ["hit"]), "more than 256 MiB"),
         (lambda path: read_poses(path, 1), "more than 16 MiB"),
-        (read_baseline, "more than 16 MiB"),
         (read_mask, "no image that can be read (has more than 512 MiB)"),
     ],
-    ids=["inspections", "poses", "baseline", "mask"],
+    ids=["inspections", "poses", "mask"],
 )
 def test_no_reader_takes_in_a_terabyte(tmp_path, read, told):
     assert told in refusal(lambda: read(sparse(tmp_path / "large")))

@@ -18,7 +18,6 @@ from harness.inspection.arguments import POSES_KEY, read_poses
 from harness.report.blocks import template
 from harness.report.compare import COMPARISON_VERSION
 from harness.report.findings import csv_text
-from harness.scorecard.figures import BASELINE_FILE, SCORECARD_VERSION, read_baseline, write_baseline
 from harness.tables.trials import FINDINGS_OF_CAPTURE, FINDINGS_VERSION
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import GENERATOR, RESULTS_VERSION, check_version, stamp_of, stamped
@@ -137,22 +136,6 @@ def test_every_page_names_its_version(path):
 def test_findings_carry_it_in_a_column():
     (head,) = csv.reader(io.StringIO(csv_text(())))
     assert head == [column.name for column in FINDINGS_OF_CAPTURE.columns] and FINDINGS_VERSION == 3
-
-
-def test_a_scorecards_baseline(tmp_path):
-    text = BASELINE_FILE.read_text()
-    assert json.loads(text)["scorecard_version"] == SCORECARD_VERSION
-    path = tmp_path / "baseline.json"
-    for version, told in ((SCORECARD_VERSION + 1, "newer tofpod"), (0, "of version 0"), (True, "which is none")):
-        changed = json.dumps({"scorecard_version": version, "figures": "of another form"})
-        path.write_text(changed)
-        for act in (read_baseline, lambda path: write_baseline(path, (), ())):
-            with pytest.raises(UserError, match=told):
-                act(path)
-        assert path.read_text() == changed, "what is not understood is not written over"
-    path.write_text(text)
-    write_baseline(path, (), read_baseline(path))
-    assert path.read_text() == text
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from validation.azure_walls import Wall, WallCheck, check_folder, walls_camera
-from validation.azure_walls_page import figure, page, table, white_before_m
+from validation.azure_walls_page import figure, length_px, page, table, white_before_m
 
 from harness.scorecard.bench import correlation, covariance, deviations, fixed_pattern, robust_inverse_fit
 from harness.vocabulary.geometry import Region
@@ -51,7 +51,7 @@ def test_a_planted_fixed_pattern_is_found_again(smooth_mm, pixel_mm):
     assert found.std_m * 1e3 == pytest.approx(np.hypot(smooth_mm, pixel_mm), abs=0.04)
     assert max(white_before_m(found), 0) * 1e3 == pytest.approx(pixel_mm, abs=0.04)
     if pixel_mm == 0:
-        assert found.length_px == pytest.approx(5.6, abs=0.4)
+        assert length_px(found) == pytest.approx(5.6, abs=0.4)
 
 
 def test_covariance_and_correlation_by_hand():
@@ -143,7 +143,7 @@ def test_the_files_fixed_pattern_is_that_of_the_walls(checks):
     left, right = (check.pattern for check in checks)
     assert left.std_m * 1e3 == pytest.approx(0.47, abs=0.01)
     assert right.std_m * 1e3 == pytest.approx(0.42, abs=0.01)
-    assert np.mean([left.length_px, right.length_px]) == pytest.approx(FILE.smooth_length_px.value, abs=1.0)
+    assert np.mean([length_px(left), length_px(right)]) == pytest.approx(FILE.smooth_length_px.value, abs=1.0)
 
 
 @pytest.mark.slow

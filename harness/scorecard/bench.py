@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage, optimize
+from scipy import ndimage
 
 from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval, mean_t, wilson
 from harness.vocabulary.geometry import MM, Region
@@ -48,11 +47,10 @@ FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
 
 @dataclass(frozen=True)
 class Bench:
-    """One camera, the effort spent on it, and the folder of stored renders."""
+    """One camera and the effort spent on it."""
 
     camera_name: str
     effort: Effort
-    renders: Path
 
     @property
     def camera(self) -> AnyCamera:
@@ -268,11 +266,10 @@ def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y:
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The part of a wall's average that stays after a smooth surface and the temporal noise are taken off. ``std_m``;
-    ``length_px`` of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12; ``covariance_m2`` (lags 0..20)."""
+    """The part of a wall's average that stays after a smooth surface and the temporal noise are taken off: ``std_m``
+    and ``covariance_m2`` (lags 0..20)."""
 
     std_m: float
-    length_px: float
     covariance_m2: np.ndarray
 
 
@@ -300,12 +297,7 @@ def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: 
         return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
 
     left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(axis=1)
-    length = float("nan")
-    if left[0] > 0:
-        lag, relative = np.arange(13), left[:13] / left[0]
-        found = optimize.least_squares(lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0])
-        length = float(abs(found.x[1]))
-    return FixedPattern(float(np.sqrt(max(left[0], 0))), length, left)
+    return FixedPattern(float(np.sqrt(max(left[0], 0))), left)
 
 
 TOLERANCE_SIGMAS = 4.0

@@ -13,9 +13,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy import ndimage
 
-from harness.evaluation.intervals import Interval
 from harness.scorecard.bench import (
     FLAT_PX,
     JITTER,
@@ -41,7 +39,7 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import digest
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.camera import CameraConfig, EffectsConfig
 
 PATCH = (40, 24)
 """Height and width in pixels. Narrow: at 70 degrees of incidence z then varies by 6 % to either side on the coarsest
@@ -49,7 +47,7 @@ camera, and the deviation's mean by under 1 %."""
 PATTERN_PATCH = (140, 180)
 LEAST_TILT = (0.05, 0.02)
 """Slopes of the frontal plane: 3 degrees, so that rounding of the output meets every phase of its step."""
-JUMP_M = 5 * MM
+JUMP_MM = 5.0
 """A frame whose mean is farther than this from the median of all is a jump, no jitter."""
 EDGE_PATCH = (40, 96)
 REACH_PX = 44.0
@@ -60,10 +58,7 @@ PITCH_PX, COPIES = 22, 4
 """Distance of plateaus (the largest diameter, and twice the reach of a filter of 11 pixels), and number an axis."""
 R2 = (0.7548776662466927, 0.5698402909980532)
 """Roberts' low-discrepancy sequence: the plateaus' positions within a pixel."""
-MONTE_CARLO_SIGMAS = 2.0
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
-
-# ---- conditions ------------------------------------------------------------------------------------------------------
 
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
 Albedo = Annotated[float, Field(gt=0.0, le=1.0, description="diffuse reflectance, above 0 and up to 1")]
@@ -94,6 +89,7 @@ class PatchConditions(PlaneConditions):
 
     patch_px: Annotated[int, Field(ge=3, le=70, description="side of a patch in pixels, 3 to 70")] = 38
     apart_px: Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")] = 0
+    rounded_mm: Annotated[float, Field(ge=0.0, le=10.0, description="step of the stored file, 0 to 10 mm")] = 0.0
 
 
 class StepConditions(Config):
@@ -116,13 +112,6 @@ class PlateauConditions(Config):
     step_mm: StepMm = 18.0
 
 
-class RoomConditions(Config):
-    """A board of 400 x 300 mm, albedo 0.6, in a room with a floor and a back wall."""
-
-    distance_m: Annotated[float, Field(ge=0.4, le=2.2, description="in metres, 0.4 to 2.2")] = 0.7
-    multipath: bool = True
-
-
 _WORDS: dict[str, Callable[[Any], str]] = {
     "distance_m": "{:g} m".format,
     "albedo": "albedo {:g}".format,
@@ -135,7 +124,7 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "diameter_px": "⌀ {:g} px".format,
     "patch_px": "patches of {:g} px".format,
     "apart_px": lambda v: f"{v:g} px apart" if v else "",
-    "multipath": lambda v: "multipath on" if v else "multipath off",
+    "rounded_mm": lambda v: f"stored in steps of {v:g} mm" if v else "",
     "lag_px": "lag {} px".format,
 }
 
@@ -159,8 +148,6 @@ def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
 def _plane(c: PlaneConditions) -> PlaneConditions:
     return PlaneConditions(**{key: getattr(c, key) for key in PlaneConditions.model_fields})
 
-
-# ---- the list --------------------------------------------------------------------------------------------------------
 
 Measure = Callable[[Bench, Any], Reading]
 
@@ -262,7 +249,9 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
     apart, of both directions."""
     n, k, found = c.patch_px, c.apart_px, []
     for unit in range(1, bench.effort.few_frames + 1):
-        left = _left_of_patches(plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0], n)
+        z_m = plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0]
+        stored_m = np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
+        left = _left_of_patches(stored_m, n)
         beside, below = left[:, :, k:] * left[:, :, : n - k], left[:, k:] * left[:, : n - k]
         found.append((left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2))
     variance, product = np.transpose(found, (1, 0, 2))
@@ -302,20 +291,12 @@ def _mean_errors_mm(stack: FrameStack) -> np.ndarray:
         return np.asarray(np.where(valid, stack.z_m - stack.true_z_m, 0).sum(axis=(1, 2)) / valid.sum(axis=(1, 2)) / MM)
 
 
-def _bias_mm(bench: Bench, c: PlaneConditions, unit: int) -> Reading:
-    return mean_of(_mean_errors_mm(plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)))
-
-
-@_quantity("bias of one unit", PlaneConditions)
-def bias_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Mean error of z of unit 1 with all its effects but jumps, direct light only."""
-    return _bias_mm(bench, c, 1)
-
-
 @_quantity("systematic error", PlaneConditions)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Greatest absolute mean error of z among ten units an hour after power-on, direct light only."""
-    errors = [abs(_bias_mm(bench, c, unit).value) for unit in range(1, bench.effort.units + 1)]
+    units = range(1, bench.effort.units + 1)
+    stacks = (plane_stack(bench, c, STEADY, bench.effort.few_frames, unit) for unit in units)
+    errors = [abs(mean_of(_mean_errors_mm(stack)).value) for stack in stacks]
     return Reading(float(np.fmax.reduce(errors)))
 
 
@@ -334,13 +315,9 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
 @_quantity("frame jitter", PlaneConditions)
 def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Deviation of a frame's mean over 960 pixels from frame to frame; jumps of over 5 mm left out."""
-    return jitter_of(_mean_errors_mm(plane_stack(bench, c, JITTER, bench.effort.whole_frames)) * MM)
-
-
-def jitter_of(means_m: np.ndarray) -> Reading:
-    """Deviation in mm of frames' means (n,), without those that jump."""
-    steady = means_m[np.abs(means_m - np.median(means_m)) < JUMP_M]
-    return jackknifed(steady, lambda m: float(m.std(ddof=1)) / MM) if steady.size >= 2 else NOTHING
+    means = _mean_errors_mm(plane_stack(bench, c, JITTER, bench.effort.whole_frames))
+    steady = means[np.abs(means - np.median(means)) < JUMP_MM]
+    return jackknifed(steady, lambda m: float(m.std(ddof=1))) if steady.size >= 2 else NOTHING
 
 
 @lru_cache(maxsize=4)
@@ -429,32 +406,3 @@ def seen_share(bench: Bench, c: PlateauConditions) -> Reading:
     height = np.full(len(rays), np.nan)
     height[often] = back.z_along_m(stack.slopes)[at][often] - np.nanmean(z[:, often], axis=0)
     return mean_of(height / step_m)
-
-
-@_quantity("bias of a board in a room", RoomConditions)
-def board_bias_mm(bench: Bench, c: RoomConditions) -> Reading:
-    """Mean error of z over a board of 400 x 300 mm before a floor and a wall, without noise and traits of a unit."""
-    # the board's tilt lets rounding of the output meet every phase of its step
-    from scenes.optics import RenderConfig
-    from scenes.render.cache import cached_view
-    from scenes.target.custom import BoardConfig, FlatConfig, MaterialConfig, PoseConfig, RoomConfig, TargetConfig
-
-    target = TargetConfig(
-        board=BoardConfig(width_mm=400.0, height_mm=300.0, thickness_mm=12.0, shape=FlatConfig()),
-        material=MaterialConfig(albedo_850=0.6, grain_contrast=0.0),
-        room=RoomConfig(floor_below_lens_m=0.2, floor_albedo_850=0.6, back_wall_distance_m=2.5),
-        pose=PoseConfig(distance_m=c.distance_m, tilt_x_deg=3.0, tilt_y_deg=4.0),
-    )
-    view, _ = cached_view(target, bench.camera.optics, RenderConfig(), bench.renders)
-    stack = bench.taken(view, NO_EFFECTS.model_copy(update={"multipath": c.multipath}), 1, "room")
-    cut = stack.region.within(view.region)
-    rim = 2 * (2 * bench.camera.optics.margin_px + 1)
-    board = ndimage.binary_erosion(view.surface == view.surface_names.index("board"), iterations=rim)
-    inside = board[cut] & np.isfinite(stack.z_m[0])
-    if not inside.any():
-        return NOTHING
-    value = float((stack.z_m[0] - stack.true_z_m)[inside].mean()) / MM
-    # the interval: two deviations of what the render's Monte Carlo leaves in a pixel, as if all pixels shared it
-    left_m = float(np.sqrt((view.indirect_noise_m[cut][inside] ** 2).mean())) if c.multipath else 0.0
-    left_mm = MONTE_CARLO_SIGMAS * left_m / MM
-    return Reading(value, Interval(value - left_mm, value + left_mm))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import optimize
 
 from harness.report import blocks as canvas
 from harness.report.blocks import BLUE, GREY, INK, ORANGE
@@ -33,6 +34,13 @@ def white_before_m(pattern: FixedPattern) -> float:
     falls = pattern.covariance_m2[0] - pattern.covariance_m2[1 : WINDOW_PX + 1]
     white = float(np.linalg.lstsq(rows, falls, rcond=None)[0][0])
     return float(np.sign(white) * np.sqrt(abs(white)))
+
+
+def length_px(pattern: FixedPattern) -> float:
+    """Length l of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12."""
+    lag, relative = np.arange(13), pattern.covariance_m2[:13] / pattern.covariance_m2[0]
+    found = optimize.least_squares(lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0])
+    return float(abs(found.x[1]))
 
 
 def _mm(value_m: float, digits: int = 2) -> str:
@@ -90,7 +98,7 @@ def _correlation_rows(check: WallCheck) -> list[list[str]]:
 def _pattern_rows(check: WallCheck) -> list[list[str]]:
     kinds: list[tuple[str, Callable[[FixedPattern], float], float]] = [
         ("standard deviation / mm", lambda p: p.std_m, MM),
-        ("correlation length / px", lambda p: p.length_px, 1.0),
+        ("correlation length / px", length_px, 1.0),
         ("white before the window / mm", white_before_m, MM),
     ]
     rows = []
@@ -294,7 +302,7 @@ def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     rows = [row for check in checks for row in _pattern_rows(check)]
     real = _listed(f"{_mm(c.pattern.std_m)} mm" for c in checks)
     ours = _listed(f"{_mm(_simulated(c, lambda p: p.std_m))} mm" for c in checks)
-    length = _listed(f"{c.pattern.length_px:.1f} px" for c in checks)
+    length = _listed(f"{length_px(c.pattern):.1f} px" for c in checks)
     white = _listed(f"{_mm(white_before_m(c.pattern))} mm" for c in checks)
     planted = facts.pixel_mm.value / camera.engine.window_px.value
     return f"""## Fixed pattern

@@ -78,7 +78,8 @@ def certainty(
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
     range_m = mean_m / engine.geometry[2]
     far_m = mean_m if gates.axial > 0 else range_m
-    steepest = (filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0)
+    steepest = filtered.edge + DEVIATIONS * filtered.edge_spread
+    steepest = steepest.mean(axis=0) if gates.edge_mean > 0 else steepest.max(axis=0)
 
     def first_failed(end: int) -> np.ndarray:
         low, high = amplitude + end * DEVIATIONS * spread, amplitude - end * DEVIATIONS * spread
@@ -100,7 +101,7 @@ def certainty(
     # a dim pixel's mean over its window, brightest as it may be
     dim = np.isfinite(filtered.edge).all(axis=0) & (at_best == ranging.LOW_AMPLITUDE)
     fails = (at_best == ranging.AMPLITUDE_RATIO) | ((at_best == ranging.UNWRAP) & margin)
-    unmeasured = engine.outside_mask | lost | _edge_fails(filtered, float(gates.edge)) | dim | (known & fails)
+    unmeasured = engine.outside_mask | lost | _edge_fails(filtered, gates) | dim | (known & fails)
     too_far = (at_best == ranging.OUT_OF_RANGE) | (at_best == ranging.LOW_REFLECTIVITY)
     never = unmeasured | (known & unwraps & too_far)
     always = known & unwraps & (at_worst == ranging.VALID) & ~never
@@ -110,14 +111,17 @@ def certainty(
     return Certainty(always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason)
 
 
-def _edge_fails(filtered: Filtered, limit: float) -> np.ndarray:
-    """Find pixels whose edge sum is above the limit in some frequency, always."""
+def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
+    """Find pixels whose edge sum, in some frequency or in the mean of all, is above the limit, always."""
+    limit, known = float(gates.edge), np.isfinite(filtered.edge)
     if np.isinf(limit):
-        return np.zeros(filtered.edge.shape[1], bool)
-    spread = np.where(np.isfinite(filtered.edge), filtered.edge_spread, 0.0)
-    below = (filtered.edge - DEVIATIONS * spread > limit) & np.isfinite(filtered.edge)
+        return np.zeros(known.shape[1], bool)
+    sure = filtered.edge - DEVIATIONS * np.where(known, filtered.edge_spread, 0.0)
+    if gates.edge_mean > 0:
+        loosest = np.maximum(filtered.edge_least - DEVIATIONS * filtered.edge_loose, 0.0)
+        return np.asarray(np.where(known, sure, loosest).mean(axis=0) > limit)
     above = np.maximum((filtered.edge_least - limit) / np.maximum(filtered.edge_loose, 1e-9), 0.0)
-    return np.asarray(below.any(axis=0) | ((above**2).sum(axis=0) > DEVIATIONS**2))
+    return np.asarray(((sure > limit) & known).any(axis=0) | ((above**2).sum(axis=0) > DEVIATIONS**2))
 
 
 def _may_fly(

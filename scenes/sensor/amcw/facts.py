@@ -254,7 +254,8 @@ class EngineFacts(OutputFacts):
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
-    ``edges_to_dim``: whether the sum that ``edge_threshold`` limits counts such dim neighbours.
+    ``edge_threshold``: limit of the sum over the window of (1 - cos dphi)/2, in ``edges_in`` any of the frequencies or
+    in their mean; ``edges_to_dim``: whether it counts such dim neighbours.
     ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: of the limits of
     range.
     """
@@ -269,6 +270,7 @@ class EngineFacts(OutputFacts):
     fusion: Fact[Literal["least_squares", "mean"]]
     amplitude_gains: PositiveEach
     edge_threshold: Positive | None = None
+    edges_in: Fact[Literal["any", "mean"]]
     lattice_residual_turns: Positive | None = None
     residual_by_amplitude: ResidualByAmplitudeFacts | None = None
     amplitude_ratio: Annotated[Fact[float], SHARE] | None = None

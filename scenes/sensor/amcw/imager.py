@@ -251,6 +251,7 @@ class AmcwImager:
         edge, lattice, by_amplitude = facts.edge_threshold, facts.lattice_residual_turns, facts.residual_by_amplitude
         gates = ranging.Gates(
             edge=f4(edge.value if edge and self.config.edge_gate else np.inf),
+            edge_mean=f4(facts.edges_in.value == "mean"),
             residual=f4(lattice.value if lattice else np.inf),
             residual_most=f4(by_amplitude.greatest_turns.value if by_amplitude else np.inf),
             residual_scale=f4(by_amplitude.scale_turns.value if by_amplitude else 0.0),

@@ -30,12 +30,14 @@ UNWRAP, EDGE, OUT_OF_RANGE, OUTSIDE_MASK, LOW_REFLECTIVITY = map(
 
 class Gates(NamedTuple):
     """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``: sum of (1 - cos
-    dphi)/2. Residual limit in turns: ``residual``, or ``residual_scale`` A^``residual_slope`` of the brightest
-    frequency's amplitude A within ``residual`` and ``residual_most``. ``ratio``: (greatest - least) / greatest
-    amplitude. ``least`` amplitude and ``total`` in units, ``reflectivity`` in units m^2. Limits of range: along the
-    optical axis where ``axial`` is 1, else along the ray."""
+    dphi)/2, in the mean of the frequencies where ``edge_mean`` is 1, else in any. Residual limit in turns:
+    ``residual``, or ``residual_scale`` A^``residual_slope`` of the brightest frequency's amplitude A within
+    ``residual`` and ``residual_most``. ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and
+    ``total`` in units, ``reflectivity`` in units m^2. Limits of range: along the optical axis where ``axial`` is 1,
+    else along the ray."""
 
     edge: np.float32
+    edge_mean: np.float32
     residual: np.float32
     residual_most: np.float32
     residual_scale: np.float32
@@ -213,13 +215,16 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
         half_path(turn, length, lattice, half[:length], residual2[:length])
         for i in range(start, start + length):
             least = filtered[0, 2, i]
-            greatest, sum_of_all, steepest = least, least, edge[0, i]
+            greatest, sum_of_all, steepest, steps = least, least, edge[0, i], edge[0, i]
             for f in range(1, n_frequencies):
                 a = filtered[f, 2, i]
                 least = min(least, a)
                 greatest = max(greatest, a)
                 sum_of_all += a
                 steepest = max(steepest, edge[f, i])
+                steps += edge[f, i]
+            if gates.edge_mean > f4(0):
+                steepest = steps / f4(n_frequencies)
             path = half[i - start] + errors_m[i]
             range_m = (FOUR * path * path - geometry[1, i]) / (FOUR * path - TWO * geometry[0, i])
             z = range_m * geometry[2, i]

@@ -23,6 +23,8 @@ from scenes.sensor.facts import (
     checked,
 )
 
+SMOOTHING_REACH = 2.5
+"""Standard deviations at which the smoothing's weights end: 0.04 of the middle one."""
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
 
 
@@ -78,13 +80,12 @@ class RippleFacts(Config):
 
 
 class LidarEngineFacts(OutputFacts):
-    """Processing on the device. ``window_px``: height and width of the smoothing's window, odd. ``agree_deviations``:
-    a neighbour in it joins the mean where its half path differs by at most so many expected deviations.
-    ``least_agreeing``: share of the window that must agree. ``confidence_electrons``: least strength."""
+    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights with which neighbours
+    are averaged along columns, then along rows; 0: not at all. ``agree_deviations``: a neighbour joins the mean where
+    its half path differs by at most so many expected deviations. ``least_agreeing``: share of the weights that must
+    agree. ``confidence_electrons``: least strength."""
 
-    window_px: Annotated[
-        Fact[tuple[int, int]], checked("odd, from 1 to 31", lambda value: value % 2 == 1 and 1 <= value <= 31)
-    ]
+    smoothing_px: Annotated[Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)]
     agree_deviations: Positive
     least_agreeing: Share
     confidence_electrons: NonNegative
@@ -165,13 +166,17 @@ class ScannedLidar(CameraFacts):
     @property
     def margin_px(self) -> int:
         """Pixels beyond a region whose light reaches it through the integration and the smoothing."""
-        return int(np.ceil(self.integration_points / 2)) + max(self.half_window_px)
+        return int(np.ceil(self.integration_points / 2)) + max(len(taps) // 2 for taps in self.smoothing_taps)
 
-    @property
-    def half_window_px(self) -> tuple[int, int]:
-        """Pixels of the smoothing's window above and below its centre, and beside it."""
-        height, width = self.engine.window_px.value
-        return height // 2, width // 2
+    @cached_property
+    def smoothing_taps(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2 r + 1,) float32 weights of sum 1 along columns and along rows."""
+        found = []
+        for deviation_px in self.engine.smoothing_px.value:
+            reach = int(np.ceil(SMOOTHING_REACH * deviation_px))
+            taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation_px, 1e-9)) ** 2)
+            found.append((taps / taps.sum()).astype(np.float32))
+        return found[0], found[1]
 
     @cached_property
     def optics(self) -> Optics:

@@ -152,61 +152,80 @@ def stronger_peak(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def noise_peaks(  # type: ignore[no-untyped-def]
-    weak, noise, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
+    weak, noise, averaged, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
 ):
     """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``. A
     level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period (Rice); taken as Poisson, the
-    highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``bandwidth_m``: deviation of half the path at one noise
+    highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``averaged``: what the mean over neighbours leaves of the
+    noise before the peak is looked for. ``bandwidth_m``: deviation of half the path at one noise
     deviation."""
     w = noise.shape[1]
     for i in range(weak.size):
         v, u = weak[i] // w, weak[i] % w
         crossings = -np.log(max(uniforms[0, i], 1e-300))
         level = np.sqrt(2.0 * np.log(rate / crossings)) if crossings < rate else 0.0
-        if level * noise[v, u] > won_height[v, u]:
-            won_height[v, u] = level * noise[v, u]
+        tall = level * averaged * noise[v, u]
+        if tall > won_height[v, u]:
+            won_height[v, u] = tall
             won_m[v, u] = uniforms[1, i] * unambiguous_m
             won_deviation_m[v, u] = bandwidth_m / max(level, 1.0)
 
 
 @numba.njit(**FAST)
-def smooth_and_gate(  # type: ignore[no-untyped-def]
-    won_m, won_height, gate_m, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
+def smooth(  # type: ignore[no-untyped-def]
+    half_m, share, height, gate_m, taps, along_rows, out_m, out_share, out_height
 ):
-    """Average the neighbours in a window that agree, then range, gates and rounding.
+    """Average with ``taps`` (2 r + 1,) the neighbours of a column, or of a row with ``along_rows``, that agree.
 
-    ``won_m``, ``won_height`` (h + 2 p, w + 2 q), with a border of half the window: half path, height. ``gate_m`` (h,
-    w): how far a neighbour's half path may differ. ``strength`` (h, w): sum of the agreeing heights over the number of
-    all neighbours. A pixel whose agreeing neighbours are too small a share is invalid. Half the path s by a receiver at
-    e gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` (h, w) is u.e, ``cosine``
-    (h, w) u_z. ``limits``: e.e, least strength, least agreeing share, least and greatest range, step.
+    ``half_m``, ``share``, ``height`` (h + 2 p, w + 2 q), with a border of p and q at least r where the taps reach: half
+    path; weight of what agreed so far; strength. ``gate_m`` (h, w): how far a neighbour's half path may differ. Writes
+    the mean half path, the weight and the strength of those that agree, (h, w) each.
     """
-    h, w = cosine.shape
-    p, q = (won_m.shape[0] - h) // 2, (won_m.shape[1] - w) // 2
-    e2, least, alike, nearest, farthest, step = limits
-    one, zero = np.float32(1), np.float32(0)
+    h, w = gate_m.shape
+    p, q, r = (half_m.shape[0] - h) // 2, (half_m.shape[1] - w) // 2, taps.size // 2
+    zero = np.float32(0)
     moved, total, heights = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for v in range(h):
         moved[:], total[:], heights[:] = zero, zero, zero
-        for dy in range(2 * p + 1):
-            for dx in range(2 * q + 1):
-                for u in range(w):
-                    off = won_m[v + dy, u + dx] - won_m[v + p, u + q]
-                    joins = abs(off) <= gate_m[v, u]
-                    moved[u] += off if joins else zero
-                    total[u] += one if joins else zero
-                    heights[u] += won_height[v + dy, u + dx] if joins else zero
-        tall = min(v, p) + min(h - 1 - v, p) + 1
+        for k in range(-r, r + 1):
+            row = v + p + (0 if along_rows else k)
+            column = q + (k if along_rows else 0)
+            for u in range(w):
+                off = half_m[row, u + column] - half_m[v + p, u + q]
+                tap = taps[k + r] if abs(off) <= gate_m[v, u] else zero
+                weight = tap * share[row, u + column]
+                moved[u] += weight * off
+                total[u] += weight
+                heights[u] += tap * height[row, u + column]
         for u in range(w):
-            everyone = np.float32(tall * (min(u, q) + min(w - 1 - u, q) + 1))
-            support = heights[u] / everyone
-            half = won_m[v + p, u + q] + moved[u] / total[u] + error_m
+            out_m[v, u] = half_m[v + p, u + q] + moved[u] / total[u]
+            out_share[v, u] = total[u]
+            out_height[v, u] = heights[u]
+
+
+@numba.njit(**FAST)
+def gated(  # type: ignore[no-untyped-def]
+    half_m, share, height, everyone, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
+):
+    """Turn smoothed half paths (h, w) into ranges; gates and rounding.
+
+    ``share``, ``height``: weight and strength of the neighbours that agree; ``everyone``: weight of all within the
+    picture. A pixel whose agreeing neighbours are too small a share is invalid. Half the path s by a receiver at e
+    gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z.
+    ``limits``: e.e, least strength, least agreeing share, least and greatest range, step.
+    """
+    h, w = cosine.shape
+    e2, least, alike, nearest, farthest, step = limits
+    for v in range(h):
+        for u in range(w):
+            support = height[v, u] / everyone[v, u]
+            half = half_m[v, u] + error_m
             range_m = (np.float32(4) * half * half - e2) / (np.float32(4) * half - np.float32(2) * along_m[v, u])
             code = VALID if (range_m >= nearest) & (range_m <= farthest) else OUT_OF_RANGE
-            code = code if total[u] >= alike * everyone else EDGE
+            code = code if share[v, u] >= alike * everyone[v, u] else EDGE
             code = code if support >= least else LOW_AMPLITUDE
             code = SATURATED if saturated[v, u] else code
             rounded = np.floor(range_m * cosine[v, u] / step + np.float32(0.5)) * step
             z_m[v, u] = rounded if code == VALID else np.float32(np.nan)
             reason[v, u] = np.uint8(code)
-            strength[v, u] = max(support, zero)
+            strength[v, u] = max(support, np.float32(0))

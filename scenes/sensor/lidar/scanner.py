@@ -2,11 +2,11 @@
 
 Modelled: one beam per pixel whose light, with all its paths, meets one detector; the coded pulse's strongest peak; shot
 noise with the avalanche's excess, ambient light and the amplifier's noise on heights and places of peaks; maxima of the
-noise; integration over more than one point's time; an error that a sweep shares; ripples of a unit; smoothing among
-agreeing neighbours; confidence threshold, least range, saturation; the receiver beside the transmitter; rounding. Not
-modelled: wiggling and the edge gate (those effects change nothing), side lobes of the real code, the mirror's uneven
-speed and errors of direction, the beam's width changing with distance, drift over seconds, light of other lidars,
-motion, walk error with amplitude, and the vendor's own filters beyond these.
+noise after an average over neighbours; integration over more than one point's time; an error that a sweep shares;
+ripples of a unit; smoothing among agreeing neighbours; confidence threshold, least range, saturation; the receiver
+beside the transmitter; rounding. Not modelled: wiggling and the edge gate (those effects change nothing), side lobes of
+the real code, the mirror's uneven speed and errors of direction, the beam's width changing with distance, drift over
+seconds, light of other lidars, motion, walk error with amplitude, and the vendor's own filters beyond these.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import interpolate, linalg
+from scipy import interpolate, linalg, ndimage
 
 from harness.vocabulary.geometry import MM, Region
 from scenes.optics import NoiseFreeView
@@ -78,6 +78,12 @@ class LidarScanner:
         return static_error_m(self.camera, self.config, self.region, self.slopes, ripples_mm)
 
     @cached_property
+    def averaged(self) -> float:
+        """What the smoothing leaves of the noise's deviation, where all neighbours agree."""
+        along, across = self.camera.smoothing_taps
+        return float(np.linalg.norm(np.convolve(along, self._noise_taps)) * np.linalg.norm(across))
+
+    @cached_property
     def gathered(self) -> np.ndarray:
         """(h, w): signal electrons of a point per unit of the view's light: the receiver's aperture is flat."""
         return np.asarray(self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
@@ -92,7 +98,7 @@ class LidarScanner:
         noise = np.sqrt(shot + photons.amplifier_electrons.value**2)
         height, half_m, deviation_m = self._peaks(phasor, noise)
         full = photons.full_scale_electrons.value if effects.saturation else np.inf
-        weak = height[0] < CERTAIN_DEVIATIONS * noise if effects.noise else np.zeros(noise.shape, bool)
+        weak = height[0] < CERTAIN_DEVIATIONS * self.averaged * noise if effects.noise else np.zeros(noise.shape, bool)
         half_m, saturated = half_m + self.static_error_m, electrons + self.ambient_electrons > full
         height, half_m, deviation_m, noise = (each.astype(f4) for each in (height, half_m, deviation_m, noise))
         return LidarReturns(height, half_m, deviation_m, noise, saturated, np.flatnonzero(weak))
@@ -121,13 +127,13 @@ class LidarScanner:
 
     def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the peaks, then the processing; ``error_m`` displaces the frame."""
-        camera, (h, w), (p, q) = self.camera, exposure.noise.shape, self.camera.half_window_px
-        bordered_m, bordered_height = (
-            np.full((h + 2 * p, w + 2 * q), kernels.NOWHERE_M),
-            np.zeros((h + 2 * p, w + 2 * q), f4),
-        )
-        inner = slice(p, p + h), slice(q, q + w)
-        won = bordered_m[inner], bordered_height[inner], np.empty((h, w), f4)
+        camera, (h, w) = self.camera, exposure.noise.shape
+        p, q = (len(taps) // 2 for taps in camera.smoothing_taps)
+        inner, bordered = (slice(p, p + h), slice(q, q + w)), (h + 2 * p, w + 2 * q)
+        # half path, share and height, with a border that agrees with nothing
+        half_m, share, height = np.full(bordered, kernels.NOWHERE_M), np.zeros(bordered, f4), np.zeros(bordered, f4)
+        share[inner] = 1.0
+        won = half_m[inner], height[inner], np.empty((h, w), f4)
         # standard normals, correlated along columns, and the sweeps' errors
         normals, sweep_m, taps = np.zeros((3, h, w), f4), np.zeros(w, f4), self._noise_taps
         if self.config.effects.noise:
@@ -140,16 +146,22 @@ class LidarScanner:
         # the Cramer-Rao bound of a delay in white noise through the matched filter, at a height of one noise deviation
         bound_m = camera.unambiguous_m / (camera.period_s * camera.bandwidth_rad_s)
         rates = self.slope, bound_m, camera.unambiguous_m
-        kernels.noise_peaks(exposure.weak, exposure.noise, rng.random((2, exposure.weak.size)), *rates, *won)
+        uniforms = rng.random((2, exposure.weak.size))
+        kernels.noise_peaks(exposure.weak, exposure.noise, self.averaged, uniforms, *rates, *won)
         gate_m = won[2] * f4(camera.engine.agree_deviations.value)
 
-        # smoothing, range, gates and rounding
+        # smoothing along columns, then along rows; range, gates and rounding
+        everyone, image = np.ones((h, w), f4), (half_m, share, height)
+        for axis, taps in enumerate(camera.smoothing_taps):
+            ndimage.convolve1d(everyone, taps, axis, everyone, mode="constant")
+            smoothed = tuple(np.empty((h, w), f4) for _ in image)
+            kernels.smooth(*image, gate_m, taps, axis == 1, *smoothed)
+            for bordered_image, result in zip(image, smoothed, strict=True):
+                bordered_image[inner] = result
         z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
-        along_m, cosine = self._geometry
-        kernels.smooth_and_gate(
-            bordered_m, bordered_height, gate_m, along_m, cosine, exposure.saturated, self._limits, f4(error_m),
-            z_m, reason, strength,
-        )  # fmt: skip
+        kernels.gated(
+            *smoothed, everyone, *self._geometry, exposure.saturated, self._limits, f4(error_m), z_m, reason, strength
+        )
         return DecodedFrame(z_m, reason, strength)
 
 
