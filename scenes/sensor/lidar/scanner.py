@@ -79,7 +79,7 @@ class LidarScanner:
 
     @cached_property
     def averaged(self) -> float:
-        """What the smoothing leaves of the noise's deviation, where all neighbours agree."""
+        """Share of the noise's deviation that the smoothing leaves where all neighbours agree."""
         along, across = self.camera.smoothing_taps
         return float(np.linalg.norm(np.convolve(along, self._noise_taps)) * np.linalg.norm(across))
 
