@@ -290,6 +290,42 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
     assert read_lens(path, 640, 576) == lens
 
 
+@pytest.mark.parametrize(
+    ("text", "distortion"),
+    (
+        ("500 0 300\n0 510 200\n0 0 1\n", (0.0,) * 8),
+        ("500 0 300 0\n0 510 200 0\n0 0 1 0\n0 0 0 1 # of a scan\n", (0.0,) * 8),
+        ("[[500.0, 0, 300], [0, 510, 200], [0, 0, 1]]", (0.0,) * 8),
+        ("500 510 300 200", (0.0,) * 8),
+        ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, "coeffs": [0, 0, 0, 0, 0],'
+         ' "model": "distortion.inverse_brown_conrady"}', (0.0,) * 8),
+        ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, "k2": 0.2, "p1": 0.01,'
+         ' "p2": 0.02, "camera_model": "OPENCV", "frames": []}', (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0)),
+        ('{"0": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1},'
+         ' "1": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1}}', (0.0,) * 8),
+        ('{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360}, "depth": {"fx": 500, "fy": 510, "cx": 300,'
+         ' "cy": 200}}', (0.0,) * 8),
+    ),
+)  # fmt: skip
+def test_lenses_as_other_programs_write_them(tmp_path: Path, text: str, distortion: tuple[float, ...]) -> None:
+    path = tmp_path / "lens.txt"
+    path.write_text(text)
+    assert read_lens(path, 640, 576) == Lens(640, 576, 500, 510, 300, 200, distortion)
+
+
+def test_frames_along_the_last_axis(tmp_path: Path) -> None:
+    """As MATLAB stacks them; three planes are told from x, y and z by their content."""
+    frames = np.stack([plane.depth_mm(n, noise_mm=0.6) for n in range(3)])
+    for name, stack in (("three", frames), ("two", frames[:2]), ("one", frames[:1])):
+        np.save(tmp_path / f"{name}.npy", np.moveaxis(stack, 0, -1))
+        recording = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS)
+        assert recording.shape == frames.shape[1:] and any("last axis" in note for note in recording.notes)
+        for frame, stored in zip(recording.frames(), stack, strict=True):
+            assert np.allclose(frame.z_m, np.where(stored > 0, stored / 1e3, np.nan), equal_nan=True)
+    np.save(tmp_path / "points.npy", plane.points_m(frames[0]))
+    assert open_capture([tmp_path / "points.npy"]).first_frame().xy_m is not None
+
+
 def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
     folder = plane.write_open3d_folder(tmp_path / "o", 1)
     assert read_lens(folder / "intrinsic.json", 96, 72) == plane.LENS

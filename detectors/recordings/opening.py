@@ -16,7 +16,7 @@ from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
 from detectors.recordings.depth_images import open_depth_folder, open_depth_list, png_kind, png_texts
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, scale_in
-from detectors.recordings.intrinsics import parsed_lens
+from detectors.recordings.intrinsics import mappings, parsed_lens
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes
@@ -97,7 +97,7 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
         beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
         for path in islice(beside, 20):
             try:
-                yield path, parsed_lens(path)
+                yield from ((path, each) for _, each in mappings(parsed_lens(path)))
             except UserError:
                 continue
 
