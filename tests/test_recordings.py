@@ -313,6 +313,36 @@ def test_lenses_as_other_programs_write_them(tmp_path: Path, text: str, distorti
     assert read_lens(path, 640, 576) == Lens(640, 576, 500, 510, 300, 200, distortion)
 
 
+@pytest.mark.parametrize("suffix", (".npy", ".tiff", ".pfm"))
+def test_a_folder_of_arrays_is_one_capture(tmp_path: Path, suffix: str) -> None:
+    """Frames in the order of their numbers; infrared pictures beside them are left out."""
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "K.txt").write_text("\n".join(" ".join(map(str, row)) for row in plane.LENS.matrix.tolist()))
+    frames = [plane.depth_mm(n, noise_mm=0.6).astype(np.float32) for n in range(11)]
+    for name, stored in [*((f"f{n}", frames[n]) for n in (10, 9, 2)), ("ir_1", np.ones_like(frames[0]))]:
+        path = tmp_path / "depth" / f"{name}{suffix}"
+        np.save(path, stored) if suffix == ".npy" else cv2.imwrite(str(path), stored)
+    recording = open_capture([tmp_path], unit="mm")
+    for frame, number in zip(recording.frames(), (2, 9, 10), strict=True):
+        assert np.allclose(1e3 * np.nan_to_num(frame.z_m), frames[number], atol=1e-3)
+    assert recording.lens == plane.LENS and len(recording.files) == 4
+
+
+def test_pages_of_a_tiff_are_frames_and_three_channels_are_points(tmp_path: Path) -> None:
+    frames = [plane.depth_mm(n, noise_mm=0.6) for n in range(2)]
+    cv2.imwritemulti(str(tmp_path / "two.tiff"), frames)
+    assert len(list(open_capture([tmp_path / "two.tiff"], lens=plane.LENS).frames())) == 2
+    points = plane.points_m(frames[0]).astype(np.float32)
+    cv2.imwrite(str(tmp_path / "xyz.tiff"), np.ascontiguousarray(points[..., ::-1]))
+    frame = open_capture([tmp_path / "xyz.tiff"]).first_frame()
+    assert np.allclose(frame.xy_m, points[..., :2], equal_nan=True)
+    cv2.imwrite(str(tmp_path / "rgb.tiff"), np.zeros((72, 96, 3), np.uint16))
+    for name in ("rgb.tiff", "cut.tiff"):
+        (tmp_path / "cut.tiff").write_bytes((tmp_path / "two.tiff").read_bytes()[:900])
+        with pytest.raises(UserError, match=r"a picture|damaged"):
+            open_capture([tmp_path / name], lens=plane.LENS)
+
+
 def test_frames_along_the_last_axis(tmp_path: Path) -> None:
     """As MATLAB stacks them; three planes are told from x, y and z by their content."""
     frames = np.stack([plane.depth_mm(n, noise_mm=0.6) for n in range(3)])
