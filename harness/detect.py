@@ -13,8 +13,8 @@ from harness.vocabulary.program import program, whole_number
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     formats = (
-        "folder or list of depth .png, .ply, .pcd, .xyz; .npy .npz .mat .mkv .r3d .bin; a ROS bag (folder, .mcap,"
-        " .db3, .bag); a Stray Scanner folder; with --pitch a height map"
+        "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff; one .npy .npz .mat .tiff .pfm .mkv .r3d"
+        " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch a height map"
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
     files = (

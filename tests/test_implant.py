@@ -155,6 +155,7 @@ def test_the_program_states_a_limit_of_a_recording(tmp_path: Path, capsys: pytes
         assert one.unflawed.area_m2[0] == pytest.approx(80 * 110 * (0.6 / 504) ** 2, rel=0.05)
     assert len(record.set_ups[0].unflawed.board) == FRAMES // 2
     said, page = capsys.readouterr().out, (out / "report.html").read_text()
+    assert said.startswith("warning: virtual damage may be harder to find than real damage") and "7 of 23" in page
     assert "one average sets the threshold" in said and "one average sets the threshold" in page
     assert "What is measured and what is simulated" in page
 

@@ -290,6 +290,72 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
     assert read_lens(path, 640, 576) == lens
 
 
+@pytest.mark.parametrize(
+    ("text", "distortion"),
+    (
+        ("500 0 300\n0 510 200\n0 0 1\n", (0.0,) * 8),
+        ("500 0 300 0\n0 510 200 0\n0 0 1 0\n0 0 0 1 # of a scan\n", (0.0,) * 8),
+        ("[[500.0, 0, 300], [0, 510, 200], [0, 0, 1]]", (0.0,) * 8),
+        ("500 510 300 200", (0.0,) * 8),
+        ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, "coeffs": [0, 0, 0, 0, 0],'
+         ' "model": "distortion.inverse_brown_conrady"}', (0.0,) * 8),
+        ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, "k2": 0.2, "p1": 0.01,'
+         ' "p2": 0.02, "camera_model": "OPENCV", "frames": []}', (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0)),
+        ('{"0": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1},'
+         ' "1": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1}}', (0.0,) * 8),
+        ('{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360}, "depth": {"fx": 500, "fy": 510, "cx": 300,'
+         ' "cy": 200}}', (0.0,) * 8),
+    ),
+)  # fmt: skip
+def test_lenses_as_other_programs_write_them(tmp_path: Path, text: str, distortion: tuple[float, ...]) -> None:
+    path = tmp_path / "lens.txt"
+    path.write_text(text)
+    assert read_lens(path, 640, 576) == Lens(640, 576, 500, 510, 300, 200, distortion)
+
+
+@pytest.mark.parametrize("suffix", (".npy", ".tiff", ".pfm"))
+def test_a_folder_of_arrays_is_one_capture(tmp_path: Path, suffix: str) -> None:
+    """Frames in the order of their numbers; infrared pictures beside them are left out."""
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "K.txt").write_text("\n".join(" ".join(map(str, row)) for row in plane.LENS.matrix.tolist()))
+    frames = [plane.depth_mm(n, noise_mm=0.6).astype(np.float32) for n in range(11)]
+    for name, stored in [*((f"f{n}", frames[n]) for n in (10, 9, 2)), ("ir_1", np.ones_like(frames[0]))]:
+        path = tmp_path / "depth" / f"{name}{suffix}"
+        np.save(path, stored) if suffix == ".npy" else cv2.imwrite(str(path), stored)
+    recording = open_capture([tmp_path], unit="mm")
+    for frame, number in zip(recording.frames(), (2, 9, 10), strict=True):
+        assert np.allclose(1e3 * np.nan_to_num(frame.z_m), frames[number], atol=1e-3)
+    assert recording.lens == plane.LENS and len(recording.files) == 4
+
+
+def test_pages_of_a_tiff_are_frames_and_three_channels_are_points(tmp_path: Path) -> None:
+    frames = [plane.depth_mm(n, noise_mm=0.6) for n in range(2)]
+    cv2.imwritemulti(str(tmp_path / "two.tiff"), frames)
+    assert len(list(open_capture([tmp_path / "two.tiff"], lens=plane.LENS).frames())) == 2
+    points = plane.points_m(frames[0]).astype(np.float32)
+    cv2.imwrite(str(tmp_path / "xyz.tiff"), np.ascontiguousarray(points[..., ::-1]))
+    frame = open_capture([tmp_path / "xyz.tiff"]).first_frame()
+    assert np.allclose(frame.xy_m, points[..., :2], equal_nan=True)
+    cv2.imwrite(str(tmp_path / "rgb.tiff"), np.zeros((72, 96, 3), np.uint16))
+    for name in ("rgb.tiff", "cut.tiff"):
+        (tmp_path / "cut.tiff").write_bytes((tmp_path / "two.tiff").read_bytes()[:900])
+        with pytest.raises(UserError, match=r"a picture|damaged"):
+            open_capture([tmp_path / name], lens=plane.LENS)
+
+
+def test_frames_along_the_last_axis(tmp_path: Path) -> None:
+    """As MATLAB stacks them; three planes are told from x, y and z by their content."""
+    frames = np.stack([plane.depth_mm(n, noise_mm=0.6) for n in range(3)])
+    for name, stack in (("three", frames), ("two", frames[:2]), ("one", frames[:1])):
+        np.save(tmp_path / f"{name}.npy", np.moveaxis(stack, 0, -1))
+        recording = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS)
+        assert recording.shape == frames.shape[1:] and any("last axis" in note for note in recording.notes)
+        for frame, stored in zip(recording.frames(), stack, strict=True):
+            assert np.allclose(frame.z_m, np.where(stored > 0, stored / 1e3, np.nan), equal_nan=True)
+    np.save(tmp_path / "points.npy", plane.points_m(frames[0]))
+    assert open_capture([tmp_path / "points.npy"]).first_frame().xy_m is not None
+
+
 def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
     folder = plane.write_open3d_folder(tmp_path / "o", 1)
     assert read_lens(folder / "intrinsic.json", 96, 72) == plane.LENS

@@ -224,7 +224,7 @@ def test_a_folder_whose_depth_lies_in_arrays_beside_pictures_names_them(tmp_path
 
 
 def test_files_that_are_not_read_are_told_how_to_be_converted(tmp_path: Path) -> None:
-    for name, told in (("a.tiff", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
+    for name, told in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
         (tmp_path / name).write_bytes(b"abc")
         assert told in refusal(tmp_path / name)
 
@@ -355,7 +355,11 @@ def test_a_cloud_on_both_sides_of_the_camera_is_refused(tmp_path: Path) -> None:
         ('{"fx": 500, "fy": 500, "cx": 300, "cy": 200, "distortion": [1, 2, 3]}', "3 numbers"),
         ('{"fx": 500, "fy": 500, "cx": 300, "cy": 200, "distortion": {"k7": 1}}', "has k7"),
         ('{"intrinsic_matrix": [1, 2, 3]}', "list of 9"),
-        ("K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\ndistortion_model: equidistant", "equidistant"),
+        ("K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\nD: [.1, 0, 0, 0]\ndistortion_model: equidistant", "equidistant"),
+        (
+            '{"a": {"fx": 500, "fy": 500, "cx": 300, "cy": 200}, "b": {"fx": 400, "fy": 500, "cx": 300, "cy": 200}}',
+            "2 dif",
+        ),
         ("fx: 500\nfx: 500\n", ":2:1:"),
         ("just text", "no names"),
     ),

@@ -14,7 +14,7 @@ import math
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,7 @@ LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
     "BYTES before the first frame"
 )
+LEGAL_PICTURES = "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
 
@@ -80,6 +81,26 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     if not arrays:
         raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=fix)
     return arrays
+
+
+def load_picture(path: Path) -> dict[str, np.ndarray]:
+    """Return the pages of a TIFF, or a PFM, of numbers; of three channels in floating point x, y, z. Raises UserError
+    where it is broken, or a colour picture."""
+    import cv2
+
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it would print is told once, below
+    try:
+        with damage_told(f"{path}: cannot be read", LEGAL_PICTURES):
+            is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
+            if not is_read or not pages:
+                raise ValueError("it is damaged, or of another kind than its name says")
+            stack = np.stack(pages)
+            if stack.ndim == 4 and (stack.dtype.kind != "f" or stack.shape[3] != 3):
+                raise ValueError(f"{stack.shape[3]} channels of {stack.dtype}, which is a picture")
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    return {"": stack[..., ::-1] if stack.ndim == 4 else stack}  # OpenCV gives the last channel first
 
 
 SENSOR_SIZES = (
@@ -157,7 +178,10 @@ def raw_layout_of(path: Path) -> UserError:
     return UserError(f"{path}: nothing says how its {size} bytes are laid out", legal=LEGAL_RAW, fix=fix)
 
 
-LOADERS: dict[str, ArraysLoader] = {".npy": load_npy, ".npz": load_npz, ".mat": load_mat}
+LOADERS: dict[str, ArraysLoader] = {
+    **{".npy": load_npy, ".npz": load_npz, ".mat": load_mat},
+    **dict.fromkeys((".tif", ".tiff", ".pfm"), load_picture),
+}
 DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
@@ -182,7 +206,7 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
         hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(str(path), asked, width, height, beside=[path.parent], hint=hint)
+        lens, files = lens_for(str(path), asked, width, height, beside=[path.parent, path.parent.parent], hint=hint)
     scale_m = asked.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
@@ -195,6 +219,17 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     is_whole = distances.dtype.kind in "iu"
     more = {"files": (path, *files), "lens": lens, "organised": organised, "notes": (note,)}
     return Recording.begun(path.name, read, scale_m, is_whole, **more)
+
+
+def open_array_list(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
+    """Open files of arrays of one kind as one capture, in the order given. Raises UserError as `open_arrays` does."""
+    first = open_arrays(paths[0], asked)
+
+    def read() -> Iterator[Frame]:
+        for path in paths:
+            yield from open_arrays(path, asked).read()
+
+    return replace(first, name=name, read=read, files=(*paths, *first.files[1:]))
 
 
 def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:

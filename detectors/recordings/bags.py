@@ -7,7 +7,6 @@ that lens are used: a pixel's ray is then the same in all frames, not rounded an
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from detectors.recordings.depth_images import NOT_DEPTH
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
@@ -147,8 +147,6 @@ IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
-NOT_DEPTH = re.compile(r"(^|[/_])(ir|infra\w*|confidence|amplitude|intensity|reflectivity)([/_]|\d|$)", re.IGNORECASE)
-"""Words in the topics of other pictures that a depth camera publishes in 16 bits or floating point."""
 RAY_TOLERANCE_PX = 0.01
 """A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
 

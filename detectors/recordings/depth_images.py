@@ -83,6 +83,10 @@ TUM_MATCH_S = 0.02
 """Largest difference of time stamps of depth and colour that still belong together (the benchmark's own default)."""
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
+NOT_DEPTH = re.compile(
+    r"(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)", re.IGNORECASE
+)
+"""Words in the names of files and topics of other pictures that a depth camera writes in 16 bits or floating point."""
 
 
 def open_depth_folder(folder: Path, asked: Asked) -> Recording:
@@ -149,11 +153,19 @@ def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: flo
 def depth_files(folder: Path) -> tuple[Path, ...]:
     """Return a folder's depth pictures in the order of their numbers, without masks. Raises UserError where none is."""
     pictures = [path for path in folder.iterdir() if path.suffix.lower() == ".png"]
-    named = [path for path in pictures if "depth" in path.stem.lower()]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
-    chosen = named or numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)]
+    # a 16-bit infrared picture looks like depth
+    chosen = depth_named(pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)])
     if not chosen:
         raise UserError(f"{folder}: no depth picture in it ({len(pictures)} PNG files)", legal=LEGAL_PNG)
+    return chosen
+
+
+def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the files whose names hold "depth", else ``others`` without those of other pictures (`NOT_DEPTH`), in the
+    order of the numbers in their names."""
+    chosen = [path for path in paths if "depth" in path.stem.lower()]
+    chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
 
     def natural(path: Path) -> tuple[object, ...]:  # 9 before 10
         parts = re.split(f"({NUMBER.pattern})", path.stem)

@@ -1,9 +1,11 @@
-"""The lens of a capture from a file: plain JSON, Open3D, OpenCV, ROS camera_info, an Azure Kinect's calibration."""
+"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure Kinect's calibration."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,16 +105,38 @@ def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
 
 
 LEGAL_LENS = (
-    "JSON or YAML with fx, fy, cx, cy in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
-    "OpenCV's or ROS' camera_info YAML; an Azure Kinect's calibration.json"
+    "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's "
+    "intrinsic.json; OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; a matrix of 3 x 3 or 4 x 4 numbers; "
+    "an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
     *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
-    "rtabmap_calib",
+    *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
 )  # stems of the files that are taken for the lens of the frames beside or below them
+BARE_MATRICES = (
+    "intrinsics.txt",
+    "intrinsic.txt",
+    "camera-intrinsics.txt",
+    "intrinsic_depth.txt",
+    "K.txt",
+    "cam_K.txt",
+)
+"""Names of text files likewise: other text beside frames is mostly something else."""
+SPELLINGS = {
+    **{"fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y")},
+    **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},
+}
+MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
+SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
+COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
+MODELS = ("distortion_model", "model", "camera_model")
+"""Keys by which programs name focal lengths and centre, the matrix (the first one's column by column), the image's
+size, the distortion and its model."""
+NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
+NESTED = 3  # levels of mappings in a file in which a lens is looked for
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
-KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial")
+KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv")
 
 
 def lens_for(
@@ -131,8 +155,8 @@ def lens_for(
     if lens is None and file is None:
         lens = own()
         suffixes = (".json", ".yaml", ".yml")
-        named = (folder / f"{stem}{suffix}" for folder in beside for stem in FOUND_BESIDE for suffix in suffixes)
-        file = next(filter(Path.is_file, named), None)
+        names = [*(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in suffixes), *BARE_MATRICES]
+        file = next(filter(Path.is_file, (folder / name for folder in beside for name in names)), None)
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
@@ -164,10 +188,9 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         if mode is None:
             raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
         return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
-    data = data.get("intrinsic", data) if isinstance(data.get("intrinsic"), dict) else data
-    pairs = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"))
-    keys = next((keys for keys in pairs if all(key in data for key in keys)), None)
-    across, down = (data[key] for key in keys) if keys else (width, height)
+    stated = _size(data)
+    data = _the_lens(path, data, (width, height))
+    across, down = _size(data) or stated or (width, height)
     if not isinstance(across, int) or not isinstance(down, int):
         raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
     if across * height != down * width:
@@ -195,11 +218,19 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping. Raises UserError on what is no JSON or YAML, and on a key given twice."""
+    """Return the file's mapping; of a bare matrix, or of bare fx fy cx cy, its numbers by name. Raises UserError on
+    what is no JSON or YAML, and on a key given twice."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
+        words = re.sub(r"[\[\](),;]|#.*", " ", text).split() if len(text) < MAX_MATRIX_TEXT else []
+        if len(words) in (4, 9, 12, 16) and all(re.fullmatch(NUMBER, word) for word in words):
+            numbers = list(map(float, words))
+            if len(words) == 4:
+                return dict(zip(SPELLINGS, numbers, strict=True))
+            row = 3 if len(words) == 9 else 4
+            return {"K": [numbers[row * i + j] for i in range(3) for j in range(3)]}
         try:
             if text.lstrip().startswith("{"):
                 data = strict_json(text, nan=True)  # `_number` names the key that is no number
@@ -220,36 +251,77 @@ def parsed_lens(path: Path) -> dict[str, Any]:
     return data
 
 
+def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield a mapping and those within it, up to `NESTED` levels, each with its path of keys."""
+    yield name, data
+    if level < NESTED:
+        for key, value in data.items():
+            if isinstance(value, dict):
+                yield from mappings(value, f"{name}.{key}".lstrip("."), level + 1)
+
+
+def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
+    """Return the mapping in a file that holds the lens: of several different ones those of this image size count, then
+    those under a name with "depth". Raises UserError where there is none, or where several are left."""
+    found = [
+        (name, each) for name, each in mappings(data) if _matrix_key(each) or all(map(partial(_named, each), SPELLINGS))
+    ]
+    for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
+        if len(found) > 1:
+            found = [(name, each) for name, each in found if fits(name, each)] or found
+    if not found:
+        keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
+        raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
+    if len({_focal_and_centre(path, each) for _, each in found}) > 1:
+        names = ", ".join(name for name, _ in found[:9])
+        fix = "write the one of these images to a file of its own"
+        raise UserError(f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix)
+    return found[0][1]
+
+
+def _named(data: dict[str, Any], quantity: str) -> str | None:
+    """Return the key by which a mapping names one of `SPELLINGS`."""
+    return next((key for key in SPELLINGS[quantity] if key in data), None)
+
+
+def _matrix_key(data: dict[str, Any]) -> str | None:
+    return next((key for key in MATRICES if isinstance(data.get(key), list | dict)), None)
+
+
+def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
+    """Return width and height that a mapping states, None where it does not."""
+    return next(((data[across], data[down]) for across, down in SIZES if across in data and down in data), None)
+
+
 def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
-    """Return fx, fy, cx, cy from whichever of the known forms the file has."""
-    if all(key in data for key in ("fx", "fy", "cx", "cy")):
-        return tuple(_number(path, key, data[key]) for key in ("fx", "fy", "cx", "cy"))
-    # Open3D's matrix stands column by column, OpenCV's and ROS' row by row
-    for key in ("intrinsic_matrix", "camera_matrix", "K", "k"):
-        if key in data:
-            m = _numbers(path, key, data[key], 9)
-            return (m[0], m[4], m[6], m[7]) if key == "intrinsic_matrix" else (m[0], m[4], m[2], m[5])
-    keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
-    raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
+    """Return fx, fy, cx, cy from whichever of the known forms a mapping has."""
+    keys = [_named(data, quantity) for quantity in SPELLINGS]
+    if all(keys):
+        return tuple(_number(path, str(key), data[key]) for key in keys)
+    key = _matrix_key(data)
+    assert key is not None
+    m = _numbers(path, key, data[key], 9)
+    # Open3D's matrix stands column by column, all others' row by row
+    return (m[0], m[4], m[6], m[7]) if key == MATRICES[0] else (m[0], m[4], m[2], m[5])
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
-    model = str(data.get("distortion_model", ""))
-    if model.lower() not in KNOWN_MODELS:
-        raise UserError(f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:]))
-    key = next((k for k in ("distortion", "distortion_coefficients", "D", "d") if k in data), None)
-    if key is None:
-        return (0.0,) * 8
-    if isinstance(data[key], dict) and "data" not in data[key]:
-        unknown = ", ".join(sorted(map(str, set(data[key]) - set(DISTORTION_NAMES))))
+    key = next((k for k in COEFFICIENTS if k in data), None)
+    if key is None or (isinstance(data[key], dict) and "data" not in data[key]):
+        given = data if key is None else data[key]
+        unknown = [] if key is None else sorted(map(str, set(given) - set(DISTORTION_NAMES)))
         if unknown:
-            raise UserError(f"{path}: {key} has {unknown}", legal=", ".join(DISTORTION_NAMES))
-        return tuple(_number(path, f"{key}.{name}", data[key].get(name, 0.0)) for name in DISTORTION_NAMES)
-    numbers = _numbers(path, key, data[key], None)
+            raise UserError(f"{path}: {key} has {', '.join(unknown)}", legal=", ".join(DISTORTION_NAMES))
+        numbers = tuple(_number(path, name, given.get(name, 0.0)) for name in DISTORTION_NAMES)
+    else:
+        numbers = _numbers(path, key, data[key], None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):
         legal = "0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt"
         raise UserError(f"{path}: {key} has {len(numbers)} numbers", legal=legal)
+    model = str(next((data[name] for name in MODELS if name in data), ""))
+    if any(numbers) and re.sub(r"[ -]", "_", model.lower().removeprefix("distortion.")) not in KNOWN_MODELS:
+        raise UserError(f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:]))
     return (numbers + (0.0,) * 8)[:8]
 
 

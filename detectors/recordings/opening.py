@@ -10,22 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from detectors.recordings.arrays import LOADERS, open_arrays, raw_layout_of
+from detectors.recordings.arrays import LOADERS, open_array_list, open_arrays, raw_layout_of
 from detectors.recordings.bags import BAG_SUFFIXES, ROS1_SUFFIX, is_bag, open_bag
 from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
-from detectors.recordings.depth_images import open_depth_folder, open_depth_list, png_kind, png_texts
+from detectors.recordings.depth_images import (
+    depth_named,
+    open_depth_folder,
+    open_depth_list,
+    png_kind,
+    png_texts,
+)
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, scale_in
-from detectors.recordings.intrinsics import parsed_lens
+from detectors.recordings.intrinsics import mappings, parsed_lens
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes
 from harness.vocabulary.geometry import OtherLens
 
 LEGAL_FORMATS = (
-    "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; a ROS bag (folder, .mcap, "
-    ".db3, .bag); one .npy, .npz, .mat, .mkv or .r3d file; a Stray Scanner folder; with --pitch a height map; with "
-    "--raw a file of bare numbers"
+    "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; a folder of .npy or .tiff;"
+    " a ROS bag (folder, .mcap, .db3, .bag); one .npy, .npz, .mat, .tiff, .pfm, .mkv or .r3d file; a Stray Scanner"
+    " folder; with --pitch a height map; with --raw a file of bare numbers"
 )
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
@@ -36,7 +42,7 @@ LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUD
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
-    **dict.fromkeys((".tif", ".tiff", ".exr"), f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}"),
+    ".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}",
     **dict.fromkeys((".h5", ".hdf5"), HDF5),
     **dict.fromkeys((".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"), "export its points as PLY"),
 }  # commands that turn files that are not read into files that are
@@ -97,7 +103,7 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
         beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
         for path in islice(beside, 20):
             try:
-                yield path, parsed_lens(path)
+                yield from ((path, each) for _, each in mappings(parsed_lens(path)))
             except UserError:
                 continue
 
@@ -141,10 +147,16 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
         if clouds:
             return open_clouds(clouds, asked, folder.name)
     pictures = [path for path in inside if path.suffix.lower() == ".png"]
-    has_arrays = any(path.suffix.lower() in LOADERS for path in inside)
-    is_depth = bool(pictures) and (not has_arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures))
-    if is_depth or (folder / "depth").is_dir():
+    arrays = [path for path in inside if path.suffix.lower() in LOADERS]
+    is_depth = bool(pictures) and (not arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures))
+    inner = folder / "depth"
+    if inner.is_dir() and not is_depth and not any(path.suffix.lower() == ".png" for path in inner.iterdir()):
+        return _open_folder(inner, asked)
+    if is_depth or inner.is_dir():
         return open_depth_folder(folder, asked)
+    frames = depth_named(arrays, arrays)
+    if len(frames) > 1 and len({path.suffix.lower() for path in frames}) == 1:
+        return open_array_list(frames, asked, folder.name)
     held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
     known = (p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
     captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
 MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
-WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat")
+WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
 PREFIX = "mapping."

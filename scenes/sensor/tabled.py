@@ -27,10 +27,10 @@ class DepthNoise:
         self.table = table
         slopes = table["slopes"] if slopes is None else slopes
         self.stretch = np.sqrt(1.0 + (np.asarray(slopes, np.float32) ** 2).sum(axis=-1))
-        self.shape, self.falloff = (
-            self.stretch.shape,
-            table["falloff"] if slopes is table["slopes"] else np.float32(1.0),
-        )
+        self.cosine, self.shape = 1.0 / self.stretch, self.stretch.shape
+        self.falloff = table["falloff"] if slopes is table["slopes"] else np.float32(1.0)
+        self.sigma_m, self.seen = (np.append(first, table[key]).astype(np.float32)
+                                   for first, key in ((0.0, "sigma_m"), (0.0, "seen")))  # fmt: skip
         white = np.random.default_rng(seed).standard_normal(self.shape, dtype=np.float32)
         self.pattern_m = table["pattern_m"] * filtered(white, table["pattern_rows"], table["pattern_columns"])
 
@@ -40,17 +40,24 @@ class DepthNoise:
         Generator."""
         table, range_m = self.table, np.asarray(z_m, np.float32) * self.stretch
         with np.errstate(divide="ignore", invalid="ignore"):
-            light = self.falloff * np.asarray(intensity, np.float32) / range_m**2
-            level = (np.log2(light) - table["first"]) * table["per_octave"]
-            level = np.nan_to_num(level, nan=-1.0, posinf=1e6, neginf=-1.0)
-        place = np.clip(level + 0.5, 0, len(table["sigma_m"]) - 1).astype(np.intp)
+            level = np.log2(self.falloff * np.asarray(intensity, np.float32) / (range_m * range_m))
+        level *= table["per_octave"]
+        level += np.float32(1.5) - table["first"] * table["per_octave"]
+        # entry 0 is no return; no light, which is NaN or minus infinity, falls there
+        place = np.fmax(np.fmin(level, np.float32(len(self.seen) - 1), out=level), 0.0, out=level).astype(np.int32)
         noise = filtered(rng.standard_normal(self.shape, dtype=np.float32), table["rows"], table["columns"])
-        moved = range_m + table["sigma_m"][place] * noise + self.pattern_m
-        seen = rng.random(self.shape, dtype=np.float32) < np.where(level < 0.0, 0.0, table["seen"][place])
+        seen = rng.random(self.shape, dtype=np.float32) < self.seen.take(place)
         seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
-        z = moved / self.stretch
-        step = table["step_m"]
-        return np.where(seen, np.round(z / step) * step if step > 0 else z, np.float32(np.nan)).astype(np.float32)
+        noise *= self.sigma_m.take(place)
+        noise += range_m
+        noise += self.pattern_m
+        noise *= self.cosine
+        if (step := table["step_m"]) > 0:
+            noise *= 1.0 / step
+            np.round(noise, out=noise)
+            noise *= step
+        noise[~seen] = np.nan
+        return noise
 
 
 def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
@@ -59,5 +66,7 @@ def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
         reach, side = len(taps) - 1, image.shape[axis]
         longer = np.concatenate([image.take(range(side - reach, side), axis), image], axis)
         parts = (longer[k : k + side] if axis == 0 else longer[:, k : k + side] for k in range(reach + 1))
-        image = sum(tap * part for tap, part in zip(taps[::-1], parts, strict=True))
+        image = np.zeros_like(image)
+        for tap, part in zip(taps[::-1], parts, strict=True):
+            image += tap * part
     return image
