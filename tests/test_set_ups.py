@@ -9,7 +9,7 @@ import pytest
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import MAIN, Experiment
 from harness.vocabulary.declaration.yaml_source import DeclarationError
-from harness.vocabulary.path_names import names_of, unit_of, value_text
+from harness.vocabulary.path_names import in_words, names_of, unit_of, value_text
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -140,6 +140,13 @@ def test_names_of_paths_and_values():
     assert value_text("x.distance_m", None) == "null"
     assert value_text("x.edge_gate", True) == "true"
     assert len(value_text("x", "y" * 100)) == 60
+
+
+def test_set_ups_and_variations_read_as_words():
+    assert in_words("camera=kinect_v2, backing distance=20 mm") == "Kinect v2, backing distance 20 mm"
+    assert in_words("source.target.distance_m=0.5") == "distance 0.5 m"
+    assert in_words("source.camera.edge_gate=false") == "edge gate off"
+    assert in_words("the script as it stands, k = 1.2") == "the script as it stands, k = 1.2"
 
 
 @pytest.mark.parametrize(("name", "points", "groups"), [("cameras", 90, 45), ("anatomy", 40, 20)])

@@ -18,6 +18,7 @@ from harness.tables.text import inches, many
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
     from matplotlib.colors import SymLogNorm
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.image import AxesImage
@@ -90,7 +91,7 @@ class Cut(NamedTuple):
 
 def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
     """Residuals of each cloud, pixels of findings, rings at the true holes (dashed: not found)."""
-    norm = _norm(np.concatenate([cloud.residual_mm[cloud.inside] for cloud in clouds]))
+    norm = residual_norm(np.concatenate([cloud.residual_mm[cloud.inside] for cloud in clouds]))
     boxes = []
     for cloud in clouds:
         v, u = np.nonzero(cloud.inside if cloud.inside.any() else np.ones_like(cloud.inside))
@@ -116,7 +117,7 @@ def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
             axes.set(xlim=(left, right), ylim=(low, top), ylabel="row (pixels)")
             marked = f"{found} of {len(cloud.truth)} holes marked"
             axes.set_title(f"{many(cloud.frames, 'frame')}, distance behind the fitted surface: {marked}")
-            _bar(figure, picture, "mm", cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)))
+            residual_bar(figure, picture, "mm", cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)))
         panels[-1].set_xlabel("column (pixels)")
 
     alt = "Range residual of each pixel in millimetres, with detected pixels and a ring at each true hole."
@@ -179,7 +180,7 @@ def _example_cut(one: StudyExample, titles: Mapping[Where, str]) -> Cut:
 def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
     """Damages on one scale of colours; the axes are in mm from the middle of each cut."""
     cuts = [cut for line in rows for cut in line if cut is not None]
-    norm = _norm(np.concatenate([cut.residual_mm.ravel() for cut in cuts]))
+    norm = residual_norm(np.concatenate([cut.residual_mm.ravel() for cut in cuts]))
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(len(rows), len(rows[0]), squeeze=False)
@@ -195,12 +196,13 @@ def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
             axes.set_xticks([middle - step, middle, middle + step], ["−10", "0", "10 mm"], fontsize=8)
             axes.set_title(cut.title, fontsize=9.5)
             axes.set_xlabel(cut.below, color=cut.colour, fontsize=9)
-        _bar(figure, picture, "distance behind the surface (mm)", ax=panels, shrink=0.8, pad=0.02)
+        residual_bar(figure, picture, "distance behind the surface (mm)", ax=panels, shrink=0.8, pad=0.02)
 
     return svg(name, (2.5 * len(rows[0]) + 1.4, 3.2 * len(rows) + 0.3), alt, draw)
 
 
-def _norm(residual_mm: np.ndarray) -> SymLogNorm:
+def residual_norm(residual_mm: np.ndarray) -> SymLogNorm:
+    """Colours of residuals (any shape): linear within 1 mm, logarithmic beyond."""
     from matplotlib.colors import SymLogNorm
 
     finite = np.abs(residual_mm[np.isfinite(residual_mm)])
@@ -218,7 +220,7 @@ def _image(axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymL
     return picture
 
 
-def _bar(figure: Figure | SubFigure, picture: AxesImage, label: str, **place: Any) -> None:
+def residual_bar(figure: Figure | SubFigure, picture: ScalarMappable, label: str, **place: Any) -> None:
     """The colour bar with round numbers; ``place``: what `Figure.colorbar` needs."""
     limit = picture.get_clim()[1] or LEAST_MM
     bar = figure.colorbar(picture, extend="both", **place)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
+from harness.report.clouds import residual_bar, residual_norm
 from harness.tables import outputs, trials
 from harness.tables.schema import jsonable
 from harness.vocabulary.files import atomic_path
@@ -178,7 +179,6 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
 WIDTH_IN, DPI = 11.0, 150
-SHOWN_SCORES = 8.0
 TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
 """Colours that stand apart from grey and from one another, also for people who see red and green alike."""
 Box = tuple[float, float, float, float]
@@ -193,8 +193,8 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
     """Draw the colour image (where known) above the residual in mm; without a pixel grid a plan view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
-    residual_mm, limit = evidence.residual_m / MM, SHOWN_SCORES * evidence.scale_m / MM
-    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    residual_mm = evidence.residual_m / MM
+    style: dict[str, Any] = {"cmap": "RdBu_r", "norm": residual_norm(residual_mm)}
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
@@ -207,7 +207,7 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
             judged = np.isfinite(residual_mm)
             x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
             shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
-        figure.colorbar(shown, ax=list(axes), extend="both").set_label("behind (+) or\nbefore (-) the\nsurface, mm")
+        residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
         for one in axes:
             _frame(one, cloud, box)
             _circle(one, cloud, enumerate(detections, start=1))

@@ -224,7 +224,9 @@ def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
             cells.append(plus_minus(*(last[f"{of}_diameter_{what}_mm"] for what in ("mean", "std"))))
         rows.append(cells)
     counted = [f"N={n}" if terminal else many(n, "frame") for n in frames]
-    heads = ("hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ()))
+    heads = ["hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ())]
+    if all(cells[1] == "–" for cells in rows):
+        heads, rows = [heads[0], *heads[2:]], [[cells[0], *cells[2:]] for cells in rows]
     return Grid.of(heads, rows, 1, "holes detected of trials, by number of averaged frames (N)")
 
 

@@ -62,11 +62,13 @@ def camera_title(name: str) -> str:
 def in_words(variant: str) -> str:
     """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m",
     and ``source.target.distance_m=0.5``, a variation's, "distance 0.5 m"."""
-    parts = [part.partition("=") for part in re.split(r", (?=[^=,]+=)", variant)]
-    return ", ".join(_said(name, value) for name, _, value in parts)
+    return ", ".join(_said(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 
-def _said(name: str, text: str) -> str:
+def _said(part: str) -> str:
+    name, is_set, text = part.partition("=")
+    if not is_set or name.endswith(" "):  # a label of the user's own
+        return part
     if re.fullmatch(r"\w+(\.\w+)+", name):
         with contextlib.suppress(ValueError):
             text = {"true": "on", "false": "off", "null": "none"}.get(text) or value_text(name, json.loads(text))

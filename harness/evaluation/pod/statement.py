@@ -60,15 +60,17 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class PodStatement:
-    """What inspections, as ``read``, say; sizes are in ``unit``. ``fits``: the models over which bound and band are the
-    widest, that of the curve first; ``models``: all that were tried; ``independent``: the bound had every row been a
-    target of its own, None where it was; ``sizes``, ``lower``, ``upper`` (m,) the band to be drawn; ``numbers``: what
-    else the fit says; ``tests``: (what, p-value, how it reads)."""
+    """Statement on inspections, as ``read``; sizes are in ``unit``. ``fits``: of hits, the models over which bound and
+    band are the widest, that of the curve first; ``signal``: the regression, None of hits; ``models``: all that were
+    tried; ``independent``: the bound had every row been a target of its own, None where it was; ``sizes``, ``lower``,
+    ``upper`` (m,) the band to be drawn; ``numbers``: what else the fit says; ``tests``: (what, p-value, how it
+    reads)."""
 
     read: Inspections
     kind: str
     unit: str
-    fits: tuple[HitMissFit, ...] | tuple[AhatFit]
+    fits: tuple[HitMissFit, ...]
+    signal: AhatFit | None
     models: tuple[ModelRow, ...]
     bound: Bound
     independent: Bound | None
@@ -82,12 +84,7 @@ class PodStatement:
     @property
     def curve(self) -> PodCurve:
         """The curve that is stated."""
-        return self.fits[0].curve
-
-    @property
-    def signal(self) -> AhatFit | None:
-        """The regression of signals; None of hits."""
-        return self.fits[0] if isinstance(self.fits[0], AhatFit) else None
+        return (self.signal or self.fits[0]).curve
 
     @property
     def a50(self) -> float:
@@ -201,8 +198,8 @@ def state_hits(
     numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
-    rows, told = _models(models, near), (numbers, tuple(notes), tuple(said))
-    return PodStatement(read, "hit/miss", unit, near, rows, limit, independent, sizes, lower, upper, *told)
+    what = (read, "hit/miss", unit, near, None, _models(models, near), limit, independent)
+    return PodStatement(*what, sizes, lower, upper, numbers, tuple(notes), tuple(said))
 
 
 def state_signals(
@@ -235,9 +232,9 @@ def state_signals(
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
-    kind, told = "signal against size", (numbers, (*read.notes, *fit.notes), tuple(said))
-    band = ahat_band(fit, sizes, CONFIDENCE)
-    return PodStatement(read, kind, unit, (fit,), _models(models, (fit,)), limit, rows, sizes, *band, *told)
+    what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit, rows)
+    band, notes = ahat_band(fit, sizes, CONFIDENCE), (*read.notes, *fit.notes)
+    return PodStatement(*what, sizes, *band, numbers, notes, tuple(said))
 
 
 def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:

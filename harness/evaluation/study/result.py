@@ -284,7 +284,7 @@ CONDITIONS = (
 def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -> str:
     """Return what all set-ups of a study have in common, in one line, and whether damage was out of view or lost with
     failed trials; empty where nothing is known."""
-    said = []
+    said: list[str] = []
     for path, words in CONDITIONS:
         value: Any = facts
         for key in path.split("."):
