@@ -110,12 +110,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     poses = goals[0]["rows"] if goals else _rows(one, list(one.seen), wanted, len(given), options.suggest)
     if not poses:
         raise UserError(f"{name}: damage of {wanted:.3g} mm is found nowhere, in no pose", fix="ask for a larger size")
-    limits_mm = np.stack([row["limits_mm"] for row in poses])
-    best, patches = limits_mm.argmin(axis=0), one.patches
+    each_mm, patches = np.stack([row["limits_mm"] for row in poses]), one.patches
+    best, limits_mm = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0), np.fmin.reduce(each_mm)
     facts = np.stack(
         [[seen.deviation_m, seen.cosine, seen.range_m] for seen in (one.seen[row["pose"]] for row in poses)]
     )
-    columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm.min(axis=0), best + 1]
+    columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm, best + 1]
     noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
     columns += [noise_m / MM, np.degrees(np.arccos(cosine)), range_m]
     names = [column.name for column in COVERAGE.columns]
@@ -125,13 +125,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
     said, warnings = (
-        answer(one.found, patches, limits_mm.min(axis=0), wanted, len(poses)),
+        answer(one.found, patches, limits_mm, wanted, len(poses)),
         warnings_of(one.found, one.seen),
     )
     if goals:
         word = "Cheapest" if goals[0]["reached"] else "The goal is not reached; nearest"
         said = f"{word}: {goals[0]['camera']}, {goals[0]['frames']} frames, {goals[0]['distance_m']:g} m. {said}"
-    config, scene = one.point.config, scene_of(patches, limits_mm.min(axis=0), one.found)
+    config, scene = one.point.config, scene_of(patches, limits_mm, one.found)
     camera, frames = config.simulated.camera, config.capture.frames
     detector = f"the detector {config.detector.name} at a threshold of {one.task.threshold:.3g}"
     first = f"Simulated, for unit {camera.unit_seed} of {camera.name}, {frames} frames, {detector}. {one.found.said}"

@@ -40,7 +40,7 @@ BOARDS, LOOKS = 40, 3
 """Damaged boards on which strength and hits are learnt, and averages in which each is inspected."""
 STEEPEST_DEG = 60.0
 """Tilt about either axis of these boards, at most."""
-DRAWS, AROUND_PX, NEAR_PX = 4, 31, 15
+DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
 """Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
 the unit's pattern; and of that in which missing pixels count."""
 MOST_PATCHES = 3000

@@ -92,14 +92,16 @@ class Findable:
         return size_mm or high
 
     def limits_mm(self, seen: Seen) -> np.ndarray:
-        """Return a90 (n,) of places: the smallest size inspected where that is found already; infinite where none is
-        found so often, where nothing is judged, and where the angle is steeper than all inspected."""
+        """Return a90 (n,) of places: the size from which on all up to the largest inspected are found, infinite where
+        there is none; NaN where nothing is judged, and where the angle is steeper than all inspected."""
         sizes_mm = np.geomspace(*self.sizes_mm, SIZES)
         places = (np.maximum(seen.cosine, self.steepest)[:, None], seen.range_m[:, None])
         log = _features(*np.broadcast_arrays(sizes_mm, *places)) @ self.coefficients
         found = log - np.log(seen.deviation_m)[:, None] >= np.log(self.index)
+        found = np.logical_and.accumulate(found[:, ::-1], axis=1)[:, ::-1]
         beyond = np.cos(min(np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG), np.pi / 2))
-        return np.where(found.any(axis=1) & (seen.cosine >= beyond), sizes_mm[found.argmax(axis=1)], np.inf)
+        limits_mm = np.where(found.any(axis=1), sizes_mm[found.argmax(axis=1)], np.inf)
+        return np.where(np.isfinite(seen.deviation_m) & (seen.cosine >= beyond), limits_mm, np.nan)
 
 
 def _features(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:

@@ -14,14 +14,15 @@ from harness.report.view3d import Scene3d, view3d_html
 from harness.tables.coverage import GOALS, POSES
 from harness.tables.text import many, percent
 
-COLOURS = ("#fde725", "#a0da39", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#8a8f96")
-"""Seven steps of viridis (van der Walt and Smith, 2015), light where small damage is found, and grey."""
+COLOURS = ("#fde725", "#a0da39", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#b3261e", "#8a8f96")
+"""Seven steps of viridis (van der Walt and Smith, 2015), light where small damage is found; red; grey."""
 METHOD = (
     "Each patch has the noise of the detector's residual about it (average, pattern of the unit, misfit of the "
     "surface), an angle of incidence and a distance. A damage's strength there is d' of the ideal observer over that "
     "noise; it was learnt, with the detector's hits against d', on boards of the experiment's family in random poses, "
-    "at the experiment's own threshold. A patch is blind where the detector judges nothing, where it is hidden, and "
-    "where it is steeper than all damage that was inspected. Of several poses the best counts, not their sum."
+    "at the experiment's own threshold. A patch is not judged where the detector judges nothing, where it is hidden or "
+    "out of view, and where it is steeper than all damage that was inspected. Of several poses the best counts, not "
+    "their sum."
 )
 
 
@@ -29,21 +30,24 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
     """Return the part in classes of its limits (n,), equal in their logarithm."""
     known = np.isfinite(limits_mm)
     low, high = (limits_mm[known].min(), limits_mm[known].max()) if known.any() else found.sizes_mm
-    ends = np.geomspace(low, high * 1.0001, len(COLOURS))
-    of = np.where(known, np.searchsorted(ends, limits_mm, side="right") - 1, len(COLOURS) - 1)
+    ends = np.geomspace(low, high * 1.0001, len(COLOURS) - 1)
+    of = np.where(known, np.searchsorted(ends, limits_mm, side="right") - 1, len(COLOURS) - 2 + np.isnan(limits_mm))
     words = [f"{one:.2g} to {other:.2g} mm" for one, other in pairwise(ends)]
-    key = list(zip([*words, f"blind up to {found.sizes_mm[1]:.3g} mm"], COLOURS, strict=True))
+    key = list(zip([*words, f"none up to {found.sizes_mm[1]:.3g} mm", "not judged"], COLOURS, strict=True))
     palette = np.array([[int(one[k : k + 2], 16) for k in (1, 3, 5)] for one in COLOURS], np.uint8)
     shown, there = f"{found.size_of} found 9 times in 10", np.unique(of).tolist()
     return Scene3d(1e3 * patches.points_m, "board", rgb=palette[of], shown=shown, key=tuple(key[n] for n in there))
 
 
 def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: float, poses: int) -> str:
-    """State the share of the face on which damage of a size is found, and what is blind to every size inspected."""
-    share, blind = patches.share(limits_mm <= size_mm), patches.share(~np.isfinite(limits_mm))
+    """State the share of the face on which damage of a size is found, and the shares where no size is, and that are not
+    judged."""
+    some = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
+    share, blind, unknown = (f"{percent(patches.share(each))} %" for each in some)
     return (
-        f"Damage with a {found.size_of} of {size_mm:.3g} mm is found nine times in ten on {percent(share)} % of the "
-        f"face in {many(poses, 'pose')}; {percent(blind)} % is blind to all sizes up to {found.sizes_mm[1]:.3g} mm."
+        f"Damage with a {found.size_of} of {size_mm:.3g} mm is found nine times in ten on {share} of the face in "
+        f"{many(poses, 'pose')}. On {blind} nothing up to {found.sizes_mm[1]:.3g} mm is found so often; {unknown} is "
+        "not judged."
     )
 
 

@@ -22,16 +22,16 @@ NO_RESIDUAL = -32768
 
 Kind = Literal["found", "missed", "finding", "false call"]
 KINDS: dict[Kind, tuple[str, str]] = {
-    "found": ("true hole, found", "#00a651"),
-    "missed": ("true hole, missed", ORANGE),
+    "found": ("damage, found", "#00a651"),
+    "missed": ("damage, missed", ORANGE),
     "finding": ("finding", DAMAGE),
-    "false call": ("finding that is no hole", "#e0201b"),
+    "false call": ("finding that is no damage", "#e0201b"),
 }
 
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A true hole ("found", "missed" in this repeat) or a finding (by the thesis' measure): ``centre_mm`` (3,), unit
+    """A damage ("found", "missed" in this repeat) or a finding (by the thesis' measure): ``centre_mm`` (3,), unit
     ``normal`` (3,), in the cloud's frame."""
 
     centre_mm: np.ndarray
