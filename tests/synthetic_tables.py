@@ -188,6 +188,9 @@ def _exactly(rng: np.random.Generator, n: int, mean: float, std: float) -> np.nd
 
 def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) -> pd.DataFrame:
     n, parts = world.repeats, []
+    of_all: dict[str, object] = {"point": f"{variant}-{frames}", "variant": variant, "frames": frames}
+    of_all |= {"kind": "through", "true_depth_mm": 12.7, "seen_depth_mm": 12.7, "true_y_mm": 0.0, "threshold": 4.0}
+    of_all |= {"model_note": "", "invalid_fraction": 0.1, "median_residual_mm": 3.0}
     for number, (diameter, offset) in enumerate(zip(DIAMETERS_MM, OFFSETS_MM, strict=True), start=1):
         detected = np.arange(n) < round(world.rate(number, frames) * n)
         size = _exactly(rng, n, diameter + world.size_bias_mm(diameter), world.size_std_mm)
@@ -206,28 +209,13 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
             "model_offset_mm": np.full(n, offset) + 0.1,
             "model_error_mm": np.full(n, 0.4),
         }
-        fixed = {
-            "point": f"{variant}-{frames}",
-            "variant": variant,
-            "frames": frames,
-            "repeat": np.arange(n),
-            "hole": str(number),
-            "kind": "through",
-            "true_diameter_mm": diameter,
-            "true_depth_mm": 12.7,
-            "seen_depth_mm": 12.7,
-            "true_x_mm": 254.0 - offset,
-            "true_y_mm": 0.0,
-            "true_offset_mm": offset,
-            "detected": detected,
-            "threshold": 4.0,
-            "model_note": "",
-            "invalid_fraction": 0.1,
-            "median_residual_mm": 3.0,
-            "state": np.where(detected, "found", "invisible"),
-        }
-        parts.append(pd.DataFrame(fixed | {name: np.where(detected, v, np.nan) for name, v in measured.items()}))
-    return pd.concat(parts, ignore_index=True)
+        of_hole = {"hole": str(number), "true_diameter_mm": diameter, "true_x_mm": 254.0 - offset}
+        of_hole |= {"true_offset_mm": offset}
+        each = {name: np.full(n, value) for name, value in of_hole.items()} | {"repeat": np.arange(n)}
+        each |= {"detected": detected, "state": np.where(detected, "found", "invisible")}
+        parts.append(each | {name: np.where(detected, v, np.nan) for name, v in measured.items()})
+    # one frame: tests make hundreds, and joining one for each hole took most of their time
+    return pd.DataFrame(of_all | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def _runs(world: World, rng: np.random.Generator, variant: str, frames: int) -> pd.DataFrame:

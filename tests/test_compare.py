@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, product
 from typing import Any
@@ -15,7 +17,8 @@ from scipy import stats
 
 from harness import compare
 from harness.evaluation.intervals import threshold_for_rate
-from harness.evaluation.study.limit import limit_of
+from harness.evaluation.study import verdict
+from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.paired import (
     _threshold_error,
     calls_change,
@@ -42,6 +45,20 @@ from tests.synthetic_study import SetUp, Study, study_record
 
 FRAMES = count()
 SMALL = {"boards": 24, "hole_free_boards": 24, "holes": 6}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_limit_once() -> Iterator[None]:
+    """The limit of a set-up that several tests compare is computed once; half of these tests' time went there."""
+    known: dict[bytes, SetUpLimit] = {}
+
+    def limit(record: SetUpRecord) -> SetUpLimit:
+        key = pickle.dumps(record)
+        return known[key] if key in known else known.setdefault(key, limit_of(record))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdict, "limit_of", limit)
+        yield
 
 
 def small(*set_ups: SetUp, **changed: object) -> StudyRecord:

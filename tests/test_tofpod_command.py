@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import re
-import shlex
 import subprocess
 import sys
 import zipfile
@@ -16,19 +14,6 @@ from harness.__main__ import TASKS, main, programs
 from harness.experiment.load import load_experiment
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-COMMANDS = re.compile(r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE)
-TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-
-
-@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
-def test_every_command_of_the_documents_is_understood(path, capsys):
-    text = path.read_text().replace("\\\n", " ")
-    for command in COMMANDS.findall(text):
-        name, *given = shlex.split(command)
-        if name in programs() and given and "..." not in command:
-            assert importlib.import_module(f"harness.{name}").main.parser().parse_args(given), command
 
 
 def test_every_program_is_in_the_documents(capsys):

@@ -1,0 +1,312 @@
+"""Every command and every block of Python in README and docs runs, in its document's order, on small inputs."""
+
+from __future__ import annotations
+
+import glob
+import importlib
+import itertools
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+import textwrap
+import types
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import marked_board
+import numpy as np
+import pandas as pd
+import pytest
+import tiny_dataset
+from marked_boards import LENS, board_pose, marked_cloud, strips
+from recorded_plane import calibration, write_mkv
+from test_gauge import captured
+from test_marks_coded import PLACES, tags
+from test_reference import casting
+from test_reference import seen as casting_seen
+from tiny_sweep import STUDY
+
+import tofpod
+from harness.__main__ import main, programs
+from harness.engine import coverage
+from harness.experiment.load import load_experiment
+from harness.inspection.gauge import read_gauge
+from harness.vocabulary.geometry import MM, Cloud, Lens
+
+ROOT = Path(__file__).resolve().parents[1]
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMANDS = re.compile(r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE)
+ONLY_PARSED = {
+    "--scheduler": "needs a cluster; test_engine_cluster runs sweeps on one",
+    "check experiments/regression.yaml": "takes minutes; .ci/run runs it as it stands",
+    "validate --figures": "needs an installed camera blaze101; test_validate runs --figures",
+    "validate --capture captures/wall --camera blaze101": "needs an installed camera blaze101",
+    "validate --board plate": "takes minutes; test_validate_board runs --board on a smaller plate",
+}
+
+
+def commands_in(path: Path) -> Iterator[list[str]]:
+    """Yield the programs' commands in a document, each once, as words."""
+    for command in dict.fromkeys(COMMANDS.findall(path.read_text().replace("\\\n", " "))):
+        words = shlex.split(command)
+        if words[0] in programs() and words[1:] and "..." not in command:
+            yield words
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_every_command_is_understood(path: Path):
+    for name, *given in commands_in(path):
+        assert importlib.import_module(f"harness.{name}").main.parser().parse_args(given), given
+
+
+def block_of(document: str, first_line: str) -> str:
+    """Return the indented block of a document that begins with a line."""
+    text = (ROOT / document).read_text()
+    lines = text[text.index(f"    {first_line}\n") :].splitlines()
+    inside = itertools.takewhile(lambda line: line.startswith("    ") or not line, lines)
+    return textwrap.dedent("\n".join(inside))
+
+
+def test_the_taste_of_the_readme_is_what_the_program_prints(capsys):
+    """Numbers may change with the stored limits; every line must still be there."""
+    shown = block_of("README.md", "$ tofpod ask --damage hole --size 7mm --distance 1m --camera azure_kinect_nfov")
+    command, *lines = shown.strip().splitlines()
+    assert main(shlex.split(command)[2:]) == 0
+
+    def form(line: str) -> str:
+        return " ".join(re.sub(r"\b(yes|no|undecided)$", "?", re.sub(r"[0-9.]+", "0", line)).split())
+
+    assert [form(line) for line in lines] == [form(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
+
+
+def test_the_documented_detector_keeps_the_contract(monkeypatch):
+    detector = types.ModuleType("acme_inspection.detector")
+    exec(block_of("docs/extending.md", "# acme_inspection/detector.py"), detector.__dict__)
+    monkeypatch.setitem(sys.modules, "acme_inspection", types.ModuleType("acme_inspection"))
+    monkeypatch.setitem(sys.modules, "acme_inspection.detector", detector)
+    tests: dict[str, Any] = {}
+    exec(block_of("docs/extending.md", "from harness.testing import check_detector"), tests)
+    tests["test_contract"]()
+
+
+def test_the_documented_gate_is_a_valid_study(tmp_path):
+    (tmp_path / "limit.yaml").write_text(block_of("docs/ci_gate.md", "# tests/limit.yaml"))
+    experiment = load_experiment(tmp_path / "limit.yaml", ("detector.name=thesis",))
+    assert experiment.config.study is not None and experiment.config.name == "acme_limit"
+    compile(block_of("docs/ci_gate.md", "# tests/test_limit.py"), "test_limit.py", "exec")
+
+
+# ---- small experiments -----------------------------------------------------------------------------------------------
+
+BOARD = "source.target.board={width_mm: 190, height_mm: 130, thickness_mm: 12.7}"
+SMALL_STUDY = (
+    *("study.boards=4", "study.hole_free_boards=2", "threshold.calibrate={boards: 4, false_calls_per_m2: 20}"),
+    *(BOARD, "source.render={bounces: 0}", "sweep={capture.frames: [1, 50]}"),
+)
+SMALL_REPEATS = ("repeats=2", "threshold.calibrate.repeats=2", "source.render={bounces: 0}", "sensitivity=null")
+SMALL = {
+    "detection_limit": (*SMALL_STUDY, "source.target.damage={kind: through, per_board: 4, diameter_mm: [2, 12]}"),
+    "detectors": (*SMALL_STUDY, "sweep={detector.name: [thesis, matched]}"),
+    "today": (*SMALL_STUDY, "sweep={source.camera.name: [azure_kinect_nfov, pmd_flexx2]}"),
+    "pipe": (*SMALL_STUDY[:3], "source.render={bounces: 0}"),
+    "averaging": (*SMALL_REPEATS, "sweep={capture.frames: [1, 5]}"),
+    "cameras": (*SMALL_REPEATS, "sweep={source.camera.name: [azure_kinect_nfov, kinect_v2]}"),
+    "anatomy": ("repeats=2", "threshold.calibrate.repeats=2", "capture.exact=false", "sweep={capture.frames: [1]}"),
+    "perspectives": (*SMALL_REPEATS, "capture.frames=5", "sweep={mapping.views: [1, 2]}"),
+}
+MORE = {
+    "implant": ("--targets", "8", "--hit-radius", "6"),
+    "gauge": ("--targets", "24"),
+    "design": ("--studies", "20"),
+    "dataset": ("--serial", "--boards", "10"),
+    "sweep": ("--serial",),
+    "efficiency": ("--serial",),
+    "coverage": ("--serial",),
+}
+
+
+def shrunk(name: str, given: list[str]) -> list[str]:
+    """Return a command's arguments with those that make it small; what the document states comes later and counts."""
+    small = SMALL.get(Path(given[0]).stem, ()) if name in ("sweep", "export", "dataset", "coverage") else ()
+    settings = [word for change in small for word in ("--set", change)]
+    return [given[0], *settings, *given[1:], *MORE.get(name, ())]
+
+
+# ---- small recordings ------------------------------------------------------------------------------------------------
+
+
+def write_capture(folder: Path, depth_m: list[np.ndarray], lens: Lens, rgb: np.ndarray | None = None) -> None:
+    """Depth pictures in millimetres, colour where there is some, and the lens, as Open3D's recorder stores them."""
+    pictures = [("depth", [np.rint(np.nan_to_num(z_m) / MM).astype(np.uint16) for z_m in depth_m])]
+    pictures += [] if rgb is None else [("color", len(depth_m) * [np.ascontiguousarray(rgb[..., ::-1])])]
+    for name, images in pictures:
+        (folder / name).mkdir(parents=True)
+        for number, image in enumerate(images):
+            assert cv2.imwrite(str(folder / name / f"{number:05d}.png"), image)
+    sizes = {"width": lens.width, "height": lens.height, "intrinsic_matrix": lens.matrix.T.ravel().tolist()}
+    (folder / "intrinsic.json").write_text(json.dumps(sizes))
+
+
+def simulated(home: Path, place: str, distance_m: float, offset_mm: float, hole_mm: float = 0.0) -> None:
+    """50 frames of an Azure Kinect before a small board; one with a hole stands before a wall."""
+    holes = [{"id": 1, "diameter_mm": hole_mm, "centre_mm": [10, 5]}] if hole_mm else []
+    board = {"width_mm": 190, "height_mm": 150, "thickness_mm": 12.7}
+    pose = {"distance_m": distance_m, "tilt_x_deg": 4, "tilt_y_deg": 3, "offset_x_mm": offset_mm}
+    target = tofpod.target({"name": "custom", "board": board, "holes": holes, "pose": pose})
+    unit = tofpod.render(target, "azure_kinect_nfov", bounces=0, cache=home / "results" / ".cache" / "renders")
+    lens = unit.camera.nominal_lens
+    cut, rng, whole = unit.region.within(lens.whole), np.random.default_rng(len(place)), []
+    for frame in tofpod.frames(unit, 50, seed=int(rng.integers(99))).frames():
+        z_m = rng.normal(1.3, 2 * MM, lens.whole.shape) * bool(holes)
+        z_m[cut] = np.where(np.isfinite(frame.z_m), frame.z_m, z_m[cut])
+        whole.append(z_m)
+    write_capture(home / place, whole, lens)
+
+
+def seen_at(cloud: Cloud, count: int = 5) -> list[np.ndarray]:
+    """Frames (h, w) of z with noise."""
+    rng = np.random.default_rng(1)
+    return [cloud.points_m[..., 2] + rng.normal(0, 0.5 * MM, cloud.valid.shape) for _ in range(count)]
+
+
+WALLS = [
+    "near1",
+    "near2",
+    "near3",
+    "far1",
+    "far2",
+    "far3",
+    *(f"captures/{n}" for n in ("near", "shifted", "far", "wall")),
+]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the documents' commands read."""
+    home = tmp_path_factory.mktemp("documents")
+    (home / "experiments").symlink_to(ROOT / "experiments")
+    (home / "study.yaml").write_text(STUDY.replace("name: tiny", "name: study"))
+    for number, place in enumerate(WALLS):
+        simulated(home, place, 0.8 if "far" in place else 0.5, 15.0 * (number % 3))
+    shutil.copytree(home / "captures" / "wall", home / "captures" / "part")
+    simulated(home, "captures/board", 0.5, 0.0, hole_mm=16.0)
+
+    flat = casting(home / "casting.stl")
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 0.5
+    cloud = casting_seen(flat, T, 0.0, dent_mm=3.0)
+    write_capture(home / "captures" / "casting", seen_at(cloud), cloud.lens)
+
+    codes, tapes = tags({key: (x, y + 0.02) for key, (x, y) in PLACES.items()}), strips(marked_board.STRIPS_M)
+
+    def paint(xy: np.ndarray) -> np.ndarray:
+        over, under = codes(xy), tapes(xy)
+        return np.where((over == codes(np.full_like(xy, 9.0))), under, over)
+
+    wide = replace(LENS, width=480, height=260, cx=239.5, cy=129.5)
+    for name, turn_deg in (("left", -8.0), ("right", 9.0)):
+        view = marked_cloud(board_pose(3.0, turn_deg), paint, samples=2, lens=wide)
+        write_capture(home / name, seen_at(view), wide, view.rgb)
+    for name, turn_deg in (("A", 3.0), ("B", 18.0), ("C", -15.0)):
+        marked_board.write_view(home / name, marked_board.T_camera_board(turn_deg), seed=1)
+
+    wall_mm = (np.random.default_rng(number).normal(700, 2, (576, 640)) for number in range(6))
+    pictures = [{"DEPTH": mm.astype(np.uint16), "IR": np.full(mm.shape, 900, np.uint16)} for mm in wall_mm]
+    write_mkv(home / "recording.mkv", pictures, attached=calibration())
+
+    rng = np.random.default_rng(4)
+    size = rng.uniform(1, 9, 80)
+    found = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
+    table = pd.DataFrame({"length": size, "length_mm": size, "diameter_mm": size, "hit": found.astype(int)})
+    table = table.assign(found=table["hit"], inspector_A=table["hit"], inspector_B=table["hit"])
+    table = table.assign(hole=range(80), board=[f"b{n // 20}" for n in range(80)])
+    table = table.assign(depth=0.2 * size + rng.normal(0, 0.1, 80))
+    for name in ("inspections.csv", "holes.csv"):
+        table.to_csv(home / name, index=False)
+    table.to_excel(home / "inspections.xlsx", index=False)
+    return home
+
+
+# ---- the commands ----------------------------------------------------------------------------------------------------
+
+
+def filled(words: list[str], home: Path) -> list[str]:
+    """Return words as a shell and a reader would fill them in: patterns of names, and the digests of results."""
+    whole = []
+    for word in words:
+        pattern = re.sub(r"<\w+>|\bDIGEST\b", "*", word)
+        names = sorted(name for name in glob.glob(pattern, root_dir=home) if not name.endswith("/latest"))
+        if "<another>" in word:
+            names = names[1:]
+        if pattern == word and "*" not in word:
+            whole.append(word)
+        elif names:
+            whole += names if "_0*" in word or "part*" in word else names[:1]
+        else:  # a folder that the command makes, named as the one before it
+            whole.append(str(Path(word).parent / Path(whole[-2]).name))
+    return [{"NAME": "azure_kinect_nfov"}.get(word, word) for word in whole]
+
+
+def prepare(command: str, home: Path) -> None:
+    """Make what a person makes between two commands."""
+    if command.startswith("score maps"):
+        for name in tiny_dataset.names_in(home / "boards"):
+            damage = tiny_dataset.arrays_of(home / "boards", name)["damage"]
+            path = home / "maps" / f"{name}.npy"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if "/train/" not in name:
+                np.save(path, np.random.default_rng(1).normal(size=damage.shape) + 6.0 * (damage > 0))
+    if command.startswith("compare scores_a"):
+        for name in ("scores_a", "scores_b"):
+            shutil.copytree(home / "scores", home / name)
+    if command == "compare A B":
+        for name, run in zip("AB", sorted(home.glob("results/detection_limit/*[!t]")), strict=False):
+            shutil.rmtree(home / name)
+            (home / name).symlink_to(run)
+    if command.startswith("detect captures/gauge"):
+        captured(home / "captures" / "gauge", read_gauge(home / "gauge" / "gauge.json"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [path for path in TEXTS if any(commands_in(path))], ids=lambda path: path.name)
+def test_every_command_runs(path: Path, inputs: Path, tmp_path: Path, monkeypatch, capfd):
+    home = tmp_path / "home"
+    shutil.copytree(inputs, home, symlinks=True, copy_function=os.link, ignore=lambda *_: ["results"])
+    (inputs / "results").mkdir(exist_ok=True)
+    (home / "results").symlink_to(inputs / "results")
+    for name, text in re.findall(r"\n    # (\w+\.yaml)\n((?:    .*\n)+)", path.read_text()):
+        (home / name).write_text(textwrap.dedent(text))
+    monkeypatch.chdir(home)
+    monkeypatch.setattr(coverage, "BOARDS", 3)
+    monkeypatch.setattr(coverage, "DRAWS", 2)
+    for name, *given in commands_in(path):
+        command = shlex.join([name, *given])
+        if not any(part in command for part in ONLY_PARSED):
+            prepare(command, home)
+            code = main([name, *shrunk(name, filled(given, home))])
+            assert code == 0, f"{command}\n{''.join(capfd.readouterr())}"
+
+
+@pytest.mark.slow
+def test_the_python_of_the_documents_runs(inputs: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results").symlink_to(inputs / "results")
+    run = tofpod.sweep
+    monkeypatch.setattr(tofpod, "sweep", lambda name, *changes: run(name, *changes, *SMALL["detection_limit"]))
+    exec(block_of("docs/python.md", "import tofpod"), {})
+    assert {path.name for path in tmp_path.iterdir()} == {"results", "found.png", "pod.png"}
+
+
+def test_what_is_only_parsed_is_in_a_document():
+    commands = {shlex.join(words) for path in TEXTS for words in commands_in(path)}
+    assert all(any(part in command for command in commands) for part in ONLY_PARSED)
