@@ -47,6 +47,12 @@ HALF_CHORDS = np.diff(_THETA / 2 + np.sin(2 * _THETA) / 4) / np.diff(EDGES)  # m
 MIDDLES = 0.5 * (EDGES[:-1] + EDGES[1:])
 
 
+def normal_of(per_px_m: np.ndarray) -> np.ndarray:
+    """Return the vector product (3,) of a surface's derivatives by u and v (2, 3)."""
+    (ax, ay, az), (bx, by, bz) = per_px_m.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, share: float = 1.0) -> np.ndarray:
     """Return the place (8,) from where a hole is seen and lit, reduced to what moves in the image: the cosine between
     ray and normal, times the ray's length per z; the drift along u and v; the shrinking; the beam along u and v; the
@@ -57,7 +63,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
     shrinking), and smaller by that divisor. Light that comes back from depth h came in at beam * h / (h + height) from
     it.
     """
-    normal = np.cross(per_px_m[0], per_px_m[1])
+    normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]
     slopes_per_px = ((per_px_m - np.outer(per_px_m[:, 2], ray)) / z)[:, :2].T
@@ -70,7 +76,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
     """Return the sight along z from everywhere at once, lit likewise: a parallel projection of unknown origin."""
-    normal = np.cross(per_px_m[0], per_px_m[1])
+    normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])
     return np.array([normal[2], *drift, 0.0, 0.0, 0.0, 1.0, 1.0])

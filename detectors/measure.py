@@ -16,7 +16,16 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from detectors.clusters import PLAIN
-from detectors.hole_model import MOST_MISFIT, HoleFit, HolePatch, fit_hole, pictures, sight, straight_sight
+from detectors.hole_model import (
+    MOST_MISFIT,
+    HoleFit,
+    HolePatch,
+    fit_hole,
+    normal_of,
+    pictures,
+    sight,
+    straight_sight,
+)
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, sigma_of
@@ -151,9 +160,9 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
     v, u = np.nonzero(near)
     if not weight.sum() > 0:
         return np.nan, np.nan, np.full(3, np.nan)
-    moments = (
-        np.atleast_2d(np.cov(np.stack([u, v]), aweights=weight, ddof=0)) - np.diag(np.square(around.patch.blur_px)) / 12
-    )
+    places, weight = np.stack([u, v]), weight / weight.sum()
+    places = places - (places @ weight)[:, None]
+    moments = (places * weight) @ places.T - np.diag(np.square(around.patch.blur_px)) / 12
     variances, axes = np.linalg.eigh(around.per_px_m.T @ moments @ around.per_px_m)
     # of the three the one nearest to 0 is that across the surface
     width_m, length_m = (float(np.sqrt(12.0 * max(each, 0.0))) for each in (sorted(variances)[-2], variances[-1]))
@@ -180,7 +189,7 @@ class _Surroundings:
     @property
     def area_m2(self) -> float:
         """Area of one pixel on the surface."""
-        return float(np.linalg.norm(np.cross(*self.per_px_m)))
+        return float(np.linalg.norm(normal_of(self.per_px_m)))
 
     def placed(self, measured: Measurement, u: float, v: float) -> Measurement:
         """Return the measurement, placed at a patch position."""
@@ -256,7 +265,7 @@ def local_plane(
         slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
         centre = slopes * z
         per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
-    if not np.linalg.norm(np.cross(*per_px)) > 1e-12:
+    if not np.linalg.norm(normal_of(per_px)) > 1e-12:
         return None
     return centre, per_px
 
@@ -282,9 +291,9 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
         return None, "the model of a blurred hole does not fit"
     fit = fit_hole(patch, u0, v0, radius, around.sign * around.peak_m, around.offset_m)
     h, w = own.shape
-    reach = np.pad(grown(own, around.reach_px + 1), 1)
-    at = np.clip(np.round([fit.v_px + 1, fit.u_px + 1]), 0, [h + 1, w + 1]).astype(int)
-    if not (fit.converged and reach[at[0], at[1]] and fit.misfit < MOST_MISFIT):
+    row, column = round(fit.v_px), round(fit.u_px)
+    is_near = 0 <= row < h and 0 <= column < w and grown(own, around.reach_px + 1)[row, column]
+    if not (fit.converged and is_near and fit.misfit < MOST_MISFIT):
         return None, "the model of a blurred hole does not fit"
     if abs(fit.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep

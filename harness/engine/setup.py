@@ -365,7 +365,8 @@ def pixel_areas(places_m: np.ndarray) -> np.ndarray:
         up, down = max(v - 1, 0), min(v + 1, h - 1)
         for u in range(w):
             left, right = max(u - 1, 0), min(u + 1, w - 1)
-            along, across = places_m[v, right] - places_m[v, left], places_m[down, u] - places_m[up, u]
-            area = abs(along[0] * across[1] - along[1] * across[0])
+            ax, ay = places_m[v, right, 0] - places_m[v, left, 0], places_m[v, right, 1] - places_m[v, left, 1]
+            bx, by = places_m[down, u, 0] - places_m[up, u, 0], places_m[down, u, 1] - places_m[up, u, 1]
+            area = abs(ax * by - ay * bx)
             areas[v, u] = area / ((right - left) * (down - up))
     return areas

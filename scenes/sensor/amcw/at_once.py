@@ -133,7 +133,7 @@ def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
 def add_linear_frames(  # type: ignore[no-untyped-def]
     shape, linear, words, given, given_at, errors, counted, total, squares
 ):
-    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear``: z less base, and its square, in steps, (n,).
+    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z less base, and its square, in steps.
 
     ``words`` (n lanes,) int8: random bytes, in whose place ``given`` (g, lanes) normals stand where ``given_at`` (n,)
     is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps of half

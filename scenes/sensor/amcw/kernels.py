@@ -21,9 +21,9 @@ OUTSIDE = f4(-1)  # amplitude of what is beyond the border or saturated: below e
 STRIDE = 2128
 """Longest padded row of an image; not a power of two, whose multiples share the cache's lines (a factor of 4 in time
 where memory lands badly)."""
-LANES = 32
-"""Frames of a listed pixel that are drawn together, whether they all count or not: a loop of 32 becomes vector code,
-a shorter one, of 16, a list of single steps, five times as slow."""
+LANES = 56
+"""Frames of a listed pixel that are drawn together, whether they all count or not: 50 frames, the usual number, in one
+go. Loops of 8 n frames become vector code from n = 4 on; 16 frames take a list of single steps, five times as long."""
 BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
 
 

@@ -23,8 +23,9 @@ from scenes.sensor.normals import FAST
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
 
-DEVIATIONS = 5.5
-"""Distance from a limit, in deviations, at which it is never met: 2e-8 a frame, and few pixels are just so far off."""
+DEVIATIONS = 4.5
+"""Distance from a limit, in deviations, at which it is taken never to be met: 3e-6 a frame, of the few pixels that are
+just so far off."""
 NOISY = 0.35  # phase noise in radians above which a pixel's phase is no longer a normal about its mean
 LITTLE = 0.004  # c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work
 SMALLEST = 1e-12
