@@ -109,11 +109,11 @@ class Quadrilaterals:
         return self._placed(rows, cols, fx.ravel(), fy.ravel())
 
     def _placed(self, rows: np.ndarray, cols: np.ndarray, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights."""
-        fx, fy, corner = fx[None, :, None], fy[None, :, None], self.corner
-        c00, c01 = corner[rows, cols][:, None], corner[rows, cols + 1][:, None]
-        c10, c11 = corner[rows + 1, cols][:, None], corner[rows + 1, cols + 1][:, None]
-        return np.asarray((1 - fy) * ((1 - fx) * c00 + fx * c01) + fy * ((1 - fx) * c10 + fx * c11))
+        """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights: bilinear, as one product of matrices
+        for each component."""
+        c00, c01, c10, c11 = (self.corner[rows + i, cols + j].T for i in (0, 1) for j in (0, 1))
+        factors = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
+        return np.moveaxis(factors @ np.stack([np.ones(len(fx)), fx, fy, fx * fy]), 0, -1)
 
 
 class Beams:

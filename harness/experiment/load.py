@@ -83,7 +83,7 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     listed = shape.get(data, swept)
     named: list[KeyPath] = [checks.CAMERA_NAME]
     named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
-    files: list[KeyPath] = [(*checks.TARGET, "file"), (*checks.TARGET, "board", "shape", "file")]
+    files = [(*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))]
     if shape.get(data, ("source", "kind")) == "capture":
         files += [("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))]
         files += [] if shape.get(data, ("source", "intrinsics")) in camera_names() else [("source", "intrinsics")]

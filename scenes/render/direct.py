@@ -3,7 +3,7 @@ Sub-rays of a footprint have equal weight; beside their sums stands what the ind
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numba
@@ -215,97 +215,116 @@ def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[
     return np.asarray(series * np.exp(1j * waves * about_m))
 
 
+class _Sums:
+    """Sums of direct light over a region's pixels, flat, while they are made: fields as of `DirectLight`. What is added
+    to a pixel replaces what was there."""
+
+    def __init__(
+        self,
+        lit: LitScene,
+        slopes: np.ndarray,
+        footprint: Quadrilaterals | Beams,
+        frequencies_hz: tuple[float, ...],
+    ) -> None:
+        self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
+        self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(frequencies_hz)
+        self.rows, self.cols = np.divmod(np.arange(h * w), w)
+        self.central = cast(lit, self.slopes)
+        self.phasor, self.face = np.zeros((lines, h * w), complex), np.zeros((lines + 1, h * w), complex)
+        self.intensity, self.coverage, self.face_range_m = np.zeros(h * w), np.ones(h * w), np.zeros(h * w)
+        self.off_face: list[OffFace] = []
+
+    def add_plane(self, here: np.ndarray) -> None:
+        """Add the light of pixels that see one plane, from what their centres met."""
+        lit, central, frequencies = self.lit, self.central, self.frequencies_hz
+        rays, range_m = self.footprint.coarse(self.rows[here], self.cols[here]), central.range_m[here].astype(float)
+        ray = np.column_stack([self.slopes[here], np.ones(len(here))])
+        centre = ray * (range_m / np.linalg.norm(ray, axis=1))[:, None]
+        albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
+        plain = np.where(central.surface[here] == lit.textured, -1.0, albedo)
+        texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
+        normal = central.normal[here].astype(float)
+        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, to_light, to_face)
+        to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
+        self.phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies)
+        self.intensity[here] = to_light[0]
+        on = central.on_face[here]
+        self.face[:-1, here[on]] = _of_moments(to_face[:, on], range_m[on], frequencies)
+        self.face[-1, here[on]], self.face_range_m[here[on]] = to_face[0, on], range_m[on]
+        self._keep_off_face(here[~on], np.ones((int((~on).sum()), rays.shape[1]), bool), rays[~on])
+
+    def add_rays(self, here: np.ndarray, rays: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
+        """Add the light of sub-rays (n, m, 2) of pixels. Returns those of ``again`` (h w,) bool in which too large an
+        error is left: they are to be divided once more."""
+        m = rays.shape[1]
+        hits = cast(self.lit, rays.reshape(-1, 2))
+        amplitude, range_m, path_m, surface, albedo, on_face = (
+            each.reshape(-1, m)
+            for each in (hits.amplitude, hits.range_m, hits.path_m, hits.surface, hits.albedo, hits.on_face)
+        )
+        self.phasor[:, here] = phasor_sums(amplitude, path_m, self.frequencies_hz)
+        self.intensity[here] = amplitude.mean(axis=1, dtype=float)
+        self.coverage[here] = (surface == self.central.surface[here, None]).mean(axis=1)
+        some = on_face.any(axis=1)
+        chosen = here[some]
+        lit_albedo, to_face = (np.where(on_face[some], each[some], 0.0) for each in (albedo, range_m))
+        self.face[:, here], self.face_range_m[here] = 0, 0
+        self.face[:-1, chosen] = phasor_sums(lit_albedo, to_face, self.frequencies_hz)
+        self.face[-1, chosen] = lit_albedo.mean(axis=1)
+        self.face_range_m[chosen] = to_face.sum(axis=1) / on_face[some].sum(axis=1)
+        unsure = np.zeros(len(here), bool)
+        if again is not None:
+            unsure = again[here]
+            unsure[unsure] = _error_m(amplitude[unsure], path_m[unsure]) > UNSURE_M
+        self._keep_off_face(here[~unsure], (~on_face & (surface >= 0))[~unsure], rays[~unsure])
+        return here[unsure]
+
+    def _keep_off_face(self, here: np.ndarray, off: np.ndarray, rays: np.ndarray) -> None:
+        counts, (row, column) = off.sum(axis=1), np.nonzero(off)
+        some, kept = counts > 0, np.stack([rays[row, column, k].astype(np.float32) for k in (0, 1)], axis=1)
+        self.off_face.append(OffFace(here[some], counts[some], counts[some] / off.shape[1], kept))
+
+
 def direct_light(
     lit: LitScene,
     slopes: np.ndarray,
     footprint: Quadrilaterals | Beams,
     frequencies_hz: tuple[float, ...],
     closely: np.ndarray | None = None,
+    roughly: np.ndarray | None = None,
 ) -> DirectLight:
     """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2). Rays are cast to pixels'
     centres and corners; where these meet one plane, evenly lit, the pixel's light follows from it. Elsewhere sub-rays
     are cast: few on a bent surface, many where a footprint meets an edge or a shadow's edge and in the pixels
-    ``closely`` (h, w), and there once more where that leaves an error. A pixel that is divided again replaces what was
-    there."""
-    (h, w), lines = slopes.shape[:2], len(frequencies_hz)
-    n = h * w
-    rows, cols = np.divmod(np.arange(n), w)
-    central = cast(lit, slopes.reshape(-1, 2))
-    phasor, face = np.zeros((lines, n), complex), np.zeros((lines + 1, n), complex)
-    intensity, coverage, face_range_m = np.zeros(n), np.ones(n), np.zeros(n)
-    unsure, seen = np.zeros(n, bool), np.zeros(n, bool)
-    passes: list[tuple[np.ndarray, np.ndarray, int, np.ndarray]] = []
-
-    def add(here: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cast sub-rays (n, m, 2) of pixels; returns their amplitudes and paths (n, m)."""
-        m = rays.shape[1]
-        hits = cast(lit, rays.reshape(-1, 2))
-        amplitude, range_m, path_m, surface, albedo, on_face = (
-            each.reshape(-1, m)
-            for each in (hits.amplitude, hits.range_m, hits.path_m, hits.surface, hits.albedo, hits.on_face)
-        )
-        phasor[:, here] = phasor_sums(amplitude, path_m, frequencies_hz)
-        intensity[here] = amplitude.mean(axis=1, dtype=float)
-        coverage[here] = (surface == central.surface[here, None]).mean(axis=1)
-        some = on_face.any(axis=1)
-        chosen, without = here[some], here[~some]
-        lit_albedo, to_face = (np.where(on_face[some], each[some], 0.0) for each in (albedo, range_m))
-        face[:, without], face_range_m[without] = 0, 0
-        face[:-1, chosen], face[-1, chosen] = phasor_sums(lit_albedo, to_face, frequencies_hz), lit_albedo.mean(axis=1)
-        face_range_m[chosen] = to_face.sum(axis=1) / on_face[some].sum(axis=1)
-        off = ~on_face & (surface >= 0)
-        passes.append((here, off.sum(axis=1), m, rays[off].astype(np.float32)))
-        return amplitude, path_m
-
-    def add_even(here: np.ndarray) -> None:
-        """Add the light of pixels that see one plane."""
-        rays, central_m = footprint.coarse(rows[here], cols[here]), central.range_m[here].astype(float)
-        ray = np.column_stack([slopes.reshape(-1, 2)[here], np.ones(len(here))])
-        centre = ray * (central_m / np.linalg.norm(ray, axis=1))[:, None]
-        albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
-        textured = central.surface[here] == lit.textured
-        texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
-        normal, plain = central.normal[here].astype(float), np.where(textured, -1.0, albedo)
-        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, to_light, to_face)
-        to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
-        phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies_hz)
-        intensity[here] = to_light[0]
-        on = central.on_face[here]
-        face[:-1, here[on]] = _of_moments(to_face[:, on], central_m[on], frequencies_hz)
-        face[-1, here[on]], face_range_m[here[on]] = to_face[0, on], central_m[on]
-        counts = np.where(on, 0, rays.shape[1])
-        passes.append((here, counts, rays.shape[1], rays[~on].reshape(-1, 2).astype(np.float32)))
-
+    ``closely`` (h, w), and there once more where that leaves an error; few at the edges in the pixels ``roughly``."""
+    shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
+    central, rows, cols = sums.central, sums.rows, sums.cols
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
     edge |= False if closely is None else closely
     reach = 2 * footprint.reach_px + 1
-    fine = ndimage.binary_dilation(edge, np.ones((reach, reach), bool)).ravel()
-    met, bent = central.surface >= 0, bend_m.ravel() > BENT_M
-    add_even(np.flatnonzero(~fine & ~bent & met))
-    for here in _chunks(np.flatnonzero(~fine & bent), COARSE**2):
-        add(here, footprint.coarse(rows[here], cols[here]))
-    for here in _chunks(np.flatnonzero(fine), FINE):
-        unsure[here] = _error_m(*add(here, footprint.fine(rows[here], cols[here]))) > UNSURE_M
-    unsure &= False if closely is None else closely.ravel()
-    for here in _chunks(np.flatnonzero(unsure), FINEST):
-        add(here, footprint.fine(rows[here], cols[here], FINEST))
-    # the sub-rays off the face of the last division of each pixel
-    off_face = []
-    for here, counts, m, rays in reversed(passes):
-        new = ~seen[here] & (counts > 0)
-        seen[here] = True
-        off_face.append((here[new], counts[new], counts[new] / m, rays[np.repeat(new, counts)]))
+    edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
+    fine = edge if roughly is None else edge & ~roughly
+    rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
+    sums.add_plane(np.flatnonzero(rest & ~bent & (central.surface >= 0)))
+    for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
+        sums.add_rays(here, footprint.coarse(rows[here], cols[here]))
+    again = None if closely is None else closely.ravel()
+    edges = _chunks(np.flatnonzero(fine), FINE)
+    unsure = [sums.add_rays(here, footprint.fine(rows[here], cols[here]), again) for here in edges]
+    for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
+        sums.add_rays(here, footprint.fine(rows[here], cols[here], FINEST))
+    off = (np.concatenate([getattr(each, f.name) for each in sums.off_face]) for f in fields(OffFace))
     return DirectLight(
-        phasor=phasor.reshape(-1, h, w),
-        intensity=intensity.reshape(h, w),
-        range_m=central.range_m.reshape(h, w).astype(float),
-        surface=central.surface.reshape(h, w),
-        uv=central.uv.reshape(h, w, 2),
-        coverage=coverage.reshape(h, w).astype(np.float32),
-        fine=fine.reshape(h, w),
-        face=face.reshape(-1, h, w),
-        face_range_m=face_range_m.reshape(h, w),
-        off_face=OffFace(*(np.concatenate(each) for each in zip(*off_face, strict=True))),
+        phasor=sums.phasor.reshape(-1, *shape),
+        intensity=sums.intensity.reshape(shape),
+        range_m=central.range_m.reshape(shape).astype(float),
+        surface=central.surface.reshape(shape),
+        uv=central.uv.reshape(*shape, 2),
+        coverage=sums.coverage.reshape(shape).astype(np.float32),
+        fine=fine,
+        face=sums.face.reshape(-1, *shape),
+        face_range_m=sums.face_range_m.reshape(shape),
+        off_face=OffFace(*off),
     )
 
 

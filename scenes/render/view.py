@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
@@ -104,7 +105,7 @@ def gather_at_points(
         point, origin, direction, seen = drawn(place, u1, u2)
         return point, origin, direction, seen / dr.gather(mi.Float, density, cell)
 
-    return _gather(lit, start, np.full(len(points_m), samples), work, on_surface=True, bright=bright)
+    return _gather(lambda longest: _Walk(lit, start, work, True, bright, longest), np.full(len(points_m), samples))
 
 
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
@@ -123,7 +124,8 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int 
         slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
         return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0)), 1.0
 
-    return _gather(lit, start, np.broadcast_to(np.asarray(samples), rays.pixel.shape), work, on_surface=False)
+    counts_of_paths = np.broadcast_to(np.asarray(samples), rays.pixel.shape)
+    return _gather(lambda longest: _Walk(lit, start, work, False, None, longest), counts_of_paths)
 
 
 def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
@@ -140,8 +142,9 @@ def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
     change dH turns the phase by Im(dH / H); frequencies are fused with the least-squares weights c f_k / (4 pi sum
     f^2)."""
     f = np.array(frequencies_hz)[:, None]
-    turn = np.imag(np.divide(change, total, out=np.zeros(change.shape, complex), where=np.abs(total) > 0))
-    return np.asarray((SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turn).sum(axis=-2))
+    weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
+    by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
+    return np.asarray((change.real * by_light.imag + change.imag * by_light.real).sum(axis=-2))
 
 
 def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
@@ -186,99 +189,129 @@ def _towards(
     return direction, dr.select(cosine > 0, dr.select(before, 2 / (1 + ratio), 1), 0)
 
 
-def _gather(
-    lit: LitScene,
-    start: Any,
-    samples: np.ndarray,
-    work: PathWork,
-    *,
-    on_surface: bool,
-    bright: np.ndarray | None = None,
-) -> np.ndarray:
-    """Walk ``samples`` (n,) paths from each place; returns the light (BATCHES, f + 1, n) complex64 of each batch,
-    frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in `NoiseFreeView`, without the
-    place's albedo where the start was a surface point, with it where the start was the lens. ``start`` (place, u1, u2):
-    point from which the path's length counts, origin, direction and weight of the first ray. ``on_surface``: light that
-    reaches the first hit directly counts (for a start at the lens it is the direct part), and all places share one
-    rotation of the low-discrepancy points (modulo 1). Cosine-weighted directions cancel cos/pi of a Lambertian surface,
-    so each bounce multiplies by its albedo and, where it is glossy, by `LitScene.lobe`."""
-    import drjit as dr
+class _Lanes(NamedTuple):
+    """Lanes of a walk, Dr.Jit arrays: each walks ``count`` paths of a place and batch, from number ``first`` on."""
 
-    mi, bounces, seed = lit.mi, work.bounces, work.seed
-    lines, per_batch = len(work.frequencies_hz), np.maximum(samples // BATCHES, 1)
-    dimensions, longest = START_DIMENSIONS + PER_VERTEX * (bounces + 1), int(per_batch.max())
-    table = mi.Float(_sobol(dimensions, longest, seed))
-    # what differs from board to board is data and no constant of the kernel, which would be compiled anew for each
-    batch_points = dr.opaque(mi.UInt32, longest)
-    aim: Any = None
-    if bright is not None:
-        aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
+    place: Any
+    batch: Any
+    first: Any
+    count: Any
 
-    # lanes for so many paths a batch at each place, and where those of each place and batch begin
-    per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
-    begins = np.cumsum(per_pair) - per_pair
-    pair = np.repeat(np.arange(len(per_pair)), per_pair)
-    of_place, of_batch = np.divmod(pair, BATCHES)
-    begin_at = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
-    lanes = of_place, of_batch, begin_at, np.minimum(per_batch[of_place] - begin_at, PATHS_A_LANE)
 
-    def walk(here: slice) -> np.ndarray:
-        """Return sums over the paths of some lanes: (f + 1, n) complex64, intensity last."""
-        place, batch, first, count = (mi.UInt32(np.ascontiguousarray(each[here], np.uint32)) for each in lanes)
-        rotation_of = batch + BATCHES * (0 if on_surface else place)
+class _Walk:
+    """Paths from places, backwards. ``start`` (place, u1, u2): point from which the path's length counts, origin,
+    direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly counts (for a start
+    at the lens it is the direct part), and all places share one rotation of the low-discrepancy points (modulo 1).
+    ``bright``: as of `gather_at_points`. ``longest``: points a batch at most. What differs from board to board is data
+    and no constant of the kernel, which would be compiled anew for each."""
 
-        def uniform(sample: Any, dimension: Any) -> Any:
-            u = dr.gather(mi.Float, table, (batch * batch_points + first + sample) * dimensions + dimension)
-            u += mi.sample_tea_float32(rotation_of, dimension + seed * 1024, 4)
-            return u - dr.floor(u)
+    def __init__(
+        self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: np.ndarray | None, longest: int
+    ) -> None:
+        import drjit as dr
 
-        def vertex_of(*state: Any) -> tuple[Any, ...]:
-            """Go on by a vertex; a lane whose path ends begins its next one. ``before``: the point from which the ray
-            comes; ``length``: of the path up to there."""
-            sample, vertex, before, before_normal, direction, length, throughput, totals = state
-            fresh = vertex == 0
-            start_point, origin, start_direction, weight = start(place, uniform(sample, 0), uniform(sample, 1))
-            before = dr.select(fresh, start_point, before)
-            origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
-            direction = dr.select(fresh, start_direction, direction)
-            length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
+        self.lit, self.start, self.work, self.on_surface, mi = lit, start, work, on_surface, lit.mi
+        self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
+        self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
+        self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
+        if bright is not None:
+            self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
-            hit = lit.meet(origin, direction)
-            met, normal = hit.valid, hit.normal
-            length = length + dr.select(met, dr.norm(hit.place - before), 0)
-            throughput = throughput * lit.albedo(hit)
-            arriving, leg = lit.arriving(hit, met if on_surface else met & ~fresh)
-            totals = _added(totals, dr.select(met, throughput * arriving, 0), length + leg, work.frequencies_hz)
+    def sums(self, lanes: _Lanes) -> np.ndarray:
+        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last."""
+        import drjit as dr
 
-            more = met & (vertex < bounces) & (throughput > 0)
-            dimension = START_DIMENSIONS + PER_VERTEX * vertex
-            u1, u2 = uniform(sample, dimension), uniform(sample, dimension + 1)
-            direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
-            if aim is not None:
-                # the half of the square that the other choice leaves is a square too
-                wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
-                spread = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
-                aimed, weight = _towards(lit, aim, hit.place, normal, spread, u1, u2)
-                direction = dr.select(fresh, aimed, direction)
-                throughput = throughput * dr.select(fresh, weight, 1)
-            throughput = throughput * lit.reflected(hit, direction)
-            more &= throughput > 0
-            sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
-            return sample, vertex, hit.place, normal, direction, length, throughput, totals
-
-        n, kinds = dr.width(place), (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
+        mi, lines = self.lit.mi, len(self.work.frequencies_hz)
+        n, kinds = dr.width(lanes.place), (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
         state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
-        totals = dr.while_loop(state, lambda sample, *_: sample < count, vertex_of, label="walk")[-1]
+
+        def go_on(*state: Any) -> tuple[Any, ...]:
+            return self._vertex(lanes, *state)
+
+        totals = dr.while_loop(state, lambda sample, *_: sample < lanes.count, go_on, label="walk")[-1]
         dr.eval(totals)
         values = [total.numpy() for total in totals]
         return np.stack([*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]])
 
+    def _vertex(
+        self,
+        lanes: _Lanes,
+        sample: Any,
+        vertex: Any,
+        before: Any,
+        before_normal: Any,
+        direction: Any,
+        length: Any,
+        throughput: Any,
+        totals: list[Any],
+    ) -> tuple[Any, ...]:
+        """Go on by a vertex; a lane whose path ends begins its next one. ``before``: the point from which the ray
+        comes; ``length``: of the path up to there."""
+        import drjit as dr
+
+        lit, mi, fresh = self.lit, self.lit.mi, vertex == 0
+        start = self.start(lanes.place, self._uniform(lanes, sample, 0), self._uniform(lanes, sample, 1))
+        start_point, origin, start_direction, weight = start
+        before = dr.select(fresh, start_point, before)
+        origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
+        direction = dr.select(fresh, start_direction, direction)
+        length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
+
+        hit = lit.meet(origin, direction)
+        met = hit.valid
+        length = length + dr.select(met, dr.norm(hit.place - before), 0)
+        throughput = throughput * lit.albedo(hit)
+        arriving, leg = lit.arriving(hit, met if self.on_surface else met & ~fresh)
+        light = dr.select(met, throughput * arriving, 0)
+        totals = _added(totals, light, length + leg, self.work.frequencies_hz)
+
+        more = met & (vertex < self.work.bounces) & (throughput > 0)
+        dimension = START_DIMENSIONS + PER_VERTEX * vertex
+        u1, u2 = self._uniform(lanes, sample, dimension), self._uniform(lanes, sample, dimension + 1)
+        direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        if self.aim is not None:
+            # the half of the square that the other choice leaves is a square too
+            wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
+            spread = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
+            aimed, weight = _towards(lit, self.aim, hit.place, hit.normal, spread, u1, u2)
+            direction = dr.select(fresh, aimed, direction)
+            throughput = throughput * dr.select(fresh, weight, 1)
+        throughput = throughput * lit.reflected(hit, direction)
+        more &= throughput > 0
+        sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
+        return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
+
+    def _uniform(self, lanes: _Lanes, sample: Any, dimension: Any) -> Any:
+        """Return a co-ordinate of the low-discrepancy point of each lane's path, turned by its place's rotation."""
+        import drjit as dr
+
+        number = lanes.batch * self.batch_points + lanes.first + sample
+        u = dr.gather(self.lit.mi.Float, self.table, number * self.dimensions + dimension)
+        rotation = lanes.batch + BATCHES * (0 if self.on_surface else lanes.place)
+        u += self.lit.mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
+        return u - dr.floor(u)
+
+
+def _gather(walk: Callable[[int], _Walk], samples: np.ndarray) -> np.ndarray:
+    """Walk ``samples`` (n,) paths from each place by ``walk`` (points a batch at most); returns the light
+    (BATCHES, f + 1, n) complex64 of each batch, frequency 0 (intensity) last. Phase counts from the place of gathering
+    on. Units as in `NoiseFreeView`, without the place's albedo where the start was a surface point, with it where the
+    start was the lens. Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce multiplies by
+    its albedo and, where it is glossy, by `LitScene.lobe`."""
+    per_batch = np.maximum(samples // BATCHES, 1)
+    walked = walk(int(per_batch.max()))
+    lines, to_device = len(walked.work.frequencies_hz), walked.lit.mi.UInt32
+    # lanes for so many paths a batch at each place, and where those of each place and batch begin
+    per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
+    begins = np.cumsum(per_pair) - per_pair
+    pair = np.repeat(np.arange(len(per_pair)), per_pair)
+    place, batch = np.divmod(pair, BATCHES)
+    first = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
+    lanes = np.stack([place, batch, first, np.minimum(per_batch[place] - first, PATHS_A_LANE)]).astype(np.uint32)
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
-    sums = np.empty((lines + 1, len(of_place)), np.complex64)
-    for begin in range(0, len(of_place), at_once):
-        here = slice(begin, begin + at_once)
-        sums[:, here] = walk(here)
+    chunks = (lanes[:, begin : begin + at_once] for begin in range(0, lanes.shape[1], at_once))
+    sums = np.concatenate([walked.sums(_Lanes(*map(to_device, chunk))) for chunk in chunks], axis=1)
     by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
     return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
 
@@ -347,11 +380,11 @@ def face_light(
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
     light = gather_at_points(lit, position, normals, work, samples, bright)
-    weights = between_nodes(xs, ys, x_seen, y_seen)
-    share = direct.face[:, seen]
-    few = noise_lines(work.frequencies_hz)
-    batches = np.stack([share[few] * (weights @ batch[few].T).T for batch in light])
-    return share * (weights @ light.mean(axis=0, dtype=complex).T).T, batches
+    few, share = noise_lines(work.frequencies_hz), direct.face[:, seen]
+    at_nodes = np.concatenate([light.mean(axis=0, dtype=complex), *light[:, few]])
+    everywhere = (between_nodes(xs, ys, x_seen, y_seen) @ at_nodes.T).T
+    batches = everywhere[len(share) :].reshape(len(light), len(few), -1)
+    return share * everywhere[: len(share)], share[few] * batches
 
 
 def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
@@ -372,11 +405,15 @@ def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np
 
 RIM_PX = 3
 """Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
+NEAR_PX = 3
+"""Pixels beyond the outline up to which edges behind the board are finely divided: a camera's filter mixes these in."""
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")
 """Kinds of damage that may lie between a pixel's corners and its centre."""
-PILOT_SAMPLES = 128
+PILOT_SAMPLES = 64
 """Paths that tell a pixel's noise, within a third."""
+LEAST_SAMPLES = 128
+"""Paths of a pixel inside the outline at least."""
 PILOT_SEED = 1 << 20
 """Offset that keeps those apart from the ones that count."""
 
@@ -396,19 +433,21 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     lit = lit_scene(mi, target.parts, optics, face_triangles(target))
     slopes = lens.region_slopes(region)
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
-    direct = direct_light(lit, slopes, footprint, optics.frequencies_hz, _at_holes(target, optics, slopes))
+    # pixels within the face's outline as the camera sees it; all, where a part of the outline is out of view
+    outline = transform_points(target.T_camera_board, target.outline_board_m)
+    inside = np.ones(region.shape, bool)
+    if lens.images(outline).all():
+        polygon = np.round(lens.project(outline) - [region.col0, region.row0]).astype(np.int32)
+        inside = cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)
+    about = ndimage.binary_dilation(inside, np.ones((3, 3), bool), NEAR_PX)
+    closely = _at_holes(target, optics, slopes)
+    direct = direct_light(lit, slopes, footprint, optics.frequencies_hz, closely, ~about)
     phasor, intensity, noise_m = direct.phasor, direct.intensity, np.zeros(region.shape)
     rgb = np.zeros((*region.shape, 3), np.float32)
     for index, part in enumerate(target.parts):
         here = direct.surface == index
         rgb[here] = part.rgb_at(direct.uv[here])
     if config.bounces > 0:
-        # pixels within the face's outline as the camera sees it; all, where a part of the outline is out of view
-        outline = transform_points(target.T_camera_board, target.outline_board_m)
-        inside = np.ones(region.shape, bool)
-        if lens.images(outline).all():
-            polygon = np.round(lens.project(outline) - [region.col0, region.row0]).astype(np.int32)
-            inside = cv2.fillPoly(np.zeros(region.shape, np.uint8), [polygon], (1,)).astype(bool)
         indirect, noise_m = indirect_light(lit, target, optics, slopes, direct, inside, config)
         phasor = phasor + indirect[:-1]
         intensity = intensity + indirect[-1].real
@@ -473,15 +512,15 @@ def _samples_inside(
 ) -> int | np.ndarray:
     """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell. The few
     are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean."""
-    if config.hole_samples <= PILOT_SAMPLES:
+    if config.hole_samples <= LEAST_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
     batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
     total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
     noise_m = range_noise_m(batches, total, work.frequencies_hz)
     wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
-    doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
-    return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
+    doublings = np.ceil(np.log2(np.maximum(wanted / LEAST_SAMPLES, 1)) - 0.5)
+    return np.minimum(LEAST_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:

@@ -32,6 +32,9 @@ Chamfer = Annotated[
 ]
 
 
+Close = Annotated[bool, Field(description="whether openings of a mesh with a flat rim are closed by lids")]
+
+
 class FlatConfig(Config):
     """A flat face."""
 
@@ -113,13 +116,8 @@ class RoughConfig(Config):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="drawn anew for every board of a family")
 
 
-class MeshConfig(Config):
-    """The front of a part from a mesh file (`scenes.target.part`); the board's sizes are then those of its bounds."""
-
-    kind: Literal["mesh"]
+class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
-    unit: FileUnit = "mm"
-    front: FrontAxis = "+z"
     content: str = Field("", max_length=32, description="the file's digest; filled in, so that results know the file")
 
     @model_validator(mode="before")
@@ -129,6 +127,15 @@ class MeshConfig(Config):
         if not path.is_file() or data.get("content"):
             return data
         return {**data, "content": file_digest(path)}
+
+
+class MeshConfig(_FileConfig):
+    """The front of a part from a mesh file (`scenes.target.part`); the board's sizes are then those of its bounds."""
+
+    kind: Literal["mesh"]
+    unit: FileUnit = "mm"
+    front: FrontAxis = "+z"
+    close: Close = False
 
 
 ShapeConfig = Annotated[
@@ -241,18 +248,30 @@ class GlossConfig(Config):
     )
 
 
-class MaterialConfig(Config):
-    """The board's reflectance: diffuse, with a grain along x that scales 850 nm and all colours alike; glossy at the
-    camera's wavelength where ``gloss`` says so, on the face and in holes, never on tape."""
+class TextureConfig(_FileConfig):
+    """An image on the face in place of the grain, stretched over width and height as the camera sees them, its first
+    row at the top. Its brightness in linear light (decoded from sRGB) scales the albedo at 850 nm and all colours
+    alike, and its mean becomes the declared albedo. Not modelled: a pattern that differs at 850 nm."""
 
-    albedo_850: Albedo = 0.6
+
+class ReflectanceConfig(Config):
+    """Reflectance of a board: diffuse, with a grain along x or a ``texture`` that scales 850 nm and all colours alike;
+    glossy at the camera's wavelength where ``gloss`` says so, on the face and in holes, never on tape."""
+
+    albedo_850: Albedo = Field(0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
     rgb: Rgb = (0.55, 0.42, 0.28)
     grain_contrast: float = Field(
         0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean, before clipping to 0..1"
     )
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
-    grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
     gloss: GlossConfig | None = None
+    texture: TextureConfig | None = None
+
+
+class MaterialConfig(ReflectanceConfig):
+    """The same with the grain of one board out of all alike."""
+
+    grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 
 
 class BackingConfig(Config):

@@ -192,18 +192,6 @@ _Flawed = DrawnSlots | DrawnGouges | DrawnRound | DrawnCorrosion | DrawnChips
 AnyDrawn = Annotated[_Drilled | _Flawed, Field(discriminator="kind")]
 
 
-class DrawnMaterialConfig(Config):
-    """Reflectance of the boards, as in MaterialConfig, but every board has a grain of its own."""
-
-    albedo_850: custom.Albedo = Field(
-        default=0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found"
-    )
-    rgb: custom.Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = 0.05
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = 8.0
-    gloss: custom.GlossConfig | None = None
-
-
 class DrawnTargetConfig(Config):
     """A family of boards. ``drawn`` gives the full declaration of any board, ``declare`` that of the first damaged
     board. Limits named ``..._mm`` and ``..._deg`` of the pose are the ends of uniform distributions about 0."""
@@ -244,7 +232,9 @@ class DrawnTargetConfig(Config):
         default=8.0, description="about x and about y: as far off frontal as is plausible for a sheet put up by hand"
     )
     roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(default=2.0, description="a board is set down by eye")
-    material: DrawnMaterialConfig = DrawnMaterialConfig()
+    material: custom.ReflectanceConfig = Field(
+        default=custom.ReflectanceConfig(), description="every board has a grain of its own"
+    )
     backing: custom.BackingConfig | None = Field(
         default=custom.BackingConfig(distance_mm=20.0),
         description="as behind the thesis' board. Without a size it fills every hole in every pose that can be drawn",

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_bytes, write_text
+from harness.vocabulary.files import bounded_bytes, write_bytes, write_text
 from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
@@ -45,6 +45,7 @@ TEXEL_MM = 0.6
 """Finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera in view), coarse enough to make in 40 ms."""
 MAX_TEXELS = 4096
 """Most texels along a side: a board of metres gets coarser texels instead of gigabytes."""
+MOST_IMAGE_BYTES = 1 << 28
 LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6
 """Amplitudes of growth lines and fibres in the pattern (their squares add to 1). A guess, as are the lengths below."""
 WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0
@@ -81,6 +82,25 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
     return np.clip(raw + lift, 0.0, 1.0).astype(np.float32)
 
 
+def image_pattern(file: str) -> np.ndarray:
+    """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most. Raises
+    UserError for what is no image or black."""
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8), cv2.IMREAD_ANYDEPTH)
+    except (OSError, cv2.error) as error:
+        raise UserError(f"target.material.texture: {file} cannot be read ({error})") from error
+    if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
+        said = f"target.material.texture: {file} is no image that can be read, or it is black"
+        raise UserError(said, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
+    encoded = image / np.iinfo(image.dtype).max
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    fewer = min(1.0, MAX_TEXELS / max(linear.shape))
+    linear = cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA) if fewer < 1 else linear
+    return np.asarray(linear / linear.mean() - 1)
+
+
 def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Return bilinear values (...[, channels]) of a texture (rows, columns[, channels]) at ``uv`` (..., 2)."""
     rows, columns = texture.shape[:2]
@@ -101,13 +121,15 @@ ROUGH_SAGITTA_M = 8e-5
 """The same of a rough face, at its sharpest crest; elsewhere a tenth of it, far below the roughness itself."""
 TAPE_SINK_M = 0.1e-3
 """Depth of a strip's underside in the board, so that no two surfaces coincide."""
-SEGMENTS = 128
-"""Sides of a circle. The polygon has the circle's area; at 1 in, corners are 2.5 um outside, sides 1.3 um inside."""
+CORNER_M = 4e-6
+"""Distance by which the corners of a circle's polygon may stand outside it; sides lie half as far inside, and both have
+the same area. A render's rays take the longer the more sides there are: 2 mm get 28, 1 in 104."""
 RINGS = 48
 """Steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %."""
-LARGE_M, LONGEST_M = 0.65, 0.1
-"""Side of a board from which on its triangles are cut to edges of ``LONGEST_M``: a renderer in float32 misses the plane
-of a triangle from a facet of a hole to a far corner by its length squared over its width times 1e-7, 0.1 mm at 1 m."""
+CELL_M, MOST_ALONG = 0.03, 64
+"""Largest cell of a damaged sheet, and most cells along a side for this reason. Without cells triangles would run from
+the facets of a hole to the board's corners: rays take twice as long to pass these, and a renderer in float32 misses
+their plane by the length squared over the width times 1e-7, 0.1 mm at 1 m."""
 SPARE_M = 0.2 * MM
 """Least distance by which a cutter reaches beyond the face."""
 MAX_CELLS = 1_000_000
@@ -156,23 +178,21 @@ class Target:
 
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
-    import trimesh
 
     check_target(config)
     T_camera_board, board, material = config.pose.T_camera_board, config.board, config.material
     truth, sagitta_m = truth_of(config, T_camera_board), _sagitta_m(config)
     mesh = board_solid(config, truth)
-    if max(board.width_mm, board.height_mm) * MM > LARGE_M:
-        vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, LONGEST_M)
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
     plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
     mesh.apply_transform(T_camera_board)
     uv = texture_850 = texture_rgb = None
-    if material.grain_contrast != 0:
+    if material.texture is not None or material.grain_contrast != 0:
         uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
-        pattern = grain(material, board.width_mm, board.height_mm)
-        texture_850 = reflectance(pattern, material.albedo_850, material.grain_contrast)
-        texture_rgb = np.stack([reflectance(pattern, mean, material.grain_contrast) for mean in material.rgb], axis=-1)
+        pattern, contrast = grain(material, board.width_mm, board.height_mm), material.grain_contrast
+        if material.texture is not None:
+            pattern, contrast = image_pattern(material.texture.file), 1.0
+        texture_850 = reflectance(pattern, material.albedo_850, contrast)
+        texture_rgb = np.stack([reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1)
     rgb = np.array(material.rgb)
     gloss = (material.gloss.share, material.gloss.exponent) if material.gloss else (0.0, 1.0)
     parts = [TargetPart("board", mesh, uv, material.albedo_850, texture_850, rgb, texture_rgb, gloss)]
@@ -210,8 +230,9 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
     if isinstance(config.board.shape, MeshConfig):
         body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
     else:
-        sagitta_m = _sagitta_m(config)
-        body = sheet(face, size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=sagitta_m, flat_back=face.rough)
+        cell_m = max(CELL_M, *(size / MOST_ALONG for size in size_m)) if truth else float("inf")
+        offsets: dict[str, Any] = {"top_m": 0.0, "bottom_m": -thickness_m, "sagitta_m": _sagitta_m(config)}
+        body = sheet(face, size_m, **offsets, flat_back=face.rough, cell_m=cell_m)
     for damage, item in zip(truth, config.damages, strict=True):
         if isinstance(item, FlawConfig):
             more, less = solids_of(item, face, thickness_m)
@@ -245,11 +266,11 @@ def sheet(
     centre_m: tuple[float, float] = (0.0, 0.0),
     angle_rad: float = 0.0,
     flat_back: bool = False,
+    cell_m: float = float("inf"),
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
-    Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
-    plane. Board frame. Raises UserError where
-    the face needs more than MAX_CELLS."""
+    Its facets stay within ``sagitta_m`` of the face and span ``cell_m`` at most. ``flat_back``: its lower side is a
+    plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
     import trimesh
 
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
@@ -264,8 +285,9 @@ def sheet(
     fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
     hessian = turn.T @ np.stack([np.stack([fxx, fxy], -1), np.stack([fxy, fyy], -1)], -2) @ turn
     bends = np.abs(hessian).sum(axis=-1).max(axis=(0, 1))
-    # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
-    lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
+    # 1e-9 per metre: rounding of a turned straight direction must not cut it into more cells.
+    lengths = np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9))
+    lengths = np.where(bends > 1e-9, np.minimum(lengths, cell_m), cell_m)
     columns, rows = (max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True))
     if columns * rows > MAX_CELLS:
         needs = f"{columns} x {rows} cells to be followed within {sagitta_m / MM * 1e3:.3g} um"
@@ -338,10 +360,11 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
         edge = [(radius_m, -leg_m), (radius_m + leg_m, 0.0)] if leg_m > 0 else []
         top_m = radius_m + leg_m
         profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), *edge, (top_m, spare_m), (0.0, spare_m)])
-    angle = 2 * np.pi / SEGMENTS
+    sides = 4 * int(np.ceil(np.pi / 2 * np.sqrt(radius_m / (12 * CORNER_M))))
+    angle = 2 * np.pi / sides
     equal_area = np.sqrt(angle / np.sin(angle))
     # In millimetres: trimesh takes areas below 1e-8 for nothing, and in m2 that is a facet of a small hole.
-    solid = trimesh.creation.revolve(profile / MM * (equal_area, 1.0), sections=SEGMENTS)
+    solid = trimesh.creation.revolve(profile / MM * (equal_area, 1.0), sections=sides)
     across = np.cross([0.0, 1.0, 0.0], damage.axis_board)
     across /= np.linalg.norm(across)
     pose = np.eye(4)
@@ -361,7 +384,9 @@ def subtract(
     solids = []
     for mesh in (body, *added, *cutters):
         vertices, faces = np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.uint64)
-        solids.append(manifold3d.Manifold(manifold3d.Mesh64(vert_properties=vertices, tri_verts=faces)))
+        # edges between faces of different numbers stay; others within a plane are dissolved
+        numbers = np.arange(len(faces), dtype=np.uint64)
+        solids.append(manifold3d.Manifold(manifold3d.Mesh64(vertices, faces, face_id=numbers)))
     broken = [solid.status() for solid in solids if solid.status() != manifold3d.Error.NoError]
     if broken:
         raise RuntimeError(f"a solid is not closed: {broken}")

@@ -4,8 +4,8 @@ The part's frame is the board's: its ``front`` axis is z, towards the camera, x 
 z = 0 is its foremost point. The front is what is seen along z; damage lies there. Its heights are read off the
 triangles on a grid of `NODES` along the longer side, between which they are bilinear.
 
-Not checked: surfaces that cross themselves. Not modelled: steps of the front within a step of the grid; pressed dents
-and chips, which need a sheet's back or a declared edge."""
+Not checked: neighbouring triangles that fold onto each other. Not modelled: steps of the front within a step of the
+grid; pressed dents and chips, which need a sheet's back or a declared edge."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class MeshTargetConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000, description=".stl, .ply, .obj or .glb")]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
+    close: custom.Close = False
     flaws: Annotated[tuple[custom.AnyFlawConfig, ...], Field(max_length=500)] = ()
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
     backing: custom.BackingConfig | None = None
@@ -44,41 +45,131 @@ class MeshTargetConfig(Config):
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError where the file cannot be used."""
-        shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
+        shape = custom.MeshConfig(kind="mesh", **{key: getattr(self, key) for key in OF_MESH})
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))
-        kept: dict[str, Any] = {key: getattr(self, key) for key in type(self).model_fields if key not in OF_MESH}
+        kept: dict[str, Any] = {
+            key: getattr(self, key) for key in type(self).model_fields if key not in (*OF_MESH, "name")
+        }
         return custom.TargetConfig(board=custom.BoardConfig(**board, shape=shape), **kept)
 
 
-OF_MESH = ("name", "file", "unit", "front")
+OF_MESH = ("file", "unit", "front", "close")
+FLAT = 0.02
+"""Height of an opening's rim off its plane, over its width, up to which a lid closes it."""
 
 
 @lru_cache(maxsize=8)
 def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of a closed part, board frame, metres. Equal vertices are
-    joined, flat and doubled triangles left out, and a part that is inside out is turned. Raises UserError, with the
-    place, for what is open, not manifold, not oriented or no mesh."""
+    joined, flat and doubled triangles left out, openings closed by lids where the declaration says so, and a part that
+    is inside out is turned. Raises UserError, with the place, for what is open, not manifold, not oriented, crosses
+    itself or is no mesh."""
     mesh = read_mesh(shape.file)
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
-    for count, what, fix in ((1, "open", "close its holes"), (3, "shared by three faces or more", "split them")):
-        edges, index = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-        wrong = edges[index == 1] if count == 1 else edges[index >= count]
-        if len(wrong) or not len(mesh.faces):
-            place = (
-                ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong].mean(axis=(0, 1))) if len(wrong) else "none"
-            )
-            where = f"{len(wrong)} edges of {shape.file} are {what}, about ({place}) {shape.unit} of the file"
+
+    def refuse(wrong: np.ndarray, said: str, fix: str) -> None:
+        if len(wrong):
+            place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong].reshape(-1, 3).mean(axis=0))
+            where = f"{len(wrong)} {said.format(shape.file)}, about ({place}) {shape.unit} of the file"
             raise UserError(where, legal="a closed surface", fix=f"{fix} in a mesh editor, such as MeshLab")
+
+    edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    refuse(edges[counts > 2], "edges of {} are shared by three faces or more", "split them")
+    if (counts == 1).any() and shape.close:
+        mesh.faces = np.concatenate([mesh.faces, *_lids(mesh)])
+        edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    rim = "have a rim that is not flat" if shape.close else "are open"
+    also = "" if shape.close else "declare close: true, which puts a lid on each opening with a flat rim, or "
+    refuse(edges[counts == 1], f"edges of {{}} {rim}", f"{also}close them")
+    if not len(mesh.faces):
+        raise UserError(f"{shape.file}: is no mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
         said = f"{shape.file}: neighbouring triangles face in and out"
         raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
+    refuse(mesh.faces[crossing(mesh.triangles)], "triangles of {} cross others", "unite its overlapping shells")
     if mesh.volume < 0:
         mesh.invert()
     points = front_first(mesh, shape.unit, shape.front)
     low, high = points.min(axis=0), points.max(axis=0)
     return points - [*(low[:2] + high[:2]) / 2, high[2]], np.asarray(mesh.faces, np.int64)
+
+
+def _lids(mesh: Any) -> list[np.ndarray]:
+    """Return triangles (k, 3) that close each opening with a flat rim, oriented as the faces about it."""
+    import manifold3d  # type: ignore[import-not-found]
+
+    _, back, counts = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
+    following = {int(end): int(begin) for begin, end in mesh.edges[counts[back.ravel()] == 1]}
+    lids = []
+    while following:
+        loop = [next(iter(following))]
+        while loop[-1] in following:
+            loop.append(following.pop(loop[-1]))
+        if len(loop) < 4 or loop[0] != loop[-1]:  # openings that meet in a corner
+            continue
+        rim = mesh.vertices[loop[:-1]] - mesh.vertices[loop[:-1]].mean(axis=0)
+        x, y, height = np.linalg.svd(rim, full_matrices=False)[2] @ rim.T
+        if np.ptp(height) <= FLAT * np.ptp(x):
+            # the triangulation wants its polygon counter-clockwise
+            clockwise = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0
+            plan = np.column_stack([y, x] if clockwise else [x, y])
+            lids.append(np.array(loop)[manifold3d.triangulate([plan])])
+    return lids
+
+
+def crossing(corners: np.ndarray) -> np.ndarray:
+    """Return the indices of those triangles (n, 3, 3) that cross another with which they share no corner; touching is
+    not crossing. In strips along x they are swept, so that only those are compared whose extents meet."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    strip_m = max(float(np.ptp(corners[..., 1])) / max(1, int(np.sqrt(len(corners)) / 8)), 1e-12)
+    first, last = (((each[:, 1] - low[:, 1].min()) / strip_m).astype(np.int64) for each in (low, high))
+    counts = last - first + 1
+    index = np.repeat(np.arange(len(corners)), counts)
+    strips = first[index] + np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
+    order = np.lexsort((low[index, 0], strips))
+    found = np.zeros(len(index), bool)
+    index = index[order]
+    _sweep(corners[index], low[index], high[index], strips[order], found)
+    return np.unique(index[found])
+
+
+@numba.njit(cache=True, nogil=True)
+def _sweep(corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.ndarray, found: np.ndarray) -> None:
+    for i in range(len(corners)):
+        for j in range(i + 1, len(corners)):
+            if strips[j] != strips[i] or low[j, 0] > high[i, 0]:
+                break
+            if low[j, 1] > high[i, 1] or low[i, 1] > high[j, 1] or low[j, 2] > high[i, 2] or low[i, 2] > high[j, 2]:
+                continue
+            joined = False
+            for a in range(3):
+                for b in range(3):
+                    joined |= (corners[i, a] == corners[j, b]).all()
+            if not joined and (_pierces(corners[i], corners[j]) or _pierces(corners[j], corners[i])):
+                found[i] = found[j] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _pierces(one: np.ndarray, other: np.ndarray) -> bool:
+    """Tell whether an edge of one triangle passes through the inside of another."""
+    a, b, c = other[0], other[1], other[2]
+    for k in range(3):
+        p, q = one[k], one[(k + 1) % 3]
+        if _volume(a, b, c, p) * _volume(a, b, c, q) < 0.0:
+            first, second, third = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)
+            if (first > 0.0 and second > 0.0 and third > 0.0) or (first < 0.0 and second < 0.0 and third < 0.0):
+                return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
+    """Return six times the signed volume of a tetrahedron."""
+    u, v, w = b - a, c - a, d - a
+    x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    return float(x * w[0] + y * w[1] + z * w[2])
 
 
 @lru_cache(maxsize=8)
