@@ -64,7 +64,7 @@ def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
 
 def verdicts_of(found: Summaries) -> list[Verdict]:
     """Return the claims that were scored."""
-    return [Verdict(**dict(row)) for _, row in found[trials.CLAIMS].iterrows()]
+    return [Verdict(*row) for row in found[trials.CLAIMS].itertuples(index=False)]
 
 
 def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
