@@ -125,8 +125,8 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
         others = there.get(variant["reference"], [])
         for number, one in enumerate(there.get(str(variant["variant"]), [None])):
             alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
-            said = {"reason": "", "settings": ""} if number else {}  # why is said once
-            rows.append(Varied({**variant, **said}, one, next(iter([*alike, *others[-1:]]), None)))
+            again = {"reason": "", "settings": ""} if number else {}  # why is said once
+            rows.append(Varied({**variant, **again}, one, next(iter([*alike, *others[-1:]]), None)))
     if not rows:
         return Markup("")
     said = (

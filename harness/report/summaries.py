@@ -44,8 +44,9 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with
     else:
         several = len(set_ups) > 1
         compared = compare_set_ups(tables, summary, everything, half_sizes=several)
-        varies = ~compared["variant"].isin(set_ups) if len(compared) else []
-        found[trials.SET_UPS] = compared.assign(is_variation=varies)
+        if len(compared):
+            compared["is_variation"] = ~compared["variant"].isin(set_ups)
+        found[trials.SET_UPS] = compared
         found[trials.EFFECTS] = effect_costs(tables)
         if with_claims and several:
             verdict, posterior = claim_c11(summary, paths), posterior_of(of_set_ups(summary, tables), paths)
@@ -63,7 +64,7 @@ def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
 
 def verdicts_of(found: Summaries) -> list[Verdict]:
     """Return the claims that were scored."""
-    return [Verdict(**row) for row in found[trials.CLAIMS].to_dict("records")]
+    return [Verdict(*row) for row in found[trials.CLAIMS].itertuples(index=False)]
 
 
 def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
