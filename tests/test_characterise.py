@@ -151,9 +151,9 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
 
 
 def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
-    """The gap at a step is found again; what one distance and no amplitude cannot tell is said first."""
+    """The gap at a slanted step is found again; what one distance and no amplitude cannot tell is said first."""
     slopes = truth.nominal_lens.region_slopes(truth.nominal_lens.whole)
-    z_m = np.where(slopes[..., 0] < 0.05, 1.0, 1.25)
+    z_m = np.where(slopes @ [1.0, 0.35] < 0.05, 1.0, 1.25)
     path = recorded(tmp_path / "step.npz", truth, z_m, 0.6 / z_m**2, 12, keep=False, frame_jumps=False)
     given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out"), "--rate", "15"]
     assert characterise.main(given) == 0

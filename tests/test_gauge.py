@@ -163,11 +163,13 @@ def test_a_capture_of_the_board_gives_hits_and_misses(made: Path, tmp_path: Path
 @pytest.mark.slow
 def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wrong(tmp_path: Path):
     """The real camera has five times the fixed pattern of the study's, whose limit is too small. Holes of a rendered
-    gauge board before the real camera correct it. The truth is the same study with the real camera."""
+    gauge board before the real camera correct it. The truth is the same study with the real camera; its holes keep as
+    clear of the board's edge as the gauge's, because the crop takes those near it for the edge."""
     numbers = {"fixed_pattern.smooth_mm": 3.0, "fixed_pattern.pixel_mm": 4.0}
     experiment = Path(__file__).resolve().parents[1] / "experiments" / "detection_limit.yaml"
     changes = ["source.target.distance_m=0.5", "detector.name=local", "detector.settings={}", "threshold={k: 6}"]
     changes += ["study.boards=8", "study.hole_free_boards=1", "capture.frames=1", "source.target.room=null"]
+    changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
     changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
     changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
     given = [text for each in changes for text in ("--set", each)]

@@ -313,6 +313,12 @@ def test_lenses_as_other_programs_write_them(tmp_path: Path, text: str, distorti
     assert read_lens(path, 640, 576) == Lens(640, 576, 500, 510, 300, 200, distortion)
 
 
+def test_pictures_beside_clouds_are_told(tmp_path: Path) -> None:
+    plane.write_pcd(tmp_path / "c.pcd", plane.points_m(plane.depth_mm()))
+    cv2.imwrite(str(tmp_path / "1.png"), plane.depth_mm())
+    assert "1 pictures or arrays beside the .pcd files are not read" in open_capture([tmp_path]).notes
+
+
 @pytest.mark.parametrize("suffix", (".npy", ".tiff", ".pfm"))
 def test_a_folder_of_arrays_is_one_capture(tmp_path: Path, suffix: str) -> None:
     """Frames in the order of their numbers; infrared pictures beside them are left out."""

@@ -145,7 +145,10 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
     for suffix in (*CLOUDS, *POINT_LISTS[:3]):
         clouds = [path for path in inside if path.suffix.lower() == suffix]
         if clouds:
-            return open_clouds(clouds, asked, folder.name)
+            recording = open_clouds(clouds, asked, folder.name)
+            beside = sum(path.suffix.lower() in (".png", *LOADERS) for path in inside)
+            note = f"{beside} pictures or arrays beside the {suffix} files are not read" if beside else ""
+            return replace(recording, notes=(*recording.notes, note))
     pictures = [path for path in inside if path.suffix.lower() == ".png"]
     arrays = [path for path in inside if path.suffix.lower() in LOADERS]
     is_depth = bool(pictures) and (not arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures))

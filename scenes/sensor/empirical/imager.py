@@ -83,16 +83,17 @@ class EmpiricalImager:
         return IdealRange(*(each.astype(f4) for each in (range_m, sigma_m, amplitude, chance)))
 
     def _gap(self, range_m: np.ndarray) -> np.ndarray:
-        """Return the chance (h, w) that a step of depth takes a pixel's return; a share of a pixel is a chance."""
-        edge = self.camera.edge
+        """Return the chance (h, w) that a step of depth takes a pixel's return; a share of a pixel is a chance. The gap
+        counts along the row or the column that crosses the step, so diagonal neighbours are none."""
+        edge, beside = self.camera.edge, ndimage.generate_binary_structure(2, 1)
         far, near = (
-            fold(np.where(np.isfinite(range_m), range_m, empty), 3)
+            fold(np.where(np.isfinite(range_m), range_m, empty), footprint=beside)
             for fold, empty in ((ndimage.maximum_filter, -np.inf), (ndimage.minimum_filter, np.inf))
         )
         step = np.isfinite(range_m) & (far - near > edge.least_step_mm.value * MM)
         if not step.any():
             return np.zeros(range_m.shape)
-        return np.clip(edge.gap_px.value / 2 - ndimage.distance_transform_edt(~step), 0, 1)
+        return np.clip(edge.gap_px.value / 2 - ndimage.distance_transform_cdt(~step, "taxicab"), 0, 1)
 
     def _blurred(self, range_m: np.ndarray) -> np.ndarray:
         known, blur_px = np.isfinite(range_m), self.camera.edge.blur_px.value
