@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.files import shipped
 
 PART_OF_SET_UP = "prepare"
 TASKS = (
@@ -87,12 +88,14 @@ def _told(name: str, rest: list[str]) -> int:
 
 
 def _completion() -> str:
-    """Return a script that completes programs and their options; everything else is a file's name."""
-    cases = []
+    """Return a script that completes programs, their options and the experiments that come with tofpod; everything else
+    is a file's name."""
+    experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []
     for program in programs():
-        parser = importlib.import_module(f"harness.{program}").main.parser()
-        options = " ".join(option for action in parser._actions for option in action.option_strings)
-        cases.append(f'    {program}) COMPREPLY=($(compgen -W "{options}" -- "$word"));;')
+        actions = importlib.import_module(f"harness.{program}").main.parser()._actions
+        words = [option for action in actions for option in action.option_strings]
+        words += experiments if any(action.dest == "experiment" for action in actions) else []
+        cases.append(f'    {program}) COMPREPLY=($(compgen -W "{" ".join(words)}" -- "$word"));;')
     return COMPLETION.format(programs=" ".join(programs()), options="\n".join(cases))
 
 

@@ -23,7 +23,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--like", metavar="CAMERA", help=like)
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
-    add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as harness.detect has it")
+    add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as for harness.detect")
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
     add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")

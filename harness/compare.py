@@ -21,7 +21,7 @@ FILES = (COMPARISON.name, COMPARISON_PAGE.name)
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
-    add("second", type=Path, metavar="B", help="likewise; what is asked is whether B is worse or better than A")
+    add("second", type=Path, metavar="B", help="likewise; the question is whether B is worse or better than A")
     level = "level of the tests, all set-ups together (default: 0.05)"
     add("--alpha", type=float, default=0.05, metavar="P", help=level)
     add("--json", action="store_true", help="print JSON instead of the table")

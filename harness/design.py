@@ -32,9 +32,9 @@ OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    put = parser.add_argument_group("the guess, told or read from a study").add_argument
+    put = parser.add_argument_group("the assumed curve, given or read from a study").add_argument
     put("--a50", type=float, metavar="SIZE", help="size that is found half the time")
-    put("--a90", type=float, metavar="SIZE", help="size that is found nine times of ten")
+    put("--a90", type=float, metavar="SIZE", help="size that is found nine times out of ten")
     put("--link", choices=LINKS, help="shape of the curve (default: logit)")
     put("--log", action="store_true", default=None, help="the curve is against the sizes' logarithm")
     put("--study", type=Path, metavar="DIR", help="the curve of a study: its result folder, or its study.json")

@@ -59,7 +59,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
     add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
-    add("--pitch", metavar="LENGTH", help="the array is a height map whose pixels are so far apart: 0.5mm")
+    add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
     add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
     add = parser.add_argument_group(
         "several views of one target",

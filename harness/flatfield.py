@@ -30,9 +30,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
-    add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as harness.detect has it")
+    add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
     poses = (
-        "where the camera stood (as harness.detect has it): the surface's own shape is then parted from the pattern"
+        "where the camera stood, as for harness.detect: the surface's own shape is then parted from the pattern"
         " by least squares; without, it counts as noise"
     )
     add("--poses", type=Path, metavar="FILE", help=poses)
@@ -40,7 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the fixed pattern of one unit of a camera: what its range is off at each pixel, in every "
+    "Measure the fixed pattern of one unit of a camera: the error of range at each pixel that is the same in every "
     "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
     "camera, moved by 30 mm or more between captures, at two distances, some captures at each. The captures' "
     "order is that of time.",

@@ -36,7 +36,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--study", type=Path, metavar="DIR", help="plan by the curve of this study, simulated or implanted")
     add("--set-up", metavar="NAME", help='which of its set-ups: "50 frames"')
     add("--a50", type=float, metavar="MM", help="plan by this guess: found half the time")
-    add("--a90", type=float, metavar="MM", help="and found nine times of ten")
+    add("--a90", type=float, metavar="MM", help="and found nine times out of ten")
     add("--targets", type=int, default=36, metavar="N", help="holes in all (default: 36)")
     add("--board", default="270x175", metavar="WxH", help="size of a board, mm (default: 270x175, one sheet of A4)")
     add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")

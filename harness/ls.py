@@ -16,7 +16,7 @@ DAY_S = 86_400.0
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
-    add("name", nargs="?", help="show everything that can be set of this one; of results, those of this experiment")
+    add("name", nargs="?", help="a detector or camera, to show all its settings; with results, the experiment")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
     add("--json", action="store_true", help="as JSON, for programs")
 

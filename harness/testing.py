@@ -293,11 +293,6 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
         look.everything()
 
 
-def measures_extents(make: Make, cloud: Cloud) -> None:
-    """Each finding has a finite extent and centre, its own score, and a number of points."""
-    Look.at(make(), cloud).everything()
-
-
 def survives_pickling(make: Make, cloud: Cloud) -> None:
     """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
 
@@ -371,7 +366,6 @@ CHECKS = (
     finds_valid_pixels,
     survives_missing_pixels,
     refuses_an_empty_cloud,
-    measures_extents,
     survives_pickling,
     learns_plain_arrays,
     turns_with_the_cloud,

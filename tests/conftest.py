@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import fcntl
+import os
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
@@ -34,12 +36,25 @@ def shared_data() -> Path:
     return folder
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder of the session that the first process to need it makes; the other processes of the session wait."""
+    base = factory.getbasetemp()
+    home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"shared-{name}"
+    home.mkdir(exist_ok=True)
+    with (home / "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (home / "made").exists():
+            make(home)
+            (home / "made").touch()
+    return home
+
+
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished sweep before the thesis' target, with tiny.yaml beside the folder; not to be changed."""
     from tiny_sweep import TINY, finished
 
-    return finished(tmp_path_factory.mktemp("sweep"), TINY)
+    return made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY)) / "out"
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +62,7 @@ def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished study of random boards, likewise."""
     from tiny_sweep import STUDY, finished
 
-    return finished(tmp_path_factory.mktemp("study"), STUDY)
+    return made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY)) / "out"
 
 
 @pytest.fixture(scope="session")
@@ -55,6 +70,7 @@ def dataset_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished data set of ten boards, ``set``; not to be changed."""
     from tiny_dataset import write
 
-    home = tmp_path_factory.mktemp("dataset")
-    assert write(home, "set") == 0
-    return home
+    def make(home: Path) -> None:
+        assert write(home, "set") == 0
+
+    return made_once(tmp_path_factory, "dataset", make)

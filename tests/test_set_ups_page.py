@@ -97,6 +97,11 @@ def test_a_variation_is_shown_beside_its_set_up(page):
     assert "7 of 11 <small>5–11" in row  # the set-up's own, with one frame
 
 
+def test_a_camera_s_file_is_named_by_its_name():
+    assert camera_title("kinect_v2").startswith("Kinect")
+    assert camera_title("/home/me/my_camera.yaml") == "my camera"
+
+
 def test_the_table_has_the_counts_of_both_numbers_of_frames():
     found = cameras(SMALLEST)
     compared = compare_set_ups(found, summarise_holes(found.holes, AXES), set_ups_of(found))

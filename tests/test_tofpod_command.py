@@ -51,7 +51,11 @@ def test_completion_is_a_script_that_knows_programs_and_options(capsys):
     assert main(["completion", "bash"]) == 0
     script = capsys.readouterr().out
     ask = 'COMP_WORDS=(tofpod {}); COMP_CWORD={}; _tofpod; echo "${{COMPREPLY[@]}}"'
-    for words, place, wanted in (("sw", 1, "sweep"), ("sweep --ca", 2, "--calibration --cache-limit")):
+    for words, place, wanted in (
+        ("sw", 1, "sweep"),
+        ("sweep --ca", 2, "--calibration --cache-limit"),
+        ("sweep aver", 2, "averaging"),
+    ):
         ran = subprocess.run(
             ["bash", "-c", script + ask.format(words, place)], capture_output=True, text=True, check=True
         )

@@ -163,11 +163,3 @@ def test_real_walls_are_found_and_the_simulation_follows_them(shared_data, tmp_p
     for lag in (1, 2, 3, 5):
         measured, simulated = pick(rows, "noise correlation", f"x, lag {lag}")
         assert simulated == pytest.approx(measured, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [("azure_drilled_board", "no simulated camera has 1280 x 720 pixels"), ("azure_mkv/recording.mkv", "1 frame")],
-)
-def test_real_captures_that_cannot_be_compared_say_why(shared_data, capsys, name, says):
-    assert says in refused(["--capture", str(shared_data / name)], capsys)

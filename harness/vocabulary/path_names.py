@@ -50,13 +50,14 @@ def value_text(path: str, value: Any) -> str:
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title in the file of a camera that comes with tofpod, without commas; of any other name its words."""
+    """Return the title in the file of a camera that comes with tofpod, without commas; of any other name its words, and
+    of a file's path those of its name."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
         told = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
         if told:
             return told[1].replace(",", "")
-    return name.replace("_", " ")
+    return name.rpartition("/")[2].removesuffix(".yaml").replace("_", " ")
 
 
 def in_words(variant: str) -> str:

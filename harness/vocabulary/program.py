@@ -27,10 +27,14 @@ class Program:
     description: str
     epilog: str | None
 
+    @property
+    def command(self) -> str:
+        """Its name as it was called: ``tofpod sweep`` or ``python -m harness.sweep``."""
+        return self.name.replace("harness.", "tofpod " if Path(sys.argv[0]).name == "tofpod" else "python -m harness.")
+
     def parser(self) -> argparse.ArgumentParser:
         """Return a parser of its arguments."""
-        name, about, further = f"python -m {self.name}", self.description, self.epilog
-        parser = argparse.ArgumentParser(prog=name, description=about, epilog=further)
+        parser = argparse.ArgumentParser(prog=self.command, description=self.description, epilog=self.epilog)
         self.options(parser)
         return parser
 
@@ -42,7 +46,7 @@ class Program:
         if arguments is None:
             # what batch systems and containers send first is to end as Ctrl-C does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return exit_code_of(lambda: self.run(parsed, f"python -m {self.name} {shlex.join(given)}".rstrip()))
+        return exit_code_of(lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip()))
 
 
 def program(options: Options, description: str, epilog: str | None = None) -> Callable[[Run], Program]:
