@@ -9,84 +9,107 @@ that are known:
 
 which has the deviation 1 where there is no damage, whatever the noise's spectrum. C^-1 r is solved for by conjugate
 gradients, so missing pixels and borders add nothing and need no filling. Background structure that is not damage is
-part of the covariance, and counts as little as its power demands.
+part of the covariance, and counts as little as its power demands. The scores of each template are then divided by the
+deviation that they have, for each distance from the outline on its own: what an estimated spectrum, the outline and
+heavy tails change shows there.
+
+Wide templates have few independent places, so that their highest score by chance is lower. Their scores are raised
+(`detectors.whitening.Worth`), or a dent would be held to a hole's threshold.
 
 What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter
-sees the shoulder of a neighbour's hole. What pixels along the target's outline share is subtracted: what lies behind
-the edge, and light from beside, have a part in them. Depth that was upsampled, so that its noise reaches beyond a
-camera's window, is judged on squares of pixels in which it does not.
+sees the shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is
+subtracted: what lies behind the edge, and light from beside, have a part in them. Depth that was upsampled, so that its
+noise reaches beyond a camera's window, is judged on squares of pixels in which it does not.
 
 Not modelled: slots that no template fits, but for what they have in common with one; slots within `RIM_PX` of outlines
 and of what was taken out; templates' distortion where a surface is steep; missing returns but for the few that are no
-findings by themselves (`detectors.missing`). Tails that are heavier than Gaussian scale the narrow templates' scores as
-a whole. The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle
-that spreads as widely, which is exact where all of the template is seen; places where less than `LEAST_SEEN` of it is
-seen are not judged by that template. Scores of slots are taken on every second pixel.
+findings by themselves (`detectors.missing`). The denominator takes the share of a template's whitened energy on known
+pixels for t' C^-1 t, by a rectangle that spreads as widely, which is exact where all of the template is seen; places
+where less than `LEAST_SEEN` of it is seen are not judged by that template. Scores of slots are taken on every second
+pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numba
 import numpy as np
 import scipy.fft
 from pydantic import model_validator
+from scipy import special
 
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import LEVEL_SIGMAS, SADDLE, LocalConfig, LocalDetector, LocalEvidence, LocalPicture, local_sigma
+from detectors.local import (
+    LEAST_WINDOW,
+    LEVEL_SIGMAS,
+    SADDLE,
+    LocalConfig,
+    LocalDetector,
+    LocalEvidence,
+    LocalPicture,
+    local_sigma,
+)
 from detectors.masks import grown
 from detectors.missing import missing_evidence
 from detectors.noise import median_of
 from detectors.whitening import (
-    ALL_RADII_PX,
-    CONVERGED,
-    FIRST_SLOT,
     GRID,
     LONGEST_LAG_PX,
-    ROUGHLY_CONVERGED,
-    WINDOW,
-    coarse,
+    WINDOWS_PX,
+    Worth,
+    bank,
     grid_of,
     halved,
     inverse_times,
     noise_covariance,
     response,
+    spectra,
     spectrum,
+    window_of,
     worths,
 )
 from harness.vocabulary.geometry import Cloud
 
-WINDOW_RADII, LEAST_WINDOW = 6, 32
-"""Half of the window in which scores are set beside their own scatter: so many radii, and pixels at least."""
-SCATTER_SAMPLES = 7
-"""Samples from a window's middle to its edge: scores, which templates correlate, tell no more."""
-LEAST_SEEN = 0.5
+LEAST_SEEN = 0.6
 SHORT_PX = 13
 """Width over which noise is compared from place to place: what is wider counts there as much as elsewhere."""
 QUIET_SIGMAS = 4.0
 """Pixels beyond it, and their neighbours, do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations beyond which no single pixel counts for more: a flying pixel alone is no finding."""
+"""Deviations beyond which no pixel counts for more than its neighbours: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
 taken out before the rest is judged."""
-ROUGHLY = (0, 2, 4, 5, 9, 11)
-"""Templates that tell what stands out strongly."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
 ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
 RIM_PX = 6
 """Depth of the target's rim: the camera's window and lens reach so far over its edge."""
+RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
+"""Distances from the outline up to which scores are set beside the scatter of their own; all beyond are alike."""
+NO_ZONE = len(RIM_ENDS_PX) + 1
+WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
+"""Half of the window of the local scatter in radii, the side of the squares that it is taken from, and how much of it
+chance and damage may explain."""
+CAP, FEWEST = 2.0, 200
+"""Scores count for no more in their scatter, and fewer do not tell it."""
+DEVIATIONS = np.geomspace(0.2, 50.0, 200)
+CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
+    -CAP / DEVIATIONS
+)
+"""Deviations of a Gaussian, and the mean of its size where more than `CAP` counts as that."""
+FAINT = 3.5
+"""Scores below are raised by the same factor: what is counted there is not maxima."""
 LOBE_SHARE = 0.5
 """A score so much smaller than one of the other sign within `RIM_PX` is the lobe that whitening leaves beside
 damage."""
-WIDE_PX = 6.0
+WIDE_PX = 5.0
 """Radius from which on noise may break a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Radius up to which a template's scores tell their own tail, the share of pixels beyond it on either side, and where
@@ -108,7 +131,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 6
+    version = 7
 
     def __init__(self, settings: LocalConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
@@ -129,7 +152,7 @@ class MatchedDetector(LocalDetector):
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
         """Return the residuals on a grid in which noise reaches no farther than through a camera's own window: depth
         that was upsampled is no sharper than its camera's pixels."""
-        return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / len(WINDOW))))
+        return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / max(WINDOWS_PX))))
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
@@ -189,83 +212,182 @@ def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
     return noise_covariance(noise, inner & (loud == 0), grid_of(noise.shape))
 
 
-def _judged(noise: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
+class _Noise(NamedTuple):
+    """What a picture's noise makes of the bank: ``grid`` of its transforms, ``power`` there, and each template's
+    `Worth` through the window that the noise shows."""
+
+    grid: tuple[int, ...]
+    power: np.ndarray
+    window_px: int
+    worths: tuple[Worth, ...]
+
+
+def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    grid = grid_of(noise.shape)
-    covariance = _covariance(noise, known) if covariance is None else covariance
-    power, worth_of = spectrum(covariance, grid), worths(spectrum(covariance, (GRID, GRID)))
-    clipped = np.clip(noise, -CLIP_SIGMAS, CLIP_SIGMAS)
+    grid = grid_of(values.shape)
+    covariance = _covariance(values, known) if covariance is None else covariance
+    window_px = window_of(covariance)
+    worth_of = worths(spectrum(covariance, (GRID, GRID)), window_px)
+    noise = _Noise(grid, spectrum(covariance, grid), window_px, worth_of)
+    tamed = _tamed(values)
+    # what stands out strongly, as round templates see it
+    signed, by, solved = _scored(tamed, known, noise, rough=True)
+    radius_px = np.array([each.radius_px for each in bank(window_px)], np.float32)
+    size = np.abs(signed)
+    peaks = np.argwhere((size > STRONG) & _highest(size))
+    core, taken = _cores(peaks, size, radius_px[by], values, known)
+    seen = known & ~grown(core, MARGIN_PX) if core.any() else known
+    signed, by, _ = _scored(tamed * seen, seen, noise, start=solved)
+    _fill_discs(signed, radius_px[by])
+    signed = np.where(core, taken, np.where(known, signed, 0.0))
+    behind, before = (
+        cv2.dilate(np.maximum(each, 0.0), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)) for each in (signed, -signed)
+    )
+    lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
+    return np.where(lobe, 0.0, signed).astype(np.float64), noise.worths[0].energy ** -0.5
 
-    # what stands out strongly: its pixels count as unknown for the rest
-    roughly = inverse_times(clipped, known, power, grid, ROUGHLY_CONVERGED)
-    rough, every = scipy.fft.rfft2(roughly, grid), np.ones_like(noise)
-    size, by = np.zeros_like(noise), np.zeros(noise.shape, np.uint8)
-    for k in ROUGHLY:
-        score = response(rough, k, noise.shape) * np.float32(worth_of[k].energy ** -0.5)
-        _keep_stronger(size, by, score, every, k)
-    core, taken, taken_by = _cores(np.abs(size), by, noise, known)
-    seen = known & ~grown(core, MARGIN_PX)
 
-    rest = np.where(seen, clipped, np.float32(0.0))
-    whole = scipy.fft.rfft2(inverse_times(rest, seen, power, grid, CONVERGED, roughly), grid)
-    weighed = whole, halved(whole)
-    there, divisors = [seen.astype(np.float32)], np.ones(len(ALL_RADII_PX), np.float32)
-    even = np.pad(seen, ((0, seen.shape[0] % 2), (0, seen.shape[1] % 2)))
-    there.append(cv2.resize(even.astype(np.float32), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    # what light and flying pixels leave along outlines looks like a slot
-    off_rim = there[1] * (cv2.resize(_depth_px(even), None, fx=0.5, fy=0.5) > RIM_PX)
-    best = [(np.zeros_like(each), np.zeros(each.shape, np.uint8)) for each in there]
-    for k, worth in enumerate(worth_of):
-        step = coarse(k)
-        share = cv2.blur(there[step], worth.sides, borderType=cv2.BORDER_CONSTANT)
-        score = response(weighed[step], k, noise.shape)
-        _normalise(score, share, off_rim if k >= FIRST_SLOT else there[step], worth.energy)
-        # where the scores of a neighbourhood scatter by more than 1, the noise there is not as elsewhere
-        window = int(max(WINDOW_RADII * ALL_RADII_PX[k], LEAST_WINDOW) / (1 + step))
-        scatter = local_sigma(score, window, 1.0, SCATTER_SAMPLES)
-        if ALL_RADII_PX[k] <= TAIL_PX:
-            scatter *= _tail(np.nan_to_num(score[seen] / scatter[seen]))
-        divisors[k] = scatter.mean()
-        _keep_stronger(*best[step], score, scatter, k)
+def _tamed(values: np.ndarray) -> np.ndarray:
+    """Return values (r, c) of which none exceeds both `CLIP_SIGMAS` and its eight neighbours."""
+    ring = np.ones((3, 3), np.uint8)
+    ring[1, 1] = 0
+    low, high = (np.asarray(of(values, ring)) for of in (cv2.erode, cv2.dilate))
+    return np.clip(values, np.minimum(low, -CLIP_SIGMAS), np.maximum(high, CLIP_SIGMAS))
+
+
+def _scored(
+    values: np.ndarray, seen: np.ndarray, noise: _Noise, start: np.ndarray | None = None, rough: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each pixel's strongest score (r, c) with its sign, the template that it is by, and C^-1 r, from the pixels
+    ``seen`` (r, c); ``start`` is near to that. ``rough``: by round templates in the middles of pixels
+    alone, without the scatter of scores, which what stands out would spoil."""
+    solved = inverse_times(values, seen, noise.power, noise.grid, start)
+    whole, (h, w), depth_px = scipy.fft.rfft2(solved, noise.grid), seen.shape, _depth_px(seen)
+    views, best, shares, tail = [], [], {}, 1.0
+    for coarse, spectrum_of in enumerate((whole, halved(whole))):
+        there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
+        zone = np.searchsorted(RIM_ENDS_PX, depth).astype(np.uint8)
+        views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
+        best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
+    templates = spectra(noise.grid, noise.window_px)
+    for number, (template, worth) in enumerate(zip(bank(noise.window_px), noise.worths, strict=True)):
+        if rough and (template.coarse or any(template.halves)):
+            continue
+        spectrum_of, there, zone, inner = views[template.coarse]
+        if (template.coarse, worth.sides) not in shares:
+            share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
+            enough = (share > LEAST_SEEN) & (there > 0)
+            shares[template.coarse, worth.sides] = np.where(enough, np.maximum(share, LEAST_SEEN) ** -0.5, 0.0)
+        score = response(spectrum_of, templates[number], there.shape)
+        score *= shares[template.coarse, worth.sides] * np.float32(worth.energy**-0.5)
+        if template.slot:  # what light and flying pixels leave along outlines looks like a slot
+            score *= inner
+        deviations = np.ones(NO_ZONE)
+        if not rough:
+            wide = template.radius_px >= WIDE_PX and not template.slot
+            deviations, quiet = _deviations(
+                score, zone, round(template.radius_px / (1 + template.coarse)) if wide else 0
+            )
+            half_px = max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / (1 + template.coarse)
+            _calm(score, quiet, deviations[-1], half_px)
+            if template.radius_px <= TAIL_PX:
+                if not any(template.halves):
+                    tail = _tail((score / deviations.astype(np.float32)[zone]).ravel())
+                deviations *= tail
+        per_deviation = (1.0 / deviations).astype(np.float32)
+        _keep_stronger(*best[template.coarse], score, zone, per_deviation, worth.raised, *template.halves, number)
     (signed, by), (wide, wide_by) = best
-    h, w = seen.shape
     wide = cv2.resize(wide, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:h, :w]
     wide_by = np.repeat(np.repeat(wide_by, 2, axis=0), 2, axis=1)[:h, :w]
     wider = np.abs(wide) > np.abs(signed)
-    signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
-    _fill_discs(signed, np.asarray(ALL_RADII_PX, np.float32)[by])
-    signed = np.where(core, taken / divisors[taken_by], np.where(known, signed, 0.0))
-    near = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    behind, before = (cv2.dilate(np.maximum(each, 0.0), near) for each in (signed, -signed))
-    lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
-    return np.where(lobe, 0.0, signed).astype(np.float64), worth_of[0].energy ** -0.5
+    return np.where(wider, wide, signed) * seen, np.where(wider, wide_by, by), solved
+
+
+def _halved(image: np.ndarray) -> np.ndarray:
+    """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
+    even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2)), mode="edge").astype(np.float32)
+    return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+
+
+def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), by means of sizes up to `CAP`: of the
+    last where there are too few, and nowhere less than there; and (r, c) bool, the scores that tell it: what lies
+    within ``reach_px`` of scores that stand out does not."""
+    found, quiet = _scatter(score, zone), score != 0
+    if reach_px:
+        quiet &= ~grown(np.abs(score) > FAINT * found[-1], reach_px)
+        if quiet.sum() > FEWEST:
+            found = _scatter(score, np.where(quiet, zone, NO_ZONE))
+    return found, quiet
+
+
+def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
+    """Divide the scores (r, c) where the quiet ones within a square of ``half_px`` scatter by more than `UNEVEN`
+    deviations: the noise there is not as elsewhere."""
+    sizes = np.minimum(np.abs(score), np.float32(CAP * deviation)) * quiet
+    parts = tuple(max(1, side // PART_PX) for side in score.shape[::-1])
+    blurred = (
+        cv2.blur(cv2.resize(each, parts, interpolation=cv2.INTER_AREA), (2 * round(half_px / PART_PX) + 1,) * 2)
+        for each in (sizes, quiet.astype(np.float32))
+    )
+    local = np.interp(next(blurred) / deviation / np.maximum(next(blurred), 0.05), CAPPED, DEVIATIONS) / UNEVEN
+    if local.max() > 1.0:
+        calm = np.maximum(local, 1.0).astype(np.float32)
+        score /= cv2.resize(calm, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def _scatter(score: np.ndarray, zone: np.ndarray) -> np.ndarray:
+    sums, counts = _capped(score, zone, NO_ZONE)
+    if counts[-1] < FEWEST:
+        sums[-1], counts[-1] = sums.sum(), max(counts.sum(), 1)
+    found = np.interp(sums / np.maximum(counts, 1), CAPPED, DEVIATIONS)
+    return np.asarray(np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])))
 
 
 @numba.njit(**PLAIN)
-def _normalise(score: np.ndarray, share: np.ndarray, there: np.ndarray, energy: float) -> None:
-    """Turn responses (r, c) into scores, NaN where too little of a template is seen."""
+def _capped(score: np.ndarray, zone: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums of the scores' sizes, `CAP` at most, in each zone, and their number; 0 is no score."""
+    sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
     for i in range(score.shape[0]):
         for j in range(score.shape[1]):
-            if share[i, j] > LEAST_SEEN and there[i, j] > 0:
-                score[i, j] /= np.sqrt(energy * share[i, j])
-            else:
-                score[i, j] = np.nan
+            if zone[i, j] < zones and score[i, j] != 0:
+                sums[zone[i, j]] += min(abs(score[i, j]), CAP)
+                counts[zone[i, j]] += 1
+    return sums, counts
 
 
 @numba.njit(**PLAIN)
-def _keep_stronger(signed: np.ndarray, by: np.ndarray, score: np.ndarray, over: np.ndarray, number: int) -> None:
-    """Keep of each pixel's scores (r, c) and a score ``over`` (r, c) the larger in size, and that template's
-    ``number``."""
-    for i in range(score.shape[0]):
-        for j in range(score.shape[1]):
-            one = score[i, j] / over[i, j]
-            if abs(one) > abs(signed[i, j]):
-                signed[i, j], by[i, j] = one, number
+def _keep_stronger(
+    signed: np.ndarray,
+    by: np.ndarray,
+    score: np.ndarray,
+    zone: np.ndarray,
+    per_deviation: np.ndarray,
+    raised: float,
+    down: int,
+    right: int,
+    number: int,
+) -> None:
+    """Keep of each pixel's scores (r, c) the larger in size, and that template's ``number``. Scores are brought to
+    deviations of their ``zone`` (r, c), and raised: their squares grow by ``raised``, below `FAINT` in proportion.
+    Those of a template between pixels, ``down`` or to the ``right``, belong to all pixels round about."""
+    faint = np.float32(np.sqrt(1.0 + raised / FAINT**2))
+    height, width = score.shape
+    for i in range(height):
+        for j in range(width):
+            value = score[i, j] * per_deviation[zone[i, j]]
+            size = abs(value)
+            value *= faint if size < FAINT else np.float32(np.sqrt(1.0 + raised / size**2))
+            for y in range(i, min(i + down + 1, height)):
+                for x in range(j, min(j + right + 1, width)):
+                    if abs(value) > abs(signed[y, x]):
+                        signed[y, x], by[y, x] = value, number
 
 
 def _tail(scores: np.ndarray) -> float:
     """Return how much farther the tail of scores (n,) reaches than a Gaussian's, on the side where it is shorter,
     since damage lengthens one; 1 at least."""
+    scores = scores[scores != 0]
     count = int(TAIL_SHARE * len(scores))
     if count == 0:
         return 1.0
@@ -277,54 +399,51 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
     """Raise the scores (r, c) inside the disc of each wide template that peaks, so that what it explains is one
     finding."""
     size = np.abs(signed)
-    peaks = (size > LOUD_SIGMAS) & (radius_px >= WIDE_PX) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2)))
-    for row, column in np.argwhere(peaks):
-        radius = int(radius_px[row, column])
+    peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
+    for row, column in np.argwhere(peaks).tolist():
+        radius, least = int(radius_px[row, column]), SADDLE * 1.01 * signed[row, column]
         cut = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
         rows, columns = np.indices(size[cut].shape)
-        apart = np.hypot(rows - min(row, radius), columns - min(column, radius))
-        least = SADDLE * 1.01 * signed[row, column]
-        inside = (apart <= radius) & (signed[cut] * np.sign(least) > 0)
-        signed[cut][inside] = np.sign(least) * np.maximum(size[cut][inside], abs(least))
+        inside = np.hypot(rows - min(row, radius), columns - min(column, radius)) <= radius
+        signed[cut][inside & (size[cut] < abs(least))] = least
+
+
+def _highest(size: np.ndarray) -> np.ndarray:
+    """Return (r, c) bool: pixels than which none is larger within `ALONE_PX`."""
+    return np.asarray(size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
 
 
 def _cores(
-    size: np.ndarray, by: np.ndarray, noise: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (r, c) bool: the loud pixels, and what lies between them, that peaks of the scores' ``size`` stand on,
-    where they fill the disc of the template (r, c) that the peak is ``by``: of what is wide and shallow only the
-    loudest pixels would go. Further their signed scores (r, c), in proportion to the residual over 3 x 3 pixels, so
-    that two holes that touch keep two peaks, and higher where the loud pixels' median exceeds the clipped size; and
-    these templates (r, c)."""
-    peaks = (size > STRONG) & (size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
-    core, signed, found_by = np.zeros(size.shape, bool), np.zeros(size.shape), np.zeros(size.shape, np.uint8)
-    if not peaks.any():
-        return core, signed, found_by
-    loud = known & (np.abs(noise) > LOUD_SIGMAS)
-    around = (cv2.blur(each, (3, 3)) for each in (np.where(known, noise, np.float32(0.0)), known.astype(np.float32)))
+    peaks: np.ndarray, size: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (r, c) bool: the loud pixels, and what lies between them, that ``peaks`` (n, 2) of the scores' ``size``
+    stand on, where they fill a disc of the template's ``radius_px`` (r, c): of what is wide and shallow only the
+    loudest pixels would go. Further their signed scores (r, c), in proportion to the values over 3 x 3 pixels, so that
+    two holes that touch keep two peaks."""
+    core, signed = np.zeros(size.shape, bool), np.zeros(size.shape)
+    loud = known & (np.abs(values) > LOUD_SIGMAS)
+    around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
     smooth = next(around) / np.maximum(next(around), 0.1)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(
         cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
     )
-    score, template = np.zeros(count), np.zeros(count, np.uint8)
-    for row, column in np.argwhere(peaks):
+    score = np.zeros(count)
+    for row, column in peaks.tolist():
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
-            least = LOUD_SHARE * np.pi * ALL_RADII_PX[by[row, column]] ** 2
-            if number > 0 and stats[number, cv2.CC_STAT_AREA] > least and size[row, column] > score[number]:
-                score[number], template[number] = size[row, column], by[row, column]
+            least = LOUD_SHARE * np.pi * radius_px[row, column] ** 2
+            if number > 0 and stats[number, cv2.CC_STAT_AREA] > least:
+                score[number] = max(score[number], size[row, column])
     for number in np.flatnonzero(score):
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
-        sizes, heights = np.abs(noise[cut][part]), smooth[cut][part].astype(np.float64)
-        louder = max(float(np.median(sizes[sizes > LOUD_SIGMAS])) / CLIP_SIGMAS, 1.0)
+        heights = smooth[cut][part].astype(np.float64)
         # quiet pixels between loud ones are no finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
-        signed[cut][part] = score[number] * louder * heights / np.abs(heights).max()
+        signed[cut][part] = score[number] * heights / np.abs(heights).max()
         core[cut] |= part
-        found_by[cut][part] = template[number]
-    return core, signed, found_by
+    return core, signed
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
@@ -334,15 +453,20 @@ def _depth_px(known: np.ndarray) -> np.ndarray:
 
 
 def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the residuals (r, c) less what they share, along some 65 pixels, with those as near to the outline."""
+    """Return the residuals (r, c) less what they share, along some 65 pixels, with those as near to the outline, beyond
+    what those next to the rim share: a subtracted mean would leave a step there."""
     noise, depth_px = noise.astype(np.float32), _depth_px(known)
-    side = (2 * LEAST_WINDOW + 1,) * 2
     modest = np.clip(noise, -LEVEL_SIGMAS, LEVEL_SIGMAS)
-    for step in range(1, RIM_PX + 1):
-        layer = known & (depth_px == step)
+
+    def shared(layer: np.ndarray) -> np.ndarray:
         of, total = (
-            cv2.blur(each, side, borderType=cv2.BORDER_CONSTANT)[layer]
+            cv2.blur(each, (2 * LEAST_WINDOW + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
             for each in (layer.astype(np.float32), np.where(layer, modest, np.float32(0.0)))
         )
-        noise[layer] -= total / np.maximum(of, 1e-6)
+        return np.asarray(total / np.maximum(of, 1e-6))
+
+    inside = shared(known & (depth_px > RIM_PX) & (depth_px <= 2 * RIM_PX))
+    for step in range(1, RIM_PX + 1):
+        layer = known & (depth_px == step)
+        noise[layer] -= (shared(layer) - inside)[layer]
     return noise

@@ -15,39 +15,37 @@ import cv2
 import numpy as np
 import scipy.fft
 
-RADII_PX = (0.5, 1.5, 2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
-"""Radii of discs seen through a window of 5 x 5 pixels, as continuous-wave cameras filter their phasors."""
-SHARP_RADII_PX = (0.6, 1.2, 2.0)
-"""Radii of discs blurred by `LENS_BLUR_PX` only: cameras without such a window."""
-DENT_RADII_PX = (6.0, 9.0, 13.0, 18.0)
-"""Radii of paraboloids."""
-SLOT_PX, SLOTS_DEG = (20.0, 2.0), (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)
-"""Length and width of slots, each seen with and without such a window, and the angle of each to the rows."""
-ALL_RADII_PX = (*RADII_PX, *SHARP_RADII_PX, *DENT_RADII_PX, *(SLOT_PX[0] / 4.0,) * 2 * len(SLOTS_DEG))
-"""Radii of all templates: first discs, then paraboloids, then slots, by the radius of a disc as large."""
-FIRST_SLOT = len(ALL_RADII_PX) - 2 * len(SLOTS_DEG)
-WINDOW = (0.6, 1.0, 1.0, 1.0, 0.6)
+SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
+"""Radii of small discs, and the places between pixels at which they are compared: through a window with sharp sides
+half a pixel costs up to a seventh of the score. The first stands for all holes smaller than a pixel."""
+RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
+"""Radii of further discs."""
+DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
+"""Radii of paraboloids: denser, as before a fixed pattern their rims decide."""
+SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
+"""Length and width of slots, and the angle of each to the rows."""
+WINDOWS_PX = (1, 3, 5)
+"""Sides of the square over which cameras average, continuous-wave cameras their phasors: 3 before a Kinect v2, 5 before
+an Azure Kinect. Without it the lens alone blurs."""
 LENS_BLUR_PX = 0.6
-DENT_BLUR_PX = 1.0
-LONGEST_LAG_PX = 20
-"""Lag at which the covariance has faded (Parzen's window): long enough for the pattern of known cameras, short enough
-that 30,000 pixels tell each of its values to some per cent."""
+LONGEST_LAG_PX = 28
+"""Lag at which the covariance has faded (Parzen's window)."""
 COARSE_PX = 9.0
 """Radius from which on the scores of every second pixel are taken: between them they change by some hundredths."""
-LEAST_POWER = 0.1
-"""The spectrum is nowhere below this share of its mean: frequencies that a filter or an interpolation took out hold no
-signal either. Of 50 frames of a simulated Azure Kinect 0.3 loses a tenth of the scores of small holes, and 0.03 finds
-no more of them; in interpolated depth of a real one it raises the noise that is left."""
+LEAST_POWER = 0.01
+"""The spectrum is nowhere below this share of its mean."""
 MOST_WHITENED = 2000  # pixels whose dense covariance is factored: 0.2 s and 64 MB
+SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
+"""Halves of the sides that a `Worth` may have: the share that is seen is taken once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, ROUGHLY_CONVERGED, MOST_ITERATIONS = 0.01, 0.2, 30
-"""Relative residuals at which C^-1 r counts as solved, and as solved well enough to tell what stands out strongly."""
+CONVERGED, MOST_ITERATIONS = 0.01, 40
+"""Relative residual at which C^-1 r counts as solved, and a bound on the steps there."""
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
     """Return the grid on which a picture of this shape is transformed; it holds every template; half of it is even."""
-    quarters = (math.ceil((max(side, GRID) + 2 * LONGEST_LAG_PX) / 4) for side in shape)
+    quarters = (math.ceil((max(side, GRID) + LONGEST_LAG_PX) / 4) for side in shape)
     return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
 
 
@@ -69,6 +67,14 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32))
 
 
+def window_of(covariance: np.ndarray) -> int:
+    """Return the side of `WINDOWS_PX` that fits noise: a box of b pixels leaves neighbours unlike by 1 / b."""
+    middle = len(covariance) // 2
+    beside = (covariance[middle, middle + 1] + covariance[middle + 1, middle]) / 2.0
+    unlike = 1.0 - float(beside) / max(float(covariance[middle, middle]), 1e-12)
+    return min(WINDOWS_PX, key=lambda side: abs(math.log(max(unlike, 0.2) * side)))
+
+
 def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return an image of odd sides on a larger grid, its middle at pixel (0, 0)."""
     padded = np.zeros(shape, np.float32)
@@ -81,7 +87,6 @@ def inverse_times(
     known: np.ndarray,
     power: np.ndarray,
     shape: tuple[int, ...],
-    converged: float = CONVERGED,
     start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
@@ -99,7 +104,7 @@ def inverse_times(
     solution = filtered(values, inverse) if start is None else mask * start
     rest = values * mask - filtered(solution, power)
     towards = direction = filtered(rest, inverse)
-    product, enough = float(np.vdot(rest, towards)), converged**2 * float(np.vdot(values * mask, values))
+    product, enough = float(np.vdot(rest, towards)), CONVERGED**2 * float(np.vdot(values * mask, values))
     for _ in range(MOST_ITERATIONS):
         if float(np.vdot(rest, rest)) <= enough or product <= 0:
             break
@@ -113,22 +118,11 @@ def inverse_times(
     return np.asarray(solution)
 
 
-def response(spectrum_of: np.ndarray, number: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the correlation (r, c) of a picture, whose spectrum is given, with a template; of a coarse template, for
-    which the spectrum is that of `halved`, in the middles of 2 x 2 pixels."""
+def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the correlation (r, c) of a picture with a template, both as spectra; of `halved` ones for a ``shape``
+    half as large, in the middles of 2 x 2 pixels."""
     grid = (spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1))
-    if coarse(number):
-        template = spectra((2 * grid[0], 2 * grid[1]))[number]
-        shape = (-(-shape[0] // 2), -(-shape[1] // 2))
-    else:
-        template = spectra(grid)[number]
-    return np.asarray(scipy.fft.irfft2(spectrum_of * template, grid)[: shape[0], : shape[1]])
-
-
-def coarse(number: int) -> bool:
-    """Return whether a template is wide, or a slot's: its scores are taken on every second pixel only, so that four
-    cost as much as one."""
-    return number >= FIRST_SLOT or ALL_RADII_PX[number] >= COARSE_PX
+    return np.asarray(scipy.fft.irfft2(spectrum_of * template, grid, overwrite_x=True)[: shape[0], : shape[1]])
 
 
 def halved(spectrum_of: np.ndarray) -> np.ndarray:
@@ -149,73 +143,100 @@ def _low(spectrum_of: np.ndarray) -> np.ndarray:
     return np.concatenate((spectrum_of[:rows, :columns], spectrum_of[-rows:, :columns]))
 
 
+class Template(NamedTuple):
+    """A damage's picture on a square of an odd number of pixels, its centre ``halves`` (down, right) of half a pixel
+    off the middle; the radius of a disc as large; whether it is a slot; whether its scores change so slowly that every
+    second pixel tells them."""
+
+    image: np.ndarray
+    radius_px: float
+    halves: tuple[int, int] = (0, 0)
+    slot: bool = False
+    coarse: bool = False
+
+
 class Worth(NamedTuple):
     """The whitened energy of a template, and the sides (along columns, along rows), in pixels of its scores' picture,
-    of the rectangle over which it spreads as widely."""
+    of the rectangle over which it spreads as widely; ``raised``: by how much the square of a score exceeds that of the
+    template with the most independent places where maxima are as rare, halved so that the many wide templates together
+    do not make all false calls."""
 
     energy: float
     sides: tuple[int, int]
+    raised: float
 
 
-def worths(power: np.ndarray) -> tuple[Worth, ...]:
+def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     """Return what each template is worth under noise with this spectrum on `GRID`."""
-    found, white = [], 1.0 / np.sqrt(power)
+    found, crowds, white = [], [], 1.0 / np.sqrt(power)
     low = _low(white)
-    for number, template in enumerate(spectra((GRID, GRID))):
-        values = template * (low if coarse(number) else white)
+    for template, spectrum_of in zip(bank(window_px), spectra((GRID, GRID), window_px), strict=True):
+        values = np.abs(spectrum_of) * (low if template.coarse else white)
         # by Parseval's theorem; a second moment over space is the energy of a derivative over frequency
         half, side = np.full(values.shape[1], 2.0), len(values)
         half[[0, -1]] = 1.0
-        energy = float((values**2).sum(axis=0) @ half)
-        down = float(((values - np.roll(values, 1, axis=0)) ** 2).sum(axis=0) @ half)
+        energies = values**2 * half
+        energy = float(energies.sum())
+        down = float((((values - np.roll(values, 1, axis=0)) ** 2) * half).sum())
         along = 2.0 * float((np.diff(values, axis=1) ** 2).sum())
-        sides = (2 * round(math.sqrt(3.0 * each / energy) * side / (2.0 * math.pi)) + 1 for each in (along, down))
-        found.append(Worth(energy / GRID**2, (next(sides), next(sides))))
+        reach = (math.sqrt(3.0 * each / energy) * side / (2.0 * math.pi) for each in (along, down))
+        sides = (2 * min(SIDES_PX, key=lambda half_px, each=each: abs(half_px - each)) + 1 for each in reach)
+        # maxima are as dense as the root of the score's second spectral moments (Adler 1981)
+        cycles = np.fft.fftfreq(side)[:, None] ** 2, np.arange(values.shape[1])[None] ** 2 / side**2
+        crowds.append(math.prod(float((energies * each).sum()) / energy for each in cycles) ** 0.5 * side**2)
+        found.append(Worth(energy / GRID**2, (next(sides), next(sides)), 0.0))
+    most = max(crowds)
+    return tuple(one._replace(raised=math.log(most / crowd)) for one, crowd in zip(found, crowds, strict=True))
+
+
+@lru_cache(maxsize=6)
+def spectra(shape: tuple[int, ...], window_px: int) -> tuple[np.ndarray, ...]:
+    """Return the templates' spectra on a grid that holds them, conjugated, for the height 1 of the undisturbed damage;
+    of coarse templates the lower half. Those of symmetric templates are real."""
+    found = []
+    for template in bank(window_px):
+        drawn = scipy.fft.rfft2(_centred(template.image, shape)).conj()
+        drawn = drawn if any(template.halves) else drawn.real
+        found.append((_low(drawn) if template.coarse else drawn).copy())
     return tuple(found)
 
 
-@lru_cache(maxsize=4)
-def spectra(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra on a grid that holds them, which are real as templates are symmetric, for the
-    height 1 of the undisturbed damage; of coarse templates the lower half."""
-    drawn = (scipy.fft.rfft2(_centred(template, shape)).real for template in _templates())
-    return tuple((_low(each) if coarse(number) else each).copy() for number, each in enumerate(drawn))
+@lru_cache(maxsize=3)
+def bank(window_px: int) -> tuple[Template, ...]:
+    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids, slots."""
 
+    def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
+        def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+            return np.hypot(x - off[1], y - off[0]) < radius_px
 
-@lru_cache(maxsize=1)
-def _templates() -> tuple[np.ndarray, ...]:
-    """Return the templates, each on a square of an odd number of pixels."""
-    window = np.outer(WINDOW, WINDOW) / np.sum(WINDOW) ** 2
+        halves = (int(2 * off[0]), int(2 * off[1]))
+        return Template(seen(inside, radius_px), radius_px, halves, coarse=radius_px >= COARSE_PX)
 
-    def disc(radius_px: float) -> np.ndarray:
-        return _drawn(lambda x, y: np.hypot(x, y) < radius_px, radius_px, LENS_BLUR_PX)
+    def dent(radius_px: float) -> Template:
+        image = seen(lambda x, y: np.maximum(1.0 - (x**2 + y**2) / radius_px**2, 0.0), radius_px)
+        return Template(image, radius_px, coarse=radius_px >= COARSE_PX)
 
-    def dent(radius_px: float) -> np.ndarray:
-        return _drawn(lambda x, y: np.maximum(1.0 - (x**2 + y**2) / radius_px**2, 0.0), radius_px, DENT_BLUR_PX)
-
-    def slot(angle_deg: float) -> np.ndarray:
+    def slot(angle_deg: float) -> Template:
         turn = np.exp(-1j * math.radians(angle_deg))
 
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             along = (x + 1j * y) * turn
             return (np.abs(along.real) < SLOT_PX[0] / 2) & (np.abs(along.imag) < SLOT_PX[1] / 2)
 
-        return _drawn(inside, SLOT_PX[0] / 2, LENS_BLUR_PX)
+        return Template(seen(inside, SLOT_PX[0] / 2), SLOT_PX[0] / 4, slot=True, coarse=True)
 
-    def windowed(image: np.ndarray) -> np.ndarray:
-        return cv2.filter2D(image, -1, window, borderType=cv2.BORDER_CONSTANT)
+    def seen(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float) -> np.ndarray:
+        """Return a shape of x and y in pixels, averaged over pixels, and through the window or a lens."""
+        finer, half = 4, int(reach_px + 5)
+        places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
+        height = shape(places[None, :], places[:, None]).astype(float)
+        pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
+        if window_px > 1:
+            return np.asarray(cv2.blur(pixels, (window_px, window_px), borderType=cv2.BORDER_CONSTANT))
+        return np.asarray(cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=cv2.BORDER_CONSTANT))
 
-    sharp, slots = map(disc, SHARP_RADII_PX), [slot(angle_deg) for angle_deg in SLOTS_DEG]
-    return (*map(windowed, map(disc, RADII_PX)), *sharp, *map(dent, DENT_RADII_PX), *map(windowed, slots), *slots)
-
-
-def _drawn(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float, blur_px: float) -> np.ndarray:
-    """Return a shape of x and y in pixels, averaged over pixels and blurred by a Gaussian."""
-    finer, half = 4, int(reach_px + 5)
-    places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
-    height = shape(places[None, :], places[:, None]).astype(float)
-    pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
-    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT))
+    small = (disc(radius_px, off) for radius_px in SMALL_RADII_PX for off in HALVES_PX)
+    return (*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG))
 
 
 def noise_factor(
