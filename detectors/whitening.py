@@ -68,11 +68,13 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def window_of(covariance: np.ndarray) -> int:
-    """Return the side of `WINDOWS_PX` that fits noise: a box of b pixels leaves neighbours unlike by 1 / b."""
+    """Return the side of `WINDOWS_PX` that noise shows: its covariance falls steadily with the lag up to the side of a
+    square, and bends there; neighbours that share less than half were not averaged."""
     middle = len(covariance) // 2
-    beside = (covariance[middle, middle + 1] + covariance[middle + 1, middle]) / 2.0
-    unlike = 1.0 - float(beside) / max(float(covariance[middle, middle]), 1e-12)
-    return min(WINDOWS_PX, key=lambda side: abs(math.log(max(unlike, 0.2) * side)))
+    by_lag = (covariance[middle, middle:] + covariance[middle:, middle]) / 2.0
+    if by_lag[1] < 0.5 * by_lag[0]:
+        return 1
+    return max(WINDOWS_PX[1:], key=lambda side: float(by_lag[side - 1] - 2.0 * by_lag[side] + by_lag[side + 1]))
 
 
 def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
