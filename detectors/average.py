@@ -10,9 +10,11 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Literal
 
+import numba
 import numpy as np
 from pydantic import Field
 
+from detectors.clusters import PLAIN
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason
@@ -22,6 +24,8 @@ REFERENCE_FRAMES = 5
 SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: a changed fraction of 5 % is then known to 0.35 %, a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine that filters over 5x5
+
+NOT_FINITE = int(Reason.NOT_FINITE)
 
 
 class AverageConfig(Config):
@@ -208,26 +212,15 @@ class FrameSums:
                 )
             self.stack.append(z.astype(np.float32))
         self.frames += 1
-        used, reason = np.isfinite(z), frame.reason.ravel()
-        gone = np.flatnonzero(~used)
-        self.reasons[np.where(reason[gone] > 0, reason[gone], Reason.NOT_FINITE), gone] += 1
-        np.copyto(self.offset, z, where=used & np.isnan(self.offset))
-        deviation = z - self.offset
-        if self.gate is not None:
-            # a pixel that the first frames never saw has no gate (NaN) and takes every sample
-            used &= ~(np.abs(deviation) > self.gate)
-        self.count += used
-        self.total[used] += deviation[used]
-        self.squares[used] += deviation[used] ** 2
+        gate = np.full(1, np.nan, np.float32) if self.gate is None else self.gate
+        sums = self.offset, self.count, self.total, self.squares, self.reasons
+        used = _added(z, frame.reason.ravel(), gate, *sums)
         # further channels over the samples that the depth used
         for name, values, width in (("xy", frame.xy_m, 2), ("amplitude", frame.amplitude, 1)):
             if values is not None:
                 empty = np.zeros((z.size, width)), np.zeros((z.size, width), dtype=np.int32)
                 total, count = self.channels.setdefault(name, empty)
-                flat = values.reshape(-1, width)
-                known = np.isfinite(flat) & used[:, None]
-                np.add(total, flat, out=total, where=known)
-                count += known
+                _add_where(values.reshape(-1, width), used, total, count)
         if frame.rgb is not None:
             self.rgb_total = frame.rgb.astype(np.uint32) if self.rgb_total is None else self.rgb_total + frame.rgb
             self.rgb_frames += 1
@@ -269,6 +262,39 @@ class FrameSums:
             amplitude=means["amplitude"].reshape(self.shape) if "amplitude" in means else None,
             left_out=tuple(self.left_out),
         )
+
+
+@numba.njit(**PLAIN)
+def _added(  # type: ignore[no-untyped-def]
+    z, reason, gate, offset, count, total, squares, reasons
+):
+    """Add a frame's z (n,) less the ``offset`` to the sums, and return (n,) bool where it counts: not where it is
+    farther off than the ``gate`` (n,). NaN, for a pixel that the first frames never saw, or one NaN for all, is no
+    gate."""
+    used = np.zeros(len(z), np.bool_)
+    for i in range(len(z)):
+        if not np.isfinite(z[i]):
+            reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
+            continue
+        if np.isnan(offset[i]):
+            offset[i] = z[i]
+        deviation = z[i] - offset[i]
+        if abs(deviation) > gate[i if len(gate) > 1 else 0]:
+            continue
+        used[i] = True
+        count[i] += 1
+        total[i] += deviation
+        squares[i] += deviation * deviation
+    return used
+
+
+@numba.njit(**PLAIN)
+def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: np.ndarray) -> None:
+    for i in range(len(values)):
+        for k in range(values.shape[1]):
+            if used[i] and np.isfinite(values[i, k]):
+                total[i, k] += values[i, k]
+                count[i, k] += 1
 
 
 def _median_finite(values: np.ndarray) -> float:

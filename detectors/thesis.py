@@ -55,7 +55,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 4
+    version = 5
 
     @property
     def default_threshold(self) -> float | None:

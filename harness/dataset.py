@@ -143,7 +143,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         boards = []
         for sample in missing:
             arguments = (out, sample, windows[sample.category])
-            boards.append(Job(sample.name, "trials", write_board, arguments, (sample.render.path,)))
+            boards.append(Job(sample.name, "trials", write_board, arguments))
         carry_out(boards, outcome.trials)
     return failures
 

@@ -19,20 +19,20 @@ pytest.importorskip("distributed")
 from cluster_processes import square
 
 from harness.engine import cluster as cluster_engine
-from harness.engine.cluster import Bundle, Carried, ClusterEngine, NodeFacts
+from harness.engine.cluster import Bundle, ClusterEngine, NodeFacts
 from harness.engine.work import Ended, Job, Limits, code_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import source_digest
-from scenes.render import cache
 
 FIRST, SECOND = "tcp://first:1", "tcp://second:1"
 CODE = code_of(["thesis"])
 DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}
+SEEN = "the driver's mark"
 
 
 def facts(*, can_render: bool = True, processes: int = 1) -> NodeFacts:
     digests = DIGESTS if can_render else {"trials": DIGESTS["trials"]}
-    return NodeFacts(platform.python_version(), digests, processes, offers_render=False, sees=None)
+    return NodeFacts(platform.python_version(), digests, processes, offers_render=False, sees=SEEN)
 
 
 class FakeClient:
@@ -66,7 +66,7 @@ class FakeClient:
     def answer(self, number: int, said: Any = None) -> None:
         """Let a bundle be carried out, or end as the test says."""
         address, bundle, future = self.sent[number]
-        said = Carried(tuple(Ended("done", 1) for _ in bundle.jobs)) if said is None else said
+        said = tuple(Ended("done", 1) for _ in bundle.jobs) if said is None else said
         self.loop.asyncio_loop.call_soon_threadsafe(future.set_result, {address: said})
 
 
@@ -87,7 +87,8 @@ def client(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeClient]:
 
 def engine_with(client: FakeClient, *, scheduler: str = "tcp://driver:1", **nodes: NodeFacts) -> ClusterEngine:
     """An engine that knows its nodes."""
-    engine = ClusterEngine(scheduler, Limits(seconds=900.0), 1, CODE)
+    engine = ClusterEngine(scheduler, Limits(seconds=900.0), 1, CODE, Path())
+    engine._nonce = SEEN
     engine._client = client
     client.nodes |= {f"tcp://{name}:1": said for name, said in nodes.items()}
     stepped(engine, lambda: len(engine._nodes) + len(engine._refused) == len(nodes))
@@ -136,6 +137,13 @@ def test_a_node_of_another_version_is_left_out_while_others_are_there(tmp_path, 
     del client.nodes[SECOND]
     with pytest.raises(UserError, match="runs another version of tofpod"):
         engine.ended()
+
+
+def test_a_node_that_does_not_see_the_folder_of_renders_is_left_out(client, capsys):
+    engine = engine_with(client, first=replace(facts(), sees=None), second=facts())
+    assert set(engine._nodes) == {SECOND}
+    assert "first:1 does not see" in capsys.readouterr().err
+    engine.__exit__()
 
 
 def test_a_node_whose_processes_load_edited_code_is_left_out_and_loses_nothing(client, capsys):
@@ -212,27 +220,6 @@ def test_a_worker_without_tofpod_is_refused_at_the_start(client, error):
         stepped(engine, lambda: engine._nodes)
 
 
-def test_views_that_a_node_lacks_are_sent(tmp_path, client):
-    view = tmp_path / "view.npz"
-    view.write_bytes(b"content")
-    engine = engine_with(client, first=facts())
-    engine.submit(replace(trial("one"), needs=(view,)))
-    handed_out(engine, client)
-    assert client.sent[0][1].views == {}
-    client.answer(0, Carried(missing=("view.npz",)))
-    stepped(engine, lambda: len(client.sent) == 2)
-    assert client.sent[1][1].views == {"view.npz": b"content"}
-    client.answer(1)
-    assert [job.name for job, _ in engine.ended()] == ["one"]
-    view.unlink()
-    engine.submit(replace(trial("two"), needs=(view,)))
-    handed_out(engine, client, 3)
-    client.answer(2, Carried(missing=("view.npz",)))
-    stepped(engine, lambda: len(client.sent) == 4)
-    assert client.sent[3][1].views == {"view.npz": b""}, "the trial itself says that its view cannot be read"
-    engine.__exit__()
-
-
 def test_a_batch_system_is_waited_for_as_long_as_it_takes(client, monkeypatch, capsys):
     engine = engine_with(client, scheduler="jobqueue:slurm")
     monkeypatch.setattr(cluster_engine, "WAIT_FOR_NODES_S", 0.2)
@@ -243,12 +230,3 @@ def test_a_batch_system_is_waited_for_as_long_as_it_takes(client, monkeypatch, c
     started_by_hand = engine_with(client)
     with pytest.raises(UserError, match="no worker came"):
         stepped(started_by_hand, lambda: False)
-
-
-def test_the_probe_of_a_killed_driver_is_a_leftover(tmp_path, client):
-    engine = engine_with(client, first=facts())
-    engine.submit(render(tmp_path))
-    assert len(list(tmp_path.iterdir())) == 1
-    assert [one.path for one in cache.leftovers(tmp_path, -60.0)] == list(tmp_path.iterdir())
-    engine.__exit__()
-    assert not list(tmp_path.iterdir())

@@ -21,7 +21,7 @@ import sys
 import time
 import warnings
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from typing import Any
 from harness.engine.processes import MOST_RENDERERS, Answers, LocalEngine
 from harness.engine.work import Code, Ended, Job, Limits, Stage
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_bytes, write_text
+from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import source_digest
 
 BUNDLE_S = 0.25
@@ -42,7 +42,6 @@ TRIES = 5
 ANSWERS_S = 5  # a scheduler that is there answers a connection in milliseconds
 EXAMINED_S = 60.0  # time for a node to say what it is: it reads the sources, from a network's disk perhaps
 CLOSES_S = 1.0
-KEPT_VIEWS = 32  # views that were sent and stay on a node's disk, 4 MB each; beside those of bundles under way
 NAMES = ("SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local")
 KINDS = {name.lower(): f"{name}Cluster" for name in NAMES}
 """Classes of dask-jobqueue, each in a module of the kind's name; "local" starts its jobs on this machine."""
@@ -50,23 +49,10 @@ KINDS = {name.lower(): f"{name}Cluster" for name in NAMES}
 
 @dataclass(frozen=True)
 class Bundle:
-    """Jobs of one stage for one node. ``shares``: it sees the driver's cache; else ``views`` are contents of some that
-    the jobs read, by name."""
+    """Jobs of one stage for one node."""
 
     jobs: tuple[Job, ...]
     limits: Limits
-    shares: bool
-    views: dict[str, bytes] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Carried:
-    """The ends of a bundle's jobs, in order. ``rendered``: files for the driver's cache that the node does not see.
-    ``missing``: views that are not here and were not sent; then no job was begun."""
-
-    ended: tuple[Ended, ...] = ()
-    rendered: dict[str, bytes] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,16 +75,18 @@ class _Node:
     processes: int
     can_render: bool
     offers_render: bool
-    shares: bool
     bundles: dict[int, Bundle] = field(default_factory=dict)
     renders: int = 0
 
 
 class ClusterEngine:
     """Jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like, asked for
-    ``workers_wanted``. ``limits`` are a trial's; renders have its limit of time only. ``code``: as `LocalEngine`."""
+    ``workers_wanted``. ``limits`` are a trial's; renders have its limit of time only. ``code``: as `LocalEngine`.
+    ``folder``: where jobs read and store renders; nodes that do not see it are left out."""
 
-    def __init__(self, scheduler: str, limits: Limits, workers_wanted: int, code: Mapping[Stage, Code]) -> None:
+    def __init__(
+        self, scheduler: str, limits: Limits, workers_wanted: int, code: Mapping[Stage, Code], folder: Path
+    ) -> None:
         self._scheduler, self._limits, self._wanted = scheduler, limits, workers_wanted
         self._code = dict(code)
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
@@ -117,13 +105,16 @@ class ClusterEngine:
         self._mean_s = BUNDLE_S  # mean duration of a trial; at first as if each were worth a bundle of its own
         self._looked = float("-inf")
         self._lacking, self._lacking_since = "", time.monotonic()  # nodes that could do what waits, lacking since then
-        self._probe: Path | None = None
         self._nonce = secrets.token_hex(16)  # names this driver to the nodes
+        # a file that tells whether a node sees the folder; to the cache of renders it is a leftover
+        self._probe = folder.absolute() / f".{self._nonce[:16]}.seen.part.npz"
         self._told: set[str] = set()
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> ClusterEngine:
         with contextlib.ExitStack() as stack:
+            write_text(self._probe, self._nonce)
+            stack.callback(self._probe.unlink, missing_ok=True)
             self._client = stack.enter_context(_connected(self._scheduler, self._wanted))
             while not self._nodes:
                 self._step()
@@ -131,9 +122,6 @@ class ClusterEngine:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._probe is not None:
-            with contextlib.suppress(OSError):
-                self._probe.unlink(missing_ok=True)
         busy = [one.address for one in self._nodes.values() if one.bundles]
         if busy and self._client.status == "running":
 
@@ -151,9 +139,6 @@ class ClusterEngine:
 
     def submit(self, job: Job) -> None:
         """Take a job."""
-        folder = Path(job.arguments[-1]) if job.stage == "renders" else next((path.parent for path in job.needs), None)
-        if folder is not None and self._probe is None:
-            self._place_probe(folder)
         self._out[job.stage] += 1
         self._waiting[job.stage].append(job)
 
@@ -182,34 +167,15 @@ class ClusterEngine:
                 # where nodes are set aside for renders, these first there
                 may_render &= to.processes > 1 or not (to.bundles or (trials and not to.offers_render))
                 if renders and may_render and to.renders < min(MOST_RENDERERS, to.processes):
-                    job = renders.popleft()
-                    if to.shares or not self._is_in_cache(job):
-                        self._send(to, (job,))
+                    self._send(to, (renders.popleft(),))
                 elif trials and len(to.bundles) - to.renders <= most and not (to.processes == 1 and to.renders):
                     share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
                     count = min(self._bundle_size() * to.processes, max(share, to.processes), len(trials))
                     self._send(to, tuple(trials.popleft() for _ in range(count)))
 
-    def _is_in_cache(self, job: Job) -> bool:
-        """Return whether this machine's cache holds a render for a node that does not see it; then the job is done."""
-        from scenes.render.cache import read_view
-
-        found = read_view(Path(job.arguments[-1]) / job.name)
-        if found is not None:
-            self._over(job, Ended("done", (True, found.seconds), worker="this process"))
-        return found is not None
-
-    def _send(self, to: _Node, jobs: tuple[Job, ...], missing: Iterable[str] = ()) -> None:
-        """Send a bundle, with missing views; one that cannot be read here goes empty, so that its trials say so."""
-        paths = {path.name: path for job in jobs for path in job.needs}
-        views = {}
-        for name in missing:
-            try:
-                views[name] = paths[name].read_bytes()
-            except OSError:
-                views[name] = b""
+    def _send(self, to: _Node, jobs: tuple[Job, ...]) -> None:
         self._number += 1
-        bundle = to.bundles[self._number] = Bundle(jobs, self._limits, to.shares, views)
+        bundle = to.bundles[self._number] = Bundle(jobs, self._limits)
         to.renders += jobs[0].stage == "renders"
         self._call(to.address, self._number, carry_out, bundle, self._code, self._nonce)
 
@@ -256,7 +222,7 @@ class ClusterEngine:
             raise UserError(f"the scheduler at {self._scheduler} is gone", fix=fix)
         for address in there - self._asked:
             self._asked.add(address)
-            self._call(address, None, examine, self._code, None if self._probe is None else str(self._probe))
+            self._call(address, None, examine, self._code, str(self._probe))
         for address in self._asked - there:
             self._asked.discard(address)
             self._refused.pop(address, None)
@@ -272,12 +238,8 @@ class ClusterEngine:
         if one is None or bundle is None:
             return  # the node was given up meanwhile
         one.renders -= bundle.jobs[0].stage == "renders"
-        if isinstance(said, Carried) and said.missing:
-            self._send(one, bundle.jobs, said.missing)
-        elif isinstance(said, Carried):
-            for name, content in said.rendered.items():
-                write_bytes(Path(bundle.jobs[0].arguments[-1]) / name, content)
-            for job, ended in zip(bundle.jobs, said.ended, strict=True):
+        if isinstance(said, tuple):
+            for job, ended in zip(bundle.jobs, said, strict=True):
                 if job.stage == "trials":
                     self._mean_s += 0.1 * (ended.seconds - self._mean_s)
                 self._over(job, ended)
@@ -307,11 +269,12 @@ class ClusterEngine:
             message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
             fix = "install the same there, and start its workers again: they keep the code that they began with"
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
+        elif said.sees != self._nonce:
+            message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
+            self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
             can_render = said.digests.get("renders") == self._digests.get("renders")
-            # it may have been looked at before there was anything to see
-            shares = said.sees == self._nonce or (self._probe is not None and bool(self._sharing([address])))
-            self._nodes[address] = _Node(address, said.processes, can_render, said.offers_render, shares)
+            self._nodes[address] = _Node(address, said.processes, can_render, said.offers_render)
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
@@ -360,22 +323,6 @@ class ClusterEngine:
             self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
             if time.monotonic() - self._lacking_since > WAIT_FOR_NODES_S:
                 raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
-
-    def _place_probe(self, folder: Path) -> None:
-        """Write a file that tells whether a node sees the driver's cache; to the cache it is a leftover."""
-        self._probe = folder / f".{self._nonce[:16]}.seen.part.npz"
-        write_text(self._probe, self._nonce)
-        sharing = self._sharing(list(self._nodes))
-        for one in self._nodes.values():
-            one.shares = one.address in sharing
-        if apart := len(self._nodes) - len(sharing):
-            of_all = f"{apart} of {len(self._nodes)} workers"
-            self._tell_once(f"{of_all} do not see {folder}: renders are sent over the network")
-
-    def _sharing(self, addresses: list[str]) -> set[str]:
-        """The nodes that see the probe; a node that does not answer sees nothing."""
-        said = self._client.run(seen, str(self._probe), workers=addresses, on_error="ignore")
-        return {address for address, content in said.items() if content == self._nonce}
 
     def _tell_once(self, message: str) -> None:
         if message not in self._told:
@@ -439,10 +386,9 @@ def _bare(address: str) -> str:
 
 _engines: dict[str, LocalEngine] = {}  # engines by the code that they run: one, but for drivers of unlike experiments
 _awaited: dict[str, set[Answers]] = {}  # answers that each driver waits for
-_users: Counter[str] = Counter()  # number of bundles under way that need each view that was sent
 
 
-def examine(code: Mapping[Stage, Code], probe: str | None, dask_worker: Any) -> NodeFacts:
+def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFacts:
     """Describe this node. Digests are taken once a process: files that change later are not what it runs."""
     digests: dict[Stage, str] = {}
     for stage, which in code.items():
@@ -450,14 +396,10 @@ def examine(code: Mapping[Stage, Code], probe: str | None, dask_worker: Any) -> 
             digests[stage] = source_digest(*which)
     state = dask_worker.state
     offers_render = state.total_resources.get("render", 0) > 0
-    return NodeFacts(platform.python_version(), digests, state.nthreads, offers_render, seen(probe))
-
-
-def seen(probe: str | None) -> str | None:
-    """Return the content of a file; None where it is not there."""
+    sees = None
     with contextlib.suppress(OSError):
-        return None if probe is None else Path(probe).read_text()
-    return None
+        sees = Path(probe).read_text()
+    return NodeFacts(platform.python_version(), digests, state.nthreads, offers_render, sees)
 
 
 def drop(driver: str) -> None:
@@ -467,53 +409,30 @@ def drop(driver: str) -> None:
             engine.drop(answers)
 
 
-async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> Carried:
-    """Do the jobs of a bundle. Raises UserError where the node's processes run other code or cannot start."""
-    own = Path(dask_worker.local_directory) / "tofpod-views"
+async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> tuple[Ended, ...]:
+    """Do the jobs of a bundle; returns their ends, in order. Raises UserError where the node's processes run other code
+    or cannot start."""
     key = repr(sorted(code.items()))
     if key not in _engines:
-        _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code, sent_views=own)
+        _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code)
         _engines[key].__enter__()
         atexit.register(_engines[key].__exit__)
-    needs = set() if bundle.shares else {path.name for job in bundle.jobs for path in job.needs}
-    missing = _keep(own, needs, bundle.views)
-    if missing:
-        return Carried(missing=missing)
     answers = Answers()
     _awaited.setdefault(driver, set()).add(answers)
-    _users.update(needs)
     try:
-        return await asyncio.to_thread(_carried, bundle, _engines[key], answers, own, dask_worker.address)
+        return await asyncio.to_thread(_ends_of, bundle, _engines[key], answers, _bare(dask_worker.address))
     finally:
         _awaited.get(driver, set()).discard(answers)
-        _users.subtract(needs)
 
 
-def _carried(bundle: Bundle, engine: LocalEngine, answers: Answers, own: Path, address: str) -> Carried:
-    renders_here = bundle.jobs[0].stage == "renders" and not bundle.shares
+def _ends_of(bundle: Bundle, engine: LocalEngine, answers: Answers, worker: str) -> tuple[Ended, ...]:
     for job in bundle.jobs:
-        given = replace(job, arguments=(*job.arguments[:-1], str(own))) if renders_here else job
-        engine.put(given, bundle.limits, answers)
+        engine.put(job, bundle.limits, answers)
     ended: dict[str, Ended] = {}
     while len(ended) < len(bundle.jobs) and not answers.is_dropped:
         said = answers.ended.get()
         if isinstance(said, UserError):
             engine.drop(answers)
             raise said
-        ended[said[0].name] = replace(said[1], worker=_bare(address))
-    there = [name for name, how in ended.items() if renders_here and how.state == "done"]
-    rendered = {name: (own / name).read_bytes() for name in there}
-    return Carried(tuple(ended[job.name] for job in bundle.jobs if job.name in ended), rendered)
-
-
-def _keep(own: Path, needs: set[str], views: Mapping[str, bytes]) -> tuple[str, ...]:
-    """Store views that came, let go of the oldest, and return the names of those that are not here."""
-    for name in needs:
-        if (own / name).exists():
-            (own / name).touch()
-        elif name in views:
-            write_bytes(own / name, views[name], durable=False)
-    for path in sorted(own.glob("*.npz"), key=lambda path: path.stat().st_mtime)[: -2 * KEPT_VIEWS]:
-        if path.name not in needs and not _users[path.name]:
-            path.unlink()
-    return tuple(name for name in needs if not (own / name).exists())
+        ended[said[0].name] = replace(said[1], worker=worker)
+    return tuple(ended[job.name] for job in bundle.jobs if job.name in ended)

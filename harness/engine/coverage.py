@@ -150,10 +150,7 @@ def _each(
     act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
 ) -> list[Any]:
     """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
-    jobs = [
-        Job(str(n), "trials", act, (*some, *further), tuple(path for batch in some for path in batch.paths))
-        for n, some in enumerate(asked)
-    ]
+    jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     return [end.result() if end.state == "done" or end.is_bug else None for end in (ends[job.name] for job in jobs)]
 

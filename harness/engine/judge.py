@@ -17,7 +17,7 @@ from detectors.masks import grown
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
 from detectors.score_map import Findings, findings_at
-from harness.engine.setup import KnownCloud, at_hand, highest_within
+from harness.engine.setup import KnownCloud, highest_within
 from harness.evaluation.match import closest_pairs
 from harness.vocabulary.geometry import MM
 from scenes.target.flaws import from_line_m
@@ -165,7 +165,7 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
     detector = load_detector(name, json.loads(settings_json))
     if learned is None or not isinstance(detector, Calibratable):
         return detector
-    with np.load(at_hand(learned), allow_pickle=False) as arrays:
+    with np.load(learned, allow_pickle=False) as arrays:
         return detector.calibrated(dict(arrays))
 
 

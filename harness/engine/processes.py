@@ -55,12 +55,10 @@ class LocalEngine:
     """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
     renders have no memory limit, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
     a stage; a process that starts after one of their sources was edited is refused, because its results would be stored
-    as those of the code that this process runs. ``sent_views``: as `harness.engine.setup.sent_views`."""
+    as those of the code that this process runs."""
 
-    def __init__(
-        self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None, sent_views: Path | None = None
-    ) -> None:
-        self.code, self.sent_views = dict(code or {}), sent_views
+    def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
+        self.code = dict(code or {})
         self.digests = {stage: source_digest(*which) for stage, which in self.code.items()}
         self.false_starts = 0
         self.is_over = False
@@ -190,7 +188,7 @@ class _Worker(threading.Thread):
         """Start a process that can take jobs. Raises UserError where it runs other sources, or none can start."""
         engine = self._engine
         self._pipe, theirs = multiprocessing.get_context("spawn").Pipe()
-        arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage), engine.sent_views)
+        arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage))
         with _spawning():
             process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
             process.start()
@@ -292,9 +290,7 @@ def _spawning() -> Iterator[None]:
 # ---------------------------------------------------------------- in the process
 
 
-def serve(
-    pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None, sent_views: Path | None
-) -> None:
+def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None) -> None:
     """Carry out jobs until the driver closes the pipe. What kills this process stands in the file ``said``."""
     words = _prepare(said)
     try:
@@ -302,9 +298,7 @@ def serve(
             import cv2
 
             import harness.engine.trial  # noqa: F401
-            from harness.engine import setup
 
-            setup.sent_views = sent_views
             cv2.setNumThreads(1)
             # plug-ins are loaded now, so that the digest is that of what will run
             for module in code[0] if code else ():

@@ -205,7 +205,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
     outcome.failures += failures
     lost = {failure.what for failure in failures}
     jobs = [
-        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds), _needs(group, outcome))
+        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds))
         for number, group in enumerate(groups)
         if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
     ]
@@ -215,12 +215,6 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
             outcome.examples += ends[job.name].value
         else:
             outcome.failures.append(_failure(job.name, ends[job.name]))
-
-
-def _needs(group: Group, outcome: Outcome) -> tuple[Path, ...]:
-    """Files that the pictures of a group need: views, and what detectors have learned."""
-    learned = (Path(file) for point, file in group.learned.items() if point in outcome.thresholds)
-    return (*group.damaged.paths, *learned)
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
@@ -405,9 +399,7 @@ class _Run:
                 return
         self._begun += 1
         self.under_way[trial.key] = trial
-        learned = (Path(point.learned) for point in trial.task.points if point.learned is not None)
-        needs = (*trial.part.batch.paths, *learned)
-        self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,), needs))
+        self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,)))
 
     def _trials(self, part: PlanPart) -> list[_Trial]:
         """The trials of a part; judged ones that others judged at agreeing thresholds are filed under their keys."""

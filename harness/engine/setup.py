@@ -166,16 +166,6 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
     return np.asarray(place)
 
 
-sent_views: Path | None = None
-"""The folder, in a process that does not see the driver's cache, where files that were sent lie under their names."""
-
-
-def at_hand(path: str) -> Path:
-    """Return the path of a stored file in this process: its own, or that of what was sent."""
-    place = Path(path)
-    return sent_views / place.name if sent_views is not None and not place.exists() else place
-
-
 KEPT, KEPT_BYTES = 32, 200_000_000
 """Most set-ups that a worker keeps, and most light of their views: three views from near of a lidar, whose light has 31
 frequencies."""
@@ -195,7 +185,7 @@ def load_set_up(ref: SetUpRef) -> SetUp:
 
 
 def _read_set_up(ref: SetUpRef) -> SetUp:
-    place, T_camera_board = at_hand(ref.view_path), ref.target.pose.T_camera_board
+    place, T_camera_board = Path(ref.view_path), ref.target.pose.T_camera_board
     view = read_view(place)
     if view is None:
         raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")

@@ -50,11 +50,12 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     _refuse_newer(folder)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
-        plan = plan_of(experiment, cache, folder)
+        # other processes need not have been started in the same folder
+        plan = plan_of(experiment, cache.absolute(), folder.absolute())
         # the first file written: an unwritable folder shows before any work is done
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         journal = Journal(folder / "journal")
-        with in_use(cache), locked(folder, options.shard), engine_of(options, detectors) as engine:
+        with in_use(cache), locked(folder, options.shard), engine_of(options, detectors, cache) as engine:
             with progress_display() as report:
                 retry = options.retry_failed
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)

@@ -2,9 +2,8 @@
 against the truth.
 
 Averages are drawn at once where that is equal in distribution (plain means of at least `FEWEST_FRAMES` frames, where
-the camera's model can), from single frames otherwise. Frames that jump as a whole are left out as `detectors.average`
-leaves them out: its verdict hangs on how far each frame is displaced, which is known exactly here. Where a verdict
-might go either way, by the pixels' noise, the frames are drawn one by one.
+the camera's model can), from single frames otherwise. Frames that jump as a whole are left out by how far each is
+displaced, which is known exactly here.
 """
 
 from __future__ import annotations
@@ -12,9 +11,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
-from itertools import islice
-from operator import add
+from functools import lru_cache
+from itertools import islice, pairwise
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -43,9 +41,6 @@ from scenes.sensor.unit import FrameTotals
 FEWEST_FRAMES = 20
 """Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
 and 25 of one with holes before a far wall. By number only, so that no result hangs on what was sorted before."""
-SURE = 5.0
-"""Standard errors by which a frame's displacement keeps from a limit of the judge, so that noise cannot decide; fewer
-than `AverageConfig.jump_sigmas`, or no frame of a noisy camera would."""
 FLAT_ALBEDO = 0.6  # of a flat field's plane: painted wood or paper, as the boards of the experiments
 MOST_DISTURBED = 0.5
 """Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb. A frame's own share scatters about
@@ -86,70 +81,40 @@ def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> F
 
 
 def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
-    """The averages that can be drawn at once."""
+    """The averages that can be drawn at once, of `REFERENCE_FRAMES` frames and more."""
     summer = capture.unit.at_once
-    if summer is None or counts[-1] > capture.n_frames:
+    if summer is None or counts[-1] > capture.n_frames or (config.judge_frames and not summer.sure_pixels):
         return {}
     # one frame's noise as the judge finds it: with its rounding
     noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
-    verdicts = {n: _verdict(capture, summer, n, config, noise_m) for n in counts}
-    judged = {n: verdict for n, verdict in verdicts.items() if verdict is not None}
-    # frames that every average takes or leaves together, as the first of their numbers and their sums
-    most = max(judged, default=0)
-    used = np.array([[number < n and bool(kept[number]) for n, (kept, _) in judged.items()] for number in range(most)])
-    parts = []
-    for pattern in np.unique(used, axis=0) if most else ():
-        frames = np.flatnonzero((used == pattern).all(axis=1))
-        totals = capture.totals(frames) if pattern.any() else None
-        if pattern.any() and totals is None:
-            return {}
-        if totals is not None:
-            parts.append((frames[0], totals))
+    left_out = _left_out(capture, summer, config, noise_m) if config.judge_frames else {}
+    sums: FrameTotals | None = None
     clouds: dict[int, Cloud] = {}
-    for n, (kept, left_out) in judged.items():
-        together = [totals for first, totals in parts if first < n and kept[first]]
-        cloud = _cloud(capture, reduce(add, together), left_out) if together else None
+    for start, n in pairwise([0, *counts]):
+        frames = np.array([number for number in range(start, n) if number not in left_out])
+        totals = capture.totals(frames) if len(frames) else None
+        if totals is None and len(frames):
+            return {}
+        sums = sums + totals if sums and totals else sums or totals
+        before = tuple(left for number, left in left_out.items() if number < n)
+        cloud = _cloud(capture, sums, before) if sums else None
         if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
             clouds[n] = cloud
     return clouds
 
 
-def _verdict(
-    capture: SimulatedCapture, summer: AtOnce, n: int, config: AverageConfig, noise_m: float
-) -> tuple[np.ndarray, tuple[LeftOut, ...]] | None:
-    """The judgement of `detectors.average` on the first n frames: (n,) bool, those that are used, and those left out;
-    None where the pixels' noise might decide."""
-    shift_m = summer.z_by_error * capture.errors_m[:n]
-    if not config.judge_frames:
-        return np.ones(n, bool), ()
-    if summer.sure_pixels == 0:
-        return None
+def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, noise_m: float) -> dict[int, LeftOut]:
+    """The frames, by number, that `detectors.average` leaves out for a jump, by the displacement of each as it is: the
+    judge's own error, a sixth of the limit at most, is not drawn."""
     sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
     error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
-    limit_m, slack_m = max(config.jump_sigmas * error_m, config.jump_mm * MM), SURE * error_m
-    # displacement of the reference that the first frames make
-    first_m = shift_m[:REFERENCE_FRAMES]
-    apart = np.abs(first_m[:, None] - first_m)
-    middle = np.sort(apart, axis=1)[:, len(first_m) // 2]
-    nearest = int(np.argmin(middle))
-    # two frames are each as far from the other, and the first is taken; of more, the middle one must have company
-    if (np.abs(apart - limit_m) < slack_m).any() or (len(first_m) > 2 and middle[nearest] > limit_m):
-        return None
-    agreeing = first_m[apart[nearest] <= limit_m]
-    reference_m = float(np.median(agreeing)) if len(agreeing) > 2 else float(first_m[nearest])
-    off_m = np.abs(shift_m - reference_m)
-    if (np.abs(off_m - limit_m) < slack_m).any():
-        return None
-    against = f"the first {min(n, REFERENCE_FRAMES)} frames" if n > 2 else "the first frame"
-    left_out = tuple(
-        LeftOut(
-            f"frame {number}",
-            f"the whole range jumps by {(shift_m[number] - reference_m) / MM:+.1f} mm against {against}"
-            f" (allowed {limit_m / MM:.1f} mm)",
-        )
-        for number in np.flatnonzero(off_m > limit_m)
-    )
-    return off_m <= limit_m, left_out
+    limit_m = max(config.jump_sigmas * error_m, config.jump_mm * MM)
+    off_m = summer.z_by_error * (capture.errors_m - np.median(capture.errors_m[:REFERENCE_FRAMES]))
+    allowed = f"against the first {REFERENCE_FRAMES} frames (allowed {limit_m / MM:.1f} mm)"
+    return {
+        number: LeftOut(f"frame {number}", f"the whole range jumps by {off_m[number] / MM:+.1f} mm {allowed}")
+        for number in np.flatnonzero(np.abs(off_m) > limit_m).tolist()
+    }
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:

@@ -42,13 +42,12 @@ TRACEBACK_CHARACTERS = 4000
 @dataclass(frozen=True)
 class Job:
     """``function(*arguments)``, somewhere. The function is importable by its name; arguments and result are plain data
-    or frozen dataclasses. ``needs``: stored views, and other files, that it reads."""
+    or frozen dataclasses."""
 
     name: str
     stage: Stage
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
-    needs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -273,9 +272,9 @@ class EngineOptions:
     cache_limit_gb: float | None = None
 
 
-def engine_of(options: EngineOptions, detectors: Iterable[str] = ()) -> JobEngine:
-    """Return the engine, not yet begun, for trials of these ``detectors``. Raises UserError where it is not
-    installed or does not answer."""
+def engine_of(options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()) -> JobEngine:
+    """Return the engine, not yet begun, for trials of these ``detectors``; ``folder``: of renders. Raises UserError
+    where it is not installed or does not answer."""
     from harness.engine.processes import LocalEngine, SerialEngine
 
     if options.serial:
@@ -284,7 +283,7 @@ def engine_of(options: EngineOptions, detectors: Iterable[str] = ()) -> JobEngin
         return LocalEngine(options.jobs, options.limits, code_of(detectors))
     from harness.engine.cluster import ClusterEngine
 
-    return ClusterEngine(options.scheduler, options.limits, options.jobs, code_of(detectors))
+    return ClusterEngine(options.scheduler, options.limits, options.jobs, code_of(detectors), folder)
 
 
 def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:

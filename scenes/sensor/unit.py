@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, Reason, Region
-from harness.vocabulary.seeds import random_stream
+from harness.vocabulary.seeds import canonical_json, random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
 from scenes.sensor.facts import UnitFacts
@@ -110,6 +110,10 @@ def unit_error_m(camera: AnyCamera, config: CameraConfig, slope_x: np.ndarray) -
     return np.asarray(error)
 
 
+KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps, for further views of the same unit
+_patterns_mm: dict[tuple[str, str, int], np.ndarray] = {}
+
+
 def static_error_m(
     camera: AnyCamera,
     config: CameraConfig,
@@ -122,8 +126,14 @@ def static_error_m(
     error, lens = unit_error_m(camera, config, slopes[..., 0]), camera.nominal_lens
     if not config.effects.fixed_pattern:
         return error
-    drawn_mm = pattern_mm(random_stream(config.unit_seed, "fixed pattern", camera.name), (lens.height, lens.width))
-    return np.asarray(error + (drawn_mm * MM * config.fixed_pattern_scale)[region.within(lens.whole)])
+    key = camera.name, canonical_json(config.numbers), config.unit_seed
+    if key not in _patterns_mm:
+        while len(_patterns_mm) >= KEPT_PATTERNS:
+            del _patterns_mm[next(iter(_patterns_mm))]
+        stream = random_stream(config.unit_seed, "fixed pattern", camera.name)
+        _patterns_mm[key] = pattern_mm(stream, (lens.height, lens.width))
+    drawn_mm = _patterns_mm[key][region.within(lens.whole)]
+    return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
 
 
 def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:

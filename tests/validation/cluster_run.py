@@ -82,7 +82,7 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     experiment = load_experiment(home / "cheap.yaml")
     plan = plan_of(experiment, home / "cache")
     journal = Journal(home / "journal")
-    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"])) as engine:
+    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"]), home) as engine:
         until(lambda: engine.room("renders") > workers)
         bare = bare_rate(engine)
         scheduler = psutil.Process(cluster.scheduler.pid)

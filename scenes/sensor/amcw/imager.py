@@ -13,13 +13,13 @@ unit's offset.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Region
+from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Lens, Region
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.at_once import windows_of
@@ -134,6 +134,16 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
     return (1 - share) * sharp + share * spread(image, facts.stray_px.value) if share > 0 else sharp
 
 
+@lru_cache(maxsize=4)
+def pixel_spans(lens: Lens) -> np.ndarray:
+    """Return (h, w) of the whole sensor: the area of slopes that a pixel spans, relative to one on the axis."""
+    v, u = np.mgrid[: lens.height, : lens.width].astype(float)
+    along_u = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
+    along_v = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
+    area = np.abs(along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0])
+    return np.asarray(area * lens.fx * lens.fy)
+
+
 class AmcwImager:
     """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
@@ -159,12 +169,8 @@ class AmcwImager:
     def gathered(self) -> np.ndarray:
         """(h, w): light that a pixel gathers from a surface of given radiance, relative to one on the axis: |d slopes /
         d pixel| cos^4. Not modelled: mechanical vignetting, and the growth of the pupil with angle."""
-        v, u = np.mgrid[self.region.row0 : self.region.row1, self.region.col0 : self.region.col1].astype(float)
         lens = self.camera.nominal_lens
-        along_u = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
-        along_v = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
-        area = np.abs(along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0])
-        return np.asarray(area * lens.fx * lens.fy / (1 + (self.slopes**2).sum(axis=-1)) ** 2)
+        return pixel_spans(lens)[self.region.within(lens.whole)] / (1 + (self.slopes**2).sum(axis=-1)) ** 2
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
