@@ -410,10 +410,8 @@ NEAR_PX = 3
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")
 """Kinds of damage that may lie between a pixel's corners and its centre."""
-PILOT_SAMPLES = 64
-"""Paths that tell a pixel's noise, within a third."""
-LEAST_SAMPLES = 128
-"""Paths of a pixel inside the outline at least."""
+PILOT_SAMPLES = 128
+"""Paths that tell a pixel's noise, within a third; half as many miss the rare bright ones far behind a hole."""
 PILOT_SEED = 1 << 20
 """Offset that keeps those apart from the ones that count."""
 
@@ -512,15 +510,15 @@ def _samples_inside(
 ) -> int | np.ndarray:
     """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell. The few
     are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean."""
-    if config.hole_samples <= LEAST_SAMPLES:
+    if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
     batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
     total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
     noise_m = range_noise_m(batches, total, work.frequencies_hz)
     wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
-    doublings = np.ceil(np.log2(np.maximum(wanted / LEAST_SAMPLES, 1)) - 0.5)
-    return np.minimum(LEAST_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
+    doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
+    return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:

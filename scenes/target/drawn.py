@@ -93,19 +93,13 @@ class DrawnThrough(_Drawn):
         return self.diameter_mm[1] + 2 * self.chamfer_mm
 
 
-class DrawnBlind(DrawnThrough):
-    """Holes with a flat bottom. Depths are uniform, one from each of ``per_board`` equal parts of their range, in
-    random order: size and depth are independent."""
+class DrawnDeep(DrawnThrough):
+    """Blind holes with a flat bottom, or spherical caps. Depths are uniform, one from each of ``per_board`` equal parts
+    of their range, in random order: size and depth are independent. Of a dent it is that part of the range which is
+    legal for its size: no deeper than its radius, and on a bent face no shallower than its ball allows
+    (`scenes.target.checks`)."""
 
-    kind: Literal["blind"]  # type: ignore[assignment]
-    depth_mm: Depths
-
-
-class DrawnDents(DrawnThrough):
-    """Spherical caps. Depths as of blind holes, but of that part of the range which is legal for the dent's size: no
-    deeper than its radius, and on a bent face no shallower than its ball allows (`scenes.target.checks`)."""
-
-    kind: Literal["dent"]  # type: ignore[assignment]
+    kind: Literal["blind", "dent"]  # type: ignore[assignment]
     depth_mm: Depths
 
 
@@ -187,7 +181,7 @@ class DrawnChips(_DrawnFlaws):
     depth_mm: FlawDepths
 
 
-_Drilled = DrawnThrough | DrawnBlind | DrawnDents
+_Drilled = DrawnThrough | DrawnDeep
 _Flawed = DrawnSlots | DrawnGouges | DrawnRound | DrawnCorrosion | DrawnChips
 AnyDrawn = Annotated[_Drilled | _Flawed, Field(discriminator="kind")]
 
@@ -255,11 +249,11 @@ class DrawnTargetConfig(Config):
         # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
         ends = {low_mm: _dent_depths_mm(low_mm, bend_per_mm), widest_mm: _dent_depths_mm(widest_mm, bend_per_mm)}
         declared = damage.depths_mm or (0.0, math.inf)
-        for diameter_mm, (least_mm, most_mm) in ends.items() if isinstance(damage, DrawnDents) else ():
+        for diameter_mm, (least_mm, most_mm) in ends.items() if damage.kind == "dent" else ():
             if max(declared[0], least_mm) > min(declared[1], most_mm):
                 can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
-        if isinstance(damage, DrawnDents) and damage.chamfer_mm > 0:
+        if isinstance(damage, DrawnDeep) and damage.kind == "dent" and damage.chamfer_mm > 0:
             problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
         if not isinstance(damage, _DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
             wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
@@ -320,7 +314,7 @@ class DrawnTargetConfig(Config):
             facts: dict[str, Any] = {"id": len(made) + 1, f"{damage.size_of}_mm": size, "centre_mm": (x, y)}
             if damage.depths_mm is not None:
                 least, most = damage.depths_mm
-                if isinstance(damage, DrawnDents):
+                if damage.kind == "dent":
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
                     least, most = max(least, legal[0]), min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))

@@ -127,9 +127,9 @@ the same area. A render's rays take the longer the more sides there are: 2 mm ge
 RINGS = 48
 """Steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %."""
 CELL_M, MOST_ALONG = 0.03, 64
-"""Largest cell of a damaged sheet, and most cells along a side for this reason. Without cells triangles would run from
-the facets of a hole to the board's corners: rays take twice as long to pass these, and a renderer in float32 misses
-their plane by the length squared over the width times 1e-7, 0.1 mm at 1 m."""
+"""Longest edge of a damaged board's triangles, and the number of these along its sides from which on they are longer.
+Triangles from the facets of a hole to the board's corners would take rays twice as long to pass, and a renderer in
+float32 misses their plane by the length squared over the width times 1e-7, 0.1 mm at 1 m."""
 SPARE_M = 0.2 * MM
 """Least distance by which a cutter reaches beyond the face."""
 MAX_CELLS = 1_000_000
@@ -230,16 +230,15 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
     if isinstance(config.board.shape, MeshConfig):
         body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
     else:
-        cell_m = max(CELL_M, *(size / MOST_ALONG for size in size_m)) if truth else float("inf")
-        offsets: dict[str, Any] = {"top_m": 0.0, "bottom_m": -thickness_m, "sagitta_m": _sagitta_m(config)}
-        body = sheet(face, size_m, **offsets, flat_back=face.rough, cell_m=cell_m)
+        sagitta_m = _sagitta_m(config)
+        body = sheet(face, size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=sagitta_m, flat_back=face.rough)
     for damage, item in zip(truth, config.damages, strict=True):
         if isinstance(item, FlawConfig):
             more, less = solids_of(item, face, thickness_m)
             added, cutters = added + more, cutters + less
         else:
             cutters.append(cutter(damage, item))
-    return subtract(body, cutters, added)
+    return subtract(body, cutters, added) if truth else body
 
 
 def _rectangle(corners: np.ndarray) -> trimesh.Trimesh:
@@ -266,10 +265,9 @@ def sheet(
     centre_m: tuple[float, float] = (0.0, 0.0),
     angle_rad: float = 0.0,
     flat_back: bool = False,
-    cell_m: float = float("inf"),
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
-    Its facets stay within ``sagitta_m`` of the face and span ``cell_m`` at most. ``flat_back``: its lower side is a
+    Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
     plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
     import trimesh
 
@@ -285,9 +283,8 @@ def sheet(
     fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
     hessian = turn.T @ np.stack([np.stack([fxx, fxy], -1), np.stack([fxy, fyy], -1)], -2) @ turn
     bends = np.abs(hessian).sum(axis=-1).max(axis=(0, 1))
-    # 1e-9 per metre: rounding of a turned straight direction must not cut it into more cells.
-    lengths = np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9))
-    lengths = np.where(bends > 1e-9, np.minimum(lengths, cell_m), cell_m)
+    # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
+    lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
     columns, rows = (max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True))
     if columns * rows > MAX_CELLS:
         needs = f"{columns} x {rows} cells to be followed within {sagitta_m / MM * 1e3:.3g} um"
@@ -381,9 +378,15 @@ def subtract(
     import manifold3d  # type: ignore[import-not-found]
     import trimesh
 
+    longest_m = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG)
     solids = []
     for mesh in (body, *added, *cutters):
-        vertices, faces = np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.uint64)
+        vertices, faces = mesh.vertices, mesh.faces
+        if mesh is body:
+            whole = manifold3d.Manifold(manifold3d.Mesh64(np.array(vertices, float), np.array(faces, np.uint64)))
+            fine = whole.refine_to_length(longest_m).to_mesh64()
+            vertices, faces = fine.vert_properties[:, :3], fine.tri_verts
+        vertices, faces = np.array(vertices, float, order="C"), np.array(faces, np.uint64, order="C")
         # edges between faces of different numbers stay; others within a plane are dissolved
         numbers = np.arange(len(faces), dtype=np.uint64)
         solids.append(manifold3d.Manifold(manifold3d.Mesh64(vertices, faces, face_id=numbers)))
