@@ -17,7 +17,7 @@ from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.report.study_page import study_html, study_parts, write_study_report
 from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
-from harness.tables.text import text_of, unbroken
+from harness.tables.text import size, text_of, unbroken
 from harness.vocabulary.errors import UserError
 
 PROVENANCE = {
@@ -160,12 +160,12 @@ def test_no_number_is_written_as_python_would(page: str) -> None:
 def test_the_limits_stand_in_their_table(whole: StudyResult, page: str) -> None:
     rows = section(page, "Detection limits")
     for limit in whole.limits:
-        assert f"{limit.a90_95.value:.2f}" in rows
+        assert f"{size(limit.a90_95.value)} " in rows
         assert f"{limit.hits} of {limit.inspections}" in rows
     best = min(whole.limits, key=lambda limit: limit.a90_95.value)
     answer = re.search(r'class="answer">(.*?)</p>', page)
     assert answer is not None
-    assert f"the smallest limit (a90/95) is {best.a90_95.value:.2f}\u00a0mm" in answer[1]
+    assert f"the smallest limit (a90/95) is {size(best.a90_95.value)}\u00a0mm" in answer[1]
     assert "within 15 mm of its own" in words(page)
 
 
