@@ -295,9 +295,9 @@ def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
 
 def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return fx, fy, cx, cy from whichever of the known forms a mapping has."""
-    keys = [_named(data, quantity) for quantity in SPELLINGS]
-    if all(keys):
-        return tuple(_number(path, str(key), data[key]) for key in keys)
+    keys = [key for quantity in SPELLINGS if (key := _named(data, quantity)) is not None]
+    if len(keys) == len(SPELLINGS):
+        return tuple(_number(path, key, data[key]) for key in keys)
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
