@@ -12,10 +12,10 @@ Every check is a function of its own in `harness.testing`, listed in `CHECKS`.
 
 from __future__ import annotations
 
+import inspect
 import io
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any, TypeVar, cast
@@ -50,7 +50,8 @@ def check_detector(
     settings: Mapping[str, Any] | None = None,
     clouds: Sequence[Cloud] | None = None,
 ) -> None:
-    """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken.
+    """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken; what
+    the detector itself raises is passed on. A note on the exception names the check.
 
     ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) are then validated by its
     ``settings_type``; or a function without arguments that makes a detector anew at each call. ``clouds``: what it is
@@ -69,8 +70,12 @@ def check_detector(
 
     tried = tuple(synthetic_clouds() if clouds is None else clouds)
     for check in CHECKS:
-        for cloud in tried:
-            check(made, cloud)
+        try:
+            for cloud in tried:
+                check(made, cloud)
+        except Exception as error:
+            error.add_note(f"in {check.__name__}: {inspect.getdoc(check)}")
+            raise
     detector = made()
     loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
     require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
@@ -99,17 +104,6 @@ def require(kept: bool | np.bool_, what: str) -> None:
         raise AssertionError(what)
 
 
-@contextmanager
-def no_crash(doing: str) -> Iterator[None]:
-    """Tell any exception but a breach as one: a detector that is given a cloud may refuse it, but not break."""
-    try:
-        yield
-    except AssertionError:
-        raise
-    except Exception as error:
-        raise AssertionError(f"{doing} ended in {type(error).__name__}: {error}") from error
-
-
 @dataclass(frozen=True)
 class Look:
     """One detector's evidence on one cloud."""
@@ -121,19 +115,16 @@ class Look:
     @classmethod
     def at(cls, detector: Detector, cloud: Cloud) -> Look:
         """Analyse a cloud that can be judged."""
-        with no_crash("`analyse`"):
-            return cls(detector, cloud, detector.analyse(cloud))
+        return cls(detector, cloud, detector.analyse(cloud))
 
     @property
     def quiet(self) -> float:
         """The quiet threshold."""
-        with no_crash("`quiet_threshold`"):
-            return float(self.detector.quiet_threshold(self.cloud, self.evidence))
+        return float(self.detector.quiet_threshold(self.cloud, self.evidence))
 
     def find(self, threshold: float) -> tuple[Detection, ...]:
         """Return the findings above a threshold."""
-        with no_crash(f"`find` at a threshold of {threshold:g}"):
-            return tuple(self.detector.find(self.cloud, self.evidence, threshold))
+        return tuple(self.detector.find(self.cloud, self.evidence, threshold))
 
     def thresholds(self) -> tuple[float, ...]:
         """Return rising thresholds from 0 to the quiet threshold at scores of pixels, where findings change."""
@@ -144,8 +135,7 @@ class Look:
 
     def measured(self, finding: Detection) -> Measurement:
         """Measure a finding; the numbers must be sound."""
-        with no_crash("`measure`"):
-            found = self.detector.measure(self.cloud, self.evidence, finding)
+        found = self.detector.measure(self.cloud, self.evidence, finding)
         diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
         require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is no (3,) finite numbers")
@@ -173,10 +163,8 @@ def declares_itself(make: Make, cloud: Cloud) -> None:
     settings_type: Any = getattr(type(detector), "settings_type", None)
     is_config = isinstance(settings_type, type) and issubclass(settings_type, Config)
     require(is_config, "the class has no `settings_type` that is a harness.vocabulary.config.Config")
-    with no_crash("`settings_type()`, the settings with all defaults,"):
-        settings = settings_type()
-    with no_crash("`settings_type.from_data` of the stored defaults"):
-        restored = settings_type.from_data(settings.to_data())
+    settings = settings_type()
+    restored = settings_type.from_data(settings.to_data())
     require(restored == settings, "settings that are stored and read again are not the same")
 
 
@@ -296,15 +284,13 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
 def survives_pickling(make: Make, cloud: Cloud) -> None:
     """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
 
-    def sent(value: Any, what: str) -> Any:
-        with no_crash(f"pickling {what}"):
-            return pickle.loads(pickle.dumps(value))
+    def sent(value: Any) -> Any:
+        return pickle.loads(pickle.dumps(value))
 
-    unused = sent(make(), "the detector")
-    detector = make()
+    unused, detector = sent(make()), make()
     result = Look.at(detector, cloud).everything()
-    require(_same(sent(result, "a result"), result), "a result that was pickled is not the same")
-    for arrived in (unused, sent(detector, "the detector, once used,")):
+    require(_same(sent(result), result), "a result that was pickled is not the same")
+    for arrived in (unused, sent(detector)):
         there = Look.at(arrived, cloud).everything()
         require(_same(there, result), "a detector that was pickled gave another result")
 
@@ -316,18 +302,15 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
         return
     before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
     given = [_with_arrays(one, _read_only) for one in clouds]
-    with no_crash("`calibrate`"):
-        learned, again = (dict(detector.calibrate(given)) for _ in range(2))
+    learned, again = (dict(detector.calibrate(given)) for _ in range(2))
     require(_same(learned, again), "the second time the same clouds taught something else")
     file = io.BytesIO()
-    with no_crash("storing what was learned as an .npz without pickling"):
-        np.savez(file, **learned)  # type: ignore[arg-type]
-        file.seek(0)
-        with np.load(file, allow_pickle=False) as stored:
-            restored = dict(stored)
+    np.savez(file, **learned)  # type: ignore[arg-type]
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as stored:
+        restored = dict(stored)
     require(_same(learned, restored), "what was learned is not the same once it is stored: no plain arrays")
-    with no_crash("`calibrated`"):
-        taught: Any = detector.calibrated(restored)
+    taught: Any = detector.calibrated(restored)
     require((taught.name, taught.version) == (detector.name, detector.version), "learning changed name or version")
     require(_same(before, Look.at(detector, cloud).everything()), "learning changed the detector that was asked")
     for check in (gives_sound_evidence, is_silent_at_the_quiet_threshold, survives_pickling):
