@@ -246,6 +246,7 @@ def test_what_counts_for_a_slot() -> None:
     assert matched(known, [wide], 1e-3, None) == ({}, 0)
     assert matched(known, [wide], 1e-3, 0.4) == ({0: 0}, 0)
     assert matched(known, [wide], 1e-3, 0.9) == ({}, 0)
+    assert matched(known, [], 1e-3, 0.4) == ({}, 0)
 
 
 def slot_seen(angle_deg: float, length_mm: float, width_mm: float) -> Measurement:

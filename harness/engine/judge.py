@@ -148,12 +148,12 @@ def matched_places(
     for found in levels:
         count = len(found.scores)
         near, start = apart[:, start : start + count], start + count
-        if not len(areas):
+        if overlap is None:
             matches.append((closest_pairs(near, radius_m), 0))
             continue
         sizes = np.bincount(found.labels, minlength=count)
         on = [np.bincount(found.labels[area[found.pixels]], minlength=count) for area in areas]
-        lies = np.array(on).reshape(-1, count) >= overlap * sizes
+        lies = np.array(on).reshape(len(areas), count) >= overlap * sizes
         pairs = closest_pairs(np.where(lies, np.fmin(near, radius_m), near), radius_m)
         matches.append((pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))))
     return matches
