@@ -108,6 +108,12 @@ def test_step_edge_mixes_phasors_by_area():
     light = light_on(lit, lens, region)
     column = 322 - region.col0
     assert light.fine[:, column].all()
+    roughly = np.ones(region.shape, bool)
+    slopes, footprint = lens.region_slopes(region), footprint_of(lens, region, None)
+    rough = direct_light(lit, slopes, footprint, CAMERA.frequencies_hz, None, roughly)
+    assert not rough.fine.any()  # 16 sub-rays lie in four columns: the edge is wrong by half of one at most
+    assert np.abs(rough.coverage - light.coverage).max() < 1 / 8 + 1 / 256
+    assert rough.off_face.share.max() == 1.0
     near, far = (light_on(scene_of(frontal(z)), lens, region).phasor[:, :, column] for z in (0.7, 0.75))
     # the edge stands 0.3 px right of the pixel's left border; the lens sees a little of the far plane shadowed by the
     # plate (emitter 14 mm to the left: 1 mm wide, 0.7 px), so between 0.3 and 1.0 px nothing comes back
