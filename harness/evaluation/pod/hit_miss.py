@@ -292,7 +292,7 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
 def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper POD at ``sizes`` (n,), each one-sided at ``confidence`` as in `bound`, for drawing: the lower one
     crosses 90 % at a90/95 to a part in 1e4."""
-    x = np.log(sizes) if fit.curve.log_size else np.asarray(sizes, float)
+    x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
     low, high = (link_cdf(fit.curve.link, edge) for edge in (predictors.min(axis=0), predictors.max(axis=0)))
