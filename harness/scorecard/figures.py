@@ -36,6 +36,7 @@ from scenes.sensor.camera import camera_names
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 NEAR = 0.25
 """A figure of reality passes within this share of a published value; a bound must hold."""
+SAID_EVERY_S = 10.0
 Request = tuple[str, str, Config]
 """A camera, a quantity, and its conditions."""
 
@@ -192,9 +193,6 @@ class Score:
         return "FAIL (new)" if self.fell_behind else "fail"
 
 
-SAID_EVERY_S = 10.0
-
-
 def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Request, Reading]:
     """Measure all requests, ``jobs`` scenes at a time. The numbers do not depend on ``jobs`` or on the order."""
     scenes: dict[str, list[Request]] = defaultdict(list)
@@ -235,11 +233,6 @@ class Beside:
     measured: Reading
     simulated: Reading
 
-    @property
-    def ratio(self) -> float:
-        """Simulated by measured; NaN for what may be 0."""
-        return self.simulated.value / self.measured.value if self.unit == "mm" and self.measured.value else float("nan")
-
 
 def number(value: float) -> str:
     """Three significant digits; ``none`` where there is no value."""
@@ -263,6 +256,16 @@ def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
         Column(high, "", f"{name}.interval.high", "upper end of its 95 % interval"),
         Column("", "95 %", f"{name}.interval", text=_interval),
     )
+
+
+def _ratio(row: Beside) -> str:
+    told = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
+    return f"{row.simulated.value / row.measured.value:.2f}" if told else "–"
+
+
+def _remarks(score: Score) -> str:
+    why = f"Why it fails: {score.figure.fails}. " if score.figure.fails else ""
+    return why + score.figure.note
 
 
 def _tone(score: Score) -> Tone:
@@ -296,8 +299,9 @@ SCORES = Table(
         ),
         Column("source", "", "figure.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
-        Column("note", "note", "figure.note", "what was assumed", brief=False),
-        Column("fails", "why it fails", "figure.fails", "why it is known to fail", brief=False),
+        Column("note", "", "figure.note", "what was assumed"),
+        Column("fails", "", "figure.fails", "why it is known to fail"),
+        Column("", "note", _remarks, brief=False),
         VERSION,
     ),
     left=20,
@@ -315,7 +319,7 @@ BESIDE = Table(
         Column("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
         *_reading("measured", "measured_low", "measured_high", "measured on the capture"),
         *_reading("simulated", "simulated_low", "simulated_high", "measured on its simulation"),
-        Column("", "ratio", "ratio", text=lambda ratio: f"{ratio:.2f}" if np.isfinite(ratio) else "–"),
+        Column("", "ratio", _ratio),
         Column("", "unit", lambda row: row.unit or "–"),
         VERSION,
     ),
