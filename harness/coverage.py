@@ -77,8 +77,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.report.coverage import answer, coverage_html, scene_of, warnings_of
     from harness.tables.coverage import COVERAGE, GOALS, POSES
     from harness.tables.outputs import COVERAGE_PAGE, EXPERIMENT
-    from harness.tables.text import show
+    from harness.tables.text import many, show
     from harness.vocabulary.files import write_text
+    from harness.vocabulary.path_names import camera_title
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.render.cache import in_use
 
@@ -130,11 +131,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     )
     if goals:
         word = "Cheapest" if goals[0]["reached"] else "The goal is not reached; nearest"
-        said = f"{word}: {goals[0]['camera']}, {goals[0]['frames']} frames, {goals[0]['distance_m']:g} m. {said}"
+        frames = many(goals[0]["frames"], "frame")
+        said = f"{word}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {said}"
     config, scene = one.point.config, scene_of(patches, limits_mm, one.found)
-    camera, frames = config.simulated.camera, config.capture.frames
+    camera = config.simulated.camera
     detector = f"the detector {config.detector.name} at a threshold of {one.task.threshold:.3g}"
-    first = f"Simulated, for unit {camera.unit_seed} of {camera.name}, {frames} frames, {detector}. {one.found.said}"
+    unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
+    first = f"Simulated, for {unit}, {detector}. {one.found.said}"
     write_text(folder / COVERAGE_PAGE.name, coverage_html(name, said, first, scene, poses, goals, warnings, command))
     grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
     show([said, first, *(f"warning: {text}" for text in warnings), *grids])
@@ -167,6 +170,7 @@ def _rows(one: Survey, poses: list[Pose], size_mm: float, given: int, further: i
 
 def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
     """The fewest poses of a set-up at each distance, taken greedily, that reach the share, or all that it may have."""
+    from harness.vocabulary.path_names import camera_title, in_words
     from scenes.sensor.camera import camera_of
 
     ways, config = [], one.point.config
@@ -177,8 +181,9 @@ def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
         covered = rows[-1]["total_share"] if rows else 0.0
         seconds = len(rows) * frames / camera.unit.frames_per_second.value + max(len(rows) - 1, 0) * MOVE_S
         tilts = "; ".join(f"{row['tilt_x_deg']:g}, {row['tilt_y_deg']:g}" for row in rows)
-        way = {"set_up": one.point.label, "camera": camera.name, "frames": frames, "distance_m": distance_m}
-        way |= {"poses": len(rows), "tilts": tilts, "total_share": covered, "capture_s": seconds}
+        way = {"set_up": in_words(one.point.variant), "camera": camera_title(camera.name), "frames": frames}
+        way |= {"distance_m": distance_m, "poses": len(rows), "tilts": tilts}
+        way |= {"total_share": covered, "capture_s": seconds}
         ways.append({**way, "reached": covered >= share, "rows": rows, "survey": one})
     return ways
 

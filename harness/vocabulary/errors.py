@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 
 CLOSED_PIPE = 141
 """Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13."""
@@ -25,7 +26,7 @@ class UserError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exceptions with keyword arguments do not survive pickling between worker processes otherwise.
-        return (_rebuild, (self.message, self.legal, self.fix))
+        return partial(type(self), legal=self.legal, fix=self.fix), (self.message,)
 
     def __str__(self) -> str:
         lines = [self.message] + ([f"  legal: {self.legal}"] if self.legal else [])
@@ -34,10 +35,6 @@ class UserError(Exception):
 
 class DiskFull(UserError):
     """Nothing more can be written: no part of a program's work makes sense before there is room."""
-
-
-def _rebuild(message: str, legal: str | None, fix: str | None) -> UserError:
-    return UserError(message, legal=legal, fix=fix)
 
 
 def exit_code_of(program: Callable[[], int]) -> int:

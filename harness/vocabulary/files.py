@@ -56,11 +56,9 @@ def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: st
 
 def refuse_pixels(name: str, width: int, height: int) -> None:
     """Raise UserError where an image has no pixel, or more than `FRAME_PIXELS`."""
-    legal = f"1 to {FRAME_PIXELS // 10**6} million pixels"
-    if width < 1 or height < 1:
-        raise UserError(f"{name}: {width} x {height} pixels", legal=legal)
-    if width * height > FRAME_PIXELS:
-        raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=RAISE)
+    if min(width, height) < 1 or width * height > FRAME_PIXELS:
+        legal, fix = f"1 to {FRAME_PIXELS // 10**6} million pixels", RAISE if min(width, height) > 0 else None
+        raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=fix)
 
 
 def bounded_bytes(path: Path, at_most: int) -> bytes:
