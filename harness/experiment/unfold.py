@@ -229,8 +229,8 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
         return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
 
     chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - one for one in alone), whole])
-    axis = [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen]
-    return axis, problems
+    settings = [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen]
+    return settings, problems
 
 
 def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
