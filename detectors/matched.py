@@ -284,21 +284,18 @@ def _scored(
             score *= inner
         deviations = np.ones(NO_ZONE)
         if not rough:
-            wide = template.radius_px >= WIDE_PX and not template.slot
-            deviations, quiet = _deviations(
-                score, zone, round(template.radius_px / (1 + template.coarse)) if wide else 0
-            )
-            half_px = max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / (1 + template.coarse)
-            _calm(score, quiet, deviations[-1], half_px)
+            step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
+            deviations, quiet = _deviations(score, zone, round(round_px / step) if round_px >= WIDE_PX else 0)
+            _calm(score, quiet, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
             if template.radius_px <= TAIL_PX:
                 if not any(template.halves):
                     tail = _tail((score / deviations.astype(np.float32)[zone]).ravel())
                 deviations *= tail
         per_deviation = (1.0 / deviations).astype(np.float32)
         _keep_stronger(*best[template.coarse], score, zone, per_deviation, worth.raised, *template.halves, number)
-    (signed, by), (wide, wide_by) = best
-    wide = cv2.resize(wide, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:h, :w]
-    wide_by = np.repeat(np.repeat(wide_by, 2, axis=0), 2, axis=1)[:h, :w]
+    (signed, by), (half, half_by) = best
+    wide = np.asarray(cv2.resize(half, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR))[:h, :w]
+    wide_by = np.repeat(np.repeat(half_by, 2, axis=0), 2, axis=1)[:h, :w]
     wider = np.abs(wide) > np.abs(signed)
     return np.where(wider, wide, signed) * seen, np.where(wider, wide_by, by), solved
 
@@ -330,7 +327,8 @@ def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float
         cv2.blur(cv2.resize(each, parts, interpolation=cv2.INTER_AREA), (2 * round(half_px / PART_PX) + 1,) * 2)
         for each in (sizes, quiet.astype(np.float32))
     )
-    local = np.interp(next(blurred) / deviation / np.maximum(next(blurred), 0.05), CAPPED, DEVIATIONS) / UNEVEN
+    sums, counts = (np.asarray(each, np.float64) for each in blurred)
+    local = np.interp(sums / np.maximum(counts, 0.05) / deviation, CAPPED, DEVIATIONS) / UNEVEN
     if local.max() > 1.0:
         calm = np.maximum(local, 1.0).astype(np.float32)
         score /= cv2.resize(calm, score.shape[::-1], interpolation=cv2.INTER_LINEAR)

@@ -182,11 +182,12 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         down = float((((values - np.roll(values, 1, axis=0)) ** 2) * half).sum())
         along = 2.0 * float((np.diff(values, axis=1) ** 2).sum())
         reach = (math.sqrt(3.0 * each / energy) * side / (2.0 * math.pi) for each in (along, down))
-        sides = (2 * min(SIDES_PX, key=lambda half_px, each=each: abs(half_px - each)) + 1 for each in reach)
+        halves = (SIDES_PX[int(np.abs(np.array(SIDES_PX) - each).argmin())] for each in reach)
+        sides = 2 * next(halves) + 1, 2 * next(halves) + 1
         # maxima are as dense as the root of the score's second spectral moments (Adler 1981)
         cycles = np.fft.fftfreq(side)[:, None] ** 2, np.arange(values.shape[1])[None] ** 2 / side**2
         crowds.append(math.prod(float((energies * each).sum()) / energy for each in cycles) ** 0.5 * side**2)
-        found.append(Worth(energy / GRID**2, (next(sides), next(sides)), 0.0))
+        found.append(Worth(energy / GRID**2, sides, 0.0))
     most = max(crowds)
     return tuple(one._replace(raised=math.log(most / crowd)) for one, crowd in zip(found, crowds, strict=True))
 
