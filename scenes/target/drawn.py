@@ -241,15 +241,15 @@ class DrawnTargetConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         damage, board, bend_per_mm, problems = self.damage, self.board, _tightest_per_mm(self.board), []
-        thick, (low_mm, widest_mm), jitter_mm = board.thickness_mm, damage.size_mm, self.distance_jitter_mm
+        thick, widest_mm, jitter_mm = board.thickness_mm, damage.size_mm[1], self.distance_jitter_mm
         depths_mm = None if damage.kind in ("pressed_dent", "pressed_bump", "protrusion") else damage.depths_mm
         if depths_mm is not None and depths_mm[1] >= thick:
             deep = f"{depths_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
         # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
-        ends = {low_mm: _dent_depths_mm(low_mm, bend_per_mm), widest_mm: _dent_depths_mm(widest_mm, bend_per_mm)}
         declared = damage.depths_mm or (0.0, math.inf)
-        for diameter_mm, (least_mm, most_mm) in ends.items() if damage.kind == "dent" else ():
+        for diameter_mm in sorted(set(damage.size_mm)) if damage.kind == "dent" else []:
+            least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
             if max(declared[0], least_mm) > min(declared[1], most_mm):
                 can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
