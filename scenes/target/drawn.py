@@ -241,19 +241,20 @@ class DrawnTargetConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         damage, board, bend_per_mm, problems = self.damage, self.board, _tightest_per_mm(self.board), []
-        thick, (low_mm, widest_mm), jitter_mm = board.thickness_mm, damage.size_mm, self.distance_jitter_mm
+        thick, widest_mm, jitter_mm = board.thickness_mm, damage.size_mm[1], self.distance_jitter_mm
         depths_mm = None if damage.kind in ("pressed_dent", "pressed_bump", "protrusion") else damage.depths_mm
         if depths_mm is not None and depths_mm[1] >= thick:
             deep = f"{depths_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
         # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
-        ends = {low_mm: _dent_depths_mm(low_mm, bend_per_mm), widest_mm: _dent_depths_mm(widest_mm, bend_per_mm)}
         declared = damage.depths_mm or (0.0, math.inf)
-        for diameter_mm, (least_mm, most_mm) in ends.items() if damage.kind == "dent" else ():
+        dents = isinstance(damage, DrawnDeep) and damage.kind == "dent"
+        for diameter_mm in sorted(set(damage.size_mm)) if dents else []:
+            least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
             if max(declared[0], least_mm) > min(declared[1], most_mm):
                 can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
-        if isinstance(damage, DrawnDeep) and damage.kind == "dent" and damage.chamfer_mm > 0:
+        if isinstance(damage, DrawnDeep) and dents and damage.chamfer_mm > 0:
             problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
         if not isinstance(damage, _DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
             wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"

@@ -94,7 +94,7 @@ def image_pattern(file: str) -> np.ndarray:
     if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
         said = f"target.material.texture: {file} is no image that can be read, or it is black"
         raise UserError(said, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
-    encoded = image / np.iinfo(image.dtype).max
+    encoded = image / (2.0 ** (8 * image.itemsize) - 1)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     fewer = min(1.0, MAX_TEXELS / max(linear.shape))
     linear = cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA) if fewer < 1 else linear
@@ -381,12 +381,10 @@ def subtract(
     longest_m = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG)
     solids = []
     for mesh in (body, *added, *cutters):
-        vertices, faces = mesh.vertices, mesh.faces
+        vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.uint64)
         if mesh is body:
-            whole = manifold3d.Manifold(manifold3d.Mesh64(np.array(vertices, float), np.array(faces, np.uint64)))
-            fine = whole.refine_to_length(longest_m).to_mesh64()
-            vertices, faces = fine.vert_properties[:, :3], fine.tri_verts
-        vertices, faces = np.array(vertices, float, order="C"), np.array(faces, np.uint64, order="C")
+            fine = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces)).refine_to_length(longest_m).to_mesh64()
+            vertices, faces = (np.array(each, order="C") for each in (fine.vert_properties[:, :3], fine.tri_verts))
         # edges between faces of different numbers stay; others within a plane are dissolved
         numbers = np.arange(len(faces), dtype=np.uint64)
         solids.append(manifold3d.Manifold(manifold3d.Mesh64(vertices, faces, face_id=numbers)))
