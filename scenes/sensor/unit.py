@@ -73,9 +73,9 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     return np.asarray(smooth / np.sqrt(np.prod(power)))
 
 
-SPECTRUM, LEAST_POWER, FAINT = 256, 3e-3, 0.05
+SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
 """Frequencies of a filter's spectrum, the least power there relative to the largest, and the share of the largest tap
-below which further taps are left out: correlations are met to 0.03."""
+below which further taps are left out: correlations are met to 0.015."""
 
 
 def taps_of(correlation: np.ndarray) -> np.ndarray:
