@@ -65,12 +65,14 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
 
 
 def test_anomalib_reads_it_unchanged(home):
-    """By anomalib's own loader, where it is installed."""
+    """By anomalib's own loader, where it is installed. Its version 2.7 gives no item of any training split beside
+    pandas 3, where the mask that such items lack is no text: that alone is mended here."""
     loader = pytest.importorskip("anomalib.data.datasets.depth.mvtec_3d").MVTec3DDataset
     for split, count in (("train", 3), ("test", 5)):
         data = loader(root=home / "set", category="tiny", split=split)
         assert len(data) == count
-        for item in data:
+        data.samples["mask_path"] = data.samples["mask_path"].fillna("")
+        for item in (data[number] for number in range(count)):
             folder, stem = Path(item.image_path).parents[1], Path(item.image_path).stem
             points = tiff_floats(folder / "xyz" / f"{stem}.tiff")
             np.testing.assert_array_equal(np.moveaxis(np.asarray(item.depth_map), 0, -1), points)
