@@ -45,6 +45,8 @@ MADE = {"index.md", "reference.md", "contributing.md"}  # by make docs
 TEXTS = [ROOT / "README.md", *(path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in MADE)]
 COMMANDS = re.compile(r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE)
 ONLY_PARSED = {
+    "--suggest": "takes minutes, as it tries 24 poses; test_coverage tests the choice",
+    "--goal": "takes minutes; likewise",
     "--scheduler": "needs a cluster; test_engine_cluster runs sweeps on one",
     "check experiments/regression.yaml": "takes minutes; .ci/run runs it as it stands",
     "validate --figures": "needs an installed camera blaze101; test_validate runs --figures",
