@@ -201,7 +201,7 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
     row, *others = rows_of(tmp_path / "out" / "findings.csv")
     # too little noise for a threshold of the cloud's own: rounding gives some scores above the fallback of 5
-    assert float(row["score"]) > 100 and all(float(other["score"]) < 7 for other in others) and len(others) < 5
+    assert float(row["score"]) > 100 and all(float(other["score"]) < 10 for other in others) and len(others) < 5
     assert row["u_px"] == "" and row["volume_mm3"] == ""
     # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to a part of the hole.
     offset = np.array([float(row[f"{a}_mm"]) for a in "xy"]) - TRUE_CENTRE_MM[:2]
