@@ -213,7 +213,7 @@ def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 class _Noise(NamedTuple):
-    """What a picture's noise makes of the bank: ``grid`` of its transforms, ``power`` there, and each template's
+    """The bank before a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's
     `Worth` through the window that the noise shows."""
 
     grid: tuple[int, ...]
