@@ -47,7 +47,7 @@ ONLY_PARSED = {
     "--gauge": "needs the gauge of such a study; test_gauge runs it",
     "--scheduler": "needs a cluster; test_engine_cluster runs sweeps on one",
     "check experiments/regression.yaml": "takes minutes; .ci/run runs it as it stands",
-    "--camera ./blaze101.yaml": "needs captures by that camera; test_validate and test_validate_capture run both options",
+    "--camera ./blaze101.yaml": "needs captures by that camera; test_validate and test_validate_capture run these",
     "validate --board plate": "takes minutes; test_validate_board runs --board on a smaller plate",
 }
 
