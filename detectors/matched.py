@@ -70,6 +70,7 @@ from detectors.whitening import (
     response,
     spectra,
     spectrum,
+    transformed,
     window_of,
     worths,
 )
@@ -93,7 +94,8 @@ RIM_PX = 6
 """Depth of the target's rim: the camera's window and lens reach so far over its edge."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 """Distances from the outline up to which scores are set beside the scatter of their own; all beyond are alike."""
-NO_ZONE = len(RIM_ENDS_PX) + 1
+N_ZONES = len(RIM_ENDS_PX) + 1
+ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
 """Half of the window of the local scatter in radii, the side of the squares that it is taken from, and how much of it
 chance and damage may explain."""
@@ -103,6 +105,7 @@ DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
 )
+CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
 """Deviations of a Gaussian, and the mean of its size where more than `CAP` counts as that."""
 FAINT = 3.5
 """Scores below are raised by the same factor: what is counted there is not maxima."""
@@ -262,11 +265,12 @@ def _scored(
     ``seen`` (r, c); ``start`` is near to that. ``rough``: by round templates in the middles of pixels
     alone, without the scatter of scores, which what stands out would spoil."""
     solved = inverse_times(values, seen, noise.power, noise.grid, start)
-    whole, (h, w), depth_px = scipy.fft.rfft2(solved, noise.grid), seen.shape, _depth_px(seen)
+    (h, w), depth_px = seen.shape, _depth_px(seen)
     views, best, shares, tail = [], [], {}, 1.0
-    for coarse, spectrum_of in enumerate((whole, halved(whole))):
+    for coarse in range(1 if rough else 2):
+        spectrum_of = (halved if coarse else transformed)(solved, noise.grid)
         there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
-        zone = np.searchsorted(RIM_ENDS_PX, depth).astype(np.uint8)
+        zone = ZONES[np.ceil(np.minimum(depth, len(ZONES) - 1)).astype(np.intp)]
         views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
         best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
     templates = spectra(noise.grid, noise.window_px)
@@ -274,30 +278,34 @@ def _scored(
         if rough and (template.coarse or any(template.halves)):
             continue
         spectrum_of, there, zone, inner = views[template.coarse]
-        if (template.coarse, worth.sides) not in shares:
+        key = template.coarse, template.slot, worth.sides
+        if key not in shares:
             share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-            enough = (share > LEAST_SEEN) & (there > 0)
-            shares[template.coarse, worth.sides] = np.where(enough, np.maximum(share, LEAST_SEEN) ** -0.5, 0.0)
-        score = response(spectrum_of, templates[number], there.shape)
-        score *= shares[template.coarse, worth.sides] * np.float32(worth.energy**-0.5)
-        if template.slot:  # what light and flying pixels leave along outlines looks like a slot
-            score *= inner
-        deviations = np.ones(NO_ZONE)
+            # what light and flying pixels leave along outlines looks like a slot
+            enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
+            shares[key] = np.where(enough, np.maximum(share, LEAST_SEEN) ** -0.5, np.float32(0.0))
+        score = response(spectrum_of, templates[number], there.shape, not any(template.halves))
+        cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
+        deviations = np.ones(N_ZONES)
         if not rough:
             step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
-            deviations, quiet = _deviations(score, zone, round(round_px / step) if round_px >= WIDE_PX else 0)
-            _calm(score, quiet, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
+            deviations, loud = _deviations(score, zone, round(round_px / step) if round_px >= WIDE_PX else 0)
+            _calm(score, loud, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
             if template.radius_px <= TAIL_PX:
                 if not any(template.halves):
-                    tail = _tail((score / deviations.astype(np.float32)[zone]).ravel())
+                    tail = _tail(score * (1.0 / deviations).astype(np.float32)[zone])
                 deviations *= tail
         per_deviation = (1.0 / deviations).astype(np.float32)
         _keep_stronger(*best[template.coarse], score, zone, per_deviation, worth.raised, *template.halves, number)
-    (signed, by), (half, half_by) = best
-    wide = np.asarray(cv2.resize(half, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR))[:h, :w]
-    wide_by = np.repeat(np.repeat(half_by, 2, axis=0), 2, axis=1)[:h, :w]
-    wider = np.abs(wide) > np.abs(signed)
-    return np.where(wider, wide, signed) * seen, np.where(wider, wide_by, by), solved
+    signed, by = best[0]
+    for half, half_by in best[1:]:
+        wide, wide_by = (
+            cv2.resize(each, None, fx=2, fy=2, interpolation=how)[:h, :w]
+            for each, how in ((half, cv2.INTER_LINEAR), (half_by, cv2.INTER_NEAREST))
+        )
+        wider = np.abs(wide) > np.abs(signed)
+        signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
+    return signed * seen, by, solved
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
@@ -308,49 +316,74 @@ def _halved(image: np.ndarray) -> np.ndarray:
 
 def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), by means of sizes up to `CAP`: of the
-    last where there are too few, and nowhere less than there; and (r, c) bool, the scores that tell it: what lies
-    within ``reach_px`` of scores that stand out does not."""
-    found, quiet = _scatter(score, zone), score != 0
+    last where there are too few, and nowhere less than there; and (r, c) bool, the scores that do not tell it: those
+    within ``reach_px`` of scores that stand out."""
+    loud = np.zeros(score.shape, np.bool_)
+    found, count = _scatter(score, zone, loud)
     if reach_px:
-        quiet &= ~grown(np.abs(score) > FAINT * found[-1], reach_px)
-        if quiet.sum() > FEWEST:
-            found = _scatter(score, np.where(quiet, zone, NO_ZONE))
-    return found, quiet
+        loud = grown(np.abs(score) > FAINT * found[-1], reach_px)
+        again, count = _scatter(score, zone, loud)
+        found = again if count > FEWEST else found
+    return found, loud
 
 
-def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
-    """Divide the scores (r, c) where the quiet ones within a square of ``half_px`` scatter by more than `UNEVEN`
-    deviations: the noise there is not as elsewhere."""
-    sizes = np.minimum(np.abs(score), np.float32(CAP * deviation)) * quiet
-    parts = tuple(max(1, side // PART_PX) for side in score.shape[::-1])
-    blurred = (
-        cv2.blur(cv2.resize(each, parts, interpolation=cv2.INTER_AREA), (2 * round(half_px / PART_PX) + 1,) * 2)
-        for each in (sizes, quiet.astype(np.float32))
-    )
-    sums, counts = (np.asarray(each, np.float64) for each in blurred)
-    local = np.interp(sums / np.maximum(counts, 0.05) / deviation, CAPPED, DEVIATIONS) / UNEVEN
-    if local.max() > 1.0:
-        calm = np.maximum(local, 1.0).astype(np.float32)
-        score /= cv2.resize(calm, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
-
-
-def _scatter(score: np.ndarray, zone: np.ndarray) -> np.ndarray:
-    sums, counts = _capped(score, zone, NO_ZONE)
-    if counts[-1] < FEWEST:
-        sums[-1], counts[-1] = sums.sum(), max(counts.sum(), 1)
-    found = np.interp(sums / np.maximum(counts, 1), CAPPED, DEVIATIONS)
-    return np.asarray(np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])))
+def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float) -> None:
+    """Divide the scores (r, c) where the others than ``loud`` ones (r, c) within a square of ``half_px`` scatter by
+    more than `UNEVEN` deviations: the noise there is not as elsewhere."""
+    window = (2 * round(half_px / PART_PX) + 1,) * 2
+    sums, counts = (cv2.blur(each, window) for each in _parts(score, loud, CAP * deviation))
+    size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
+    if size.max() > CAPPED_UNEVEN:
+        local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
+        score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 @numba.njit(**PLAIN)
-def _capped(score: np.ndarray, zone: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the scores' sizes, `CAP` at most, in each zone, and their number; 0 is no score."""
+def _parts(score: np.ndarray, loud: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums of the sizes, ``cap`` at most, of scores that are not loud, in squares of some `PART_PX` pixels,
+    and their number; 0 is no score."""
+    h, w = score.shape
+    rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
+    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for i in range(h):
+        for part in range(columns):
+            total, number = 0.0, 0
+            for j in range(part * w // columns, (part + 1) * w // columns):
+                if score[i, j] != 0 and not loud[i, j]:
+                    total += min(abs(score[i, j]), cap)
+                    number += 1
+            sums[i * rows // h, part] += total
+            counts[i * rows // h, part] += number
+    return sums, counts
+
+
+def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, int]:
+    sums, counts = _capped(score, zone, loud, N_ZONES)
+    number = int(counts.sum())
+    if counts[-1] < FEWEST:
+        sums[-1], counts[-1] = sums.sum(), max(number, 1)
+    found = np.interp(sums / np.maximum(counts, 1), CAPPED, DEVIATIONS)
+    return np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])), number
+
+
+@numba.njit(**PLAIN)
+def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums of the scores' sizes, `CAP` at most, in each zone, less the loud ones, and their number; 0 is no
+    score."""
     sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
     for i in range(score.shape[0]):
+        total, number = 0.0, 0  # of the last zone, where most pixels lie
         for j in range(score.shape[1]):
-            if zone[i, j] < zones and score[i, j] != 0:
-                sums[zone[i, j]] += min(abs(score[i, j]), CAP)
-                counts[zone[i, j]] += 1
+            if score[i, j] != 0 and not loud[i, j]:
+                size = min(abs(score[i, j]), CAP)
+                if zone[i, j] == zones - 1:
+                    total += size
+                    number += 1
+                else:
+                    sums[zone[i, j]] += size
+                    counts[zone[i, j]] += 1
+        sums[-1] += total
+        counts[-1] += number
     return sums, counts
 
 
@@ -369,28 +402,28 @@ def _keep_stronger(
     """Keep of each pixel's scores (r, c) the larger in size, and that template's ``number``. Scores are brought to
     deviations of their ``zone`` (r, c), and raised: their squares grow by ``raised``, below `FAINT` in proportion.
     Those of a template between pixels, ``down`` or to the ``right``, belong to all pixels round about."""
-    faint = np.float32(np.sqrt(1.0 + raised / FAINT**2))
+    faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
-    for i in range(height):
-        for j in range(width):
-            value = score[i, j] * per_deviation[zone[i, j]]
-            size = abs(value)
-            value *= faint if size < FAINT else np.float32(np.sqrt(1.0 + raised / size**2))
-            for y in range(i, min(i + down + 1, height)):
-                for x in range(j, min(j + right + 1, width)):
-                    if abs(value) > abs(signed[y, x]):
-                        signed[y, x], by[y, x] = value, number
+    for y in range(down + 1):
+        for x in range(right + 1):
+            for i in range(height - y):
+                for j in range(width - x):
+                    most, before = abs(score[i, j]) * faint[zone[i, j]], abs(signed[i + y, j + x])
+                    if most > before:
+                        square = (score[i, j] * per_deviation[zone[i, j]]) ** 2
+                        size = min(most, np.float32(np.sqrt(square + raised)))
+                        if size > before:
+                            signed[i + y, j + x], by[i + y, j + x] = np.copysign(size, score[i, j]), number
 
 
 def _tail(scores: np.ndarray) -> float:
-    """Return how much farther the tail of scores (n,) reaches than a Gaussian's, on the side where it is shorter,
+    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on the side where it is shorter,
     since damage lengthens one; 1 at least."""
-    scores = scores[scores != 0]
-    count = int(TAIL_SHARE * len(scores))
-    if count == 0:
+    count = int(TAIL_SHARE * np.count_nonzero(scores))
+    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > TAIL_SIGMAS, scores < -TAIL_SIGMAS)]
+    if count == 0 or min(map(len, sides)) < count:
         return 1.0
-    parted = np.partition(scores, (count - 1, len(scores) - count))
-    return max(1.0, float(min(parted[-count], -parted[count - 1])) / TAIL_SIGMAS)
+    return float(min(side[-count] for side in sides)) / TAIL_SIGMAS
 
 
 def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
@@ -459,12 +492,12 @@ def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
     def shared(layer: np.ndarray) -> np.ndarray:
         of, total = (
             cv2.blur(each, (2 * LEAST_WINDOW + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
-            for each in (layer.astype(np.float32), np.where(layer, modest, np.float32(0.0)))
+            for each in (layer.astype(np.float32), modest * layer)
         )
         return np.asarray(total / np.maximum(of, 1e-6))
 
     inside = shared(known & (depth_px > RIM_PX) & (depth_px <= 2 * RIM_PX))
     for step in range(1, RIM_PX + 1):
         layer = known & (depth_px == step)
-        noise[layer] -= (shared(layer) - inside)[layer]
+        np.subtract(noise, shared(layer) - inside, out=noise, where=layer)
     return noise

@@ -39,8 +39,9 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 """Halves of the sides that a `Worth` may have: the share that is seen is taken once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS = 0.01, 40
-"""Relative residual at which C^-1 r counts as solved, and a bound on the steps there."""
+CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
+"""Relative residual at which C^-1 r counts as solved, a bound on the steps there, and the weight of 0 in what the
+preconditioner fills unknown pixels with."""
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -92,44 +93,84 @@ def inverse_times(
     start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
-    conjugate gradients that start from the stationary inverse, or from ``start`` (r, c)."""
-    h, w = values.shape
-    mask, padded = known.astype(np.float32), np.zeros(shape, np.float32)
+    conjugate gradients that start from ``start`` (r, c) or the preconditioner. That is the stationary inverse of r with
+    unknown pixels filled by their neighbours, and the transpose of that filling: where outlines are not straight or
+    pixels are missing, edges to zeros take up to four times the steps."""
+    (h, w), mask, target = values.shape, np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    mask[:h, :w], target[:h, :w] = known, values * known
+    power, inverse = (packed(each * np.complex64(1 + 1j)) / np.float32(mask.size) for each in (power, 1.0 / power))
+    share = (1.0 - mask) / (_blurred(mask) + FADED)
 
     def filtered(image: np.ndarray, by: np.ndarray) -> np.ndarray:
-        padded[:h, :w] = image
-        whole = scipy.fft.rfft2(padded)
+        whole = cv2.dft(image)
         whole *= by
-        return mask * scipy.fft.irfft2(whole, shape, overwrite_x=True)[:h, :w]
+        return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
 
-    inverse = 1.0 / power
-    solution = filtered(values, inverse) if start is None else mask * start
-    rest = values * mask - filtered(solution, power)
-    towards = direction = filtered(rest, inverse)
-    product, enough = float(np.vdot(rest, towards)), CONVERGED**2 * float(np.vdot(values * mask, values))
+    def conditioned(image: np.ndarray) -> np.ndarray:
+        filled = _blurred(image)
+        filled *= share
+        filled += image
+        whole = filtered(filled, inverse)
+        back = _blurred(np.multiply(share, whole, out=filled))
+        back += whole
+        back *= mask
+        return back
+
+    solution = conditioned(target) if start is None else np.zeros_like(mask)
+    if start is not None:
+        solution[:h, :w] = mask[:h, :w] * start
+    rest = target - mask * filtered(solution, power)
+    direction = towards = conditioned(rest)
+    product, enough = float(np.vdot(rest, towards)), CONVERGED**2 * float(np.vdot(target, target))
     for _ in range(MOST_ITERATIONS):
         if float(np.vdot(rest, rest)) <= enough or product <= 0:
             break
         onward = filtered(direction, power)
+        onward *= mask
         step = product / float(np.vdot(direction, onward))
-        solution += step * direction
-        rest -= step * onward
-        towards = filtered(rest, inverse)
+        cv2.scaleAdd(direction, step, solution, dst=solution)
+        cv2.scaleAdd(onward, -step, rest, dst=rest)
+        towards = conditioned(rest)
         before, product = product, float(np.vdot(rest, towards))
-        direction = towards + product / before * direction
-    return np.asarray(solution)
+        cv2.scaleAdd(direction, product / before, towards, dst=direction)
+    return solution[:h, :w]
 
 
-def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the correlation (r, c) of a picture with a template, both as spectra; of `halved` ones for a ``shape``
-    half as large, in the middles of 2 x 2 pixels."""
-    grid = (spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1))
-    return np.asarray(scipy.fft.irfft2(spectrum_of * template, grid, overwrite_x=True)[: shape[0], : shape[1]])
+def _blurred(image: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.GaussianBlur(image, (7, 7), 1.0, borderType=cv2.BORDER_CONSTANT))
 
 
-def halved(spectrum_of: np.ndarray) -> np.ndarray:
-    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without its higher frequencies."""
-    return _low(spectrum_of) * _middles((spectrum_of.shape[0], 2 * (spectrum_of.shape[1] - 1)))
+def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the spectrum of an image (r, c), zero beyond, on a grid of even sides, as `cv2.dft` packs it."""
+    padded = np.zeros(shape, np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    return np.asarray(cv2.dft(padded))
+
+
+def packed(half: np.ndarray) -> np.ndarray:
+    """Return a spectrum of `scipy.fft.rfft2` (r, c / 2 + 1), r and c even, as `cv2.dft` packs it (r, c)."""
+    rows = len(half)
+    found = np.empty((rows, 2 * half.shape[1] - 2), np.float32)
+    found[:, 1:-1:2], found[:, 2::2] = half[:, 1:-1].real, half[:, 1:-1].imag
+    for column in (0, -1):
+        found[0, column], found[-1, column] = half[0, column].real, half[rows // 2, column].real
+        found[1:-1:2, column] = half[1 : rows // 2, column].real
+        found[2:-1:2, column] = half[1 : rows // 2, column].imag
+    return found
+
+
+def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...], symmetric: bool) -> np.ndarray:
+    """Return the correlation (r, c) of a picture with a template, both packed (`spectra`); of a `halved` picture
+    for a ``shape`` half as large, in the middles of 2 x 2 pixels."""
+    whole = spectrum_of * template if symmetric else cv2.mulSpectrums(spectrum_of, template, 0, conjB=True)
+    inverse = cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
+    return np.asarray(inverse[: shape[0], : shape[1]])
+
+
+def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without its higher frequencies, of the
+    picture (r, c) on a grid."""
+    return packed(_low(scipy.fft.rfft2(picture, shape)) * _middles(shape))
 
 
 @lru_cache(maxsize=4)
@@ -171,42 +212,57 @@ class Worth(NamedTuple):
 def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     """Return what each template is worth under noise with this spectrum on `GRID`."""
     found, crowds, white = [], [], 1.0 / np.sqrt(power)
-    low = _low(white)
-    for template, spectrum_of in zip(bank(window_px), spectra((GRID, GRID), window_px), strict=True):
-        values = np.abs(spectrum_of) * (low if template.coarse else white)
+    for sizes, seen_by in zip(_sizes(window_px), (white, _low(white)), strict=True):
+        values = sizes * seen_by
         # by Parseval's theorem; a second moment over space is the energy of a derivative over frequency
-        half, side = np.full(values.shape[1], 2.0), len(values)
+        side, half = values.shape[1], np.full(values.shape[2], 2.0, np.float32)
         half[[0, -1]] = 1.0
-        energies = values**2 * half
-        energy = float(energies.sum())
-        down = float((((values - np.roll(values, 1, axis=0)) ** 2) * half).sum())
-        along = 2.0 * float((np.diff(values, axis=1) ** 2).sum())
-        reach = (math.sqrt(3.0 * each / energy) * side / (2.0 * math.pi) for each in (along, down))
-        halves = (SIDES_PX[int(np.abs(np.array(SIDES_PX) - each).argmin())] for each in reach)
-        sides = 2 * next(halves) + 1, 2 * next(halves) + 1
+        energies, turned = values**2 * half, np.roll(values, 1, axis=1)
+        energy = energies.sum(axis=(1, 2))
+        down = 2.0 * (energy - np.einsum("kij,kij,j->k", values, turned, half))
+        along = 2.0 * (np.diff(values, axis=2) ** 2).sum(axis=(1, 2))
+        reach = np.sqrt(3.0 * np.stack((along, down), axis=1) / energy[:, None]) * side / (2.0 * math.pi)
+        halves = np.array(SIDES_PX)[np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)]
         # maxima are as dense as the root of the score's second spectral moments (Adler 1981)
-        cycles = np.fft.fftfreq(side)[:, None] ** 2, np.arange(values.shape[1])[None] ** 2 / side**2
-        crowds.append(math.prod(float((energies * each).sum()) / energy for each in cycles) ** 0.5 * side**2)
-        found.append(Worth(energy / GRID**2, sides, 0.0))
+        moments = (
+            energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2,
+            energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2,
+        )
+        crowds += (np.sqrt(moments[0] * moments[1]) / energy * side**2).tolist()
+        found += [
+            Worth(each / GRID**2, (2 * across + 1, 2 * along + 1), 0.0)
+            for each, (across, along) in zip(energy.tolist(), halves.tolist(), strict=True)
+        ]
     most = max(crowds)
     return tuple(one._replace(raised=math.log(most / crowd)) for one, crowd in zip(found, crowds, strict=True))
 
 
 @lru_cache(maxsize=6)
 def spectra(shape: tuple[int, ...], window_px: int) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra on a grid that holds them, conjugated, for the height 1 of the undisturbed damage;
-    of coarse templates the lower half. Those of symmetric templates are real."""
-    found = []
-    for template in bank(window_px):
-        drawn = scipy.fft.rfft2(_centred(template.image, shape)).conj()
-        drawn = drawn if any(template.halves) else drawn.real
-        found.append((_low(drawn) if template.coarse else drawn).copy())
-    return tuple(found)
+    """Return the templates' spectra, `packed`, on a grid that holds them, for the height 1 of the undisturbed damage;
+    of coarse templates the lower half; of symmetric ones the real factor of each number."""
+    drawn = zip(bank(window_px), _drawn(shape, window_px), strict=True)
+    return tuple(packed(each if any(template.halves) else each.real * (1 + 1j)) for template, each in drawn)
+
+
+def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
+    """Return the spectra as `scipy.fft.rfft2` orders them."""
+    kinds = bank(window_px)
+    drawn = (scipy.fft.rfft2(_centred(template.image, shape)) for template in kinds)
+    return [_low(each) if template.coarse else each for template, each in zip(kinds, drawn, strict=True)]
+
+
+@lru_cache(maxsize=3)
+def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sizes (t, r, c) of the spectra on `GRID`, those of coarse templates, which come last, apart."""
+    sizes = list(map(np.abs, _drawn((GRID, GRID), window_px)))
+    fine = sum(not template.coarse for template in bank(window_px))
+    return np.stack(sizes[:fine]), np.stack(sizes[fine:])
 
 
 @lru_cache(maxsize=3)
 def bank(window_px: int) -> tuple[Template, ...]:
-    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids, slots."""
+    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids, slots; coarse ones last."""
 
     def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -239,7 +295,8 @@ def bank(window_px: int) -> tuple[Template, ...]:
         return np.asarray(cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=cv2.BORDER_CONSTANT))
 
     small = (disc(radius_px, off) for radius_px in SMALL_RADII_PX for off in HALVES_PX)
-    return (*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG))
+    found = (*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG))
+    return tuple(sorted(found, key=lambda template: template.coarse))
 
 
 def noise_factor(

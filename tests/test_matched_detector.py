@@ -25,6 +25,7 @@ from detectors.whitening import (
     response,
     spectra,
     spectrum,
+    transformed,
     window_of,
     worths,
 )
@@ -72,10 +73,9 @@ def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
     dense = covariance[apart[..., 0], apart[..., 1]]
     assert window_of(lags) == BLUR_PX
     solved = inverse_times(np.where(known, noise, np.float32(0.0)), known, power, grid)
-    for spectrum_of, worth in zip(
-        spectra(grid, BLUR_PX)[:10], worths(spectrum(lags, (GRID, GRID)), BLUR_PX), strict=False
-    ):
-        template = np.roll(np.fft.irfft2(np.conj(spectrum_of), grid), (13, 15), (0, 1))[:26, :30]
+    for drawn, worth in zip(bank(BLUR_PX)[:10], worths(spectrum(lags, (GRID, GRID)), BLUR_PX), strict=False):
+        half = len(drawn.image) // 2
+        template = np.pad(drawn.image, 20)[half + 7 : half + 33, half + 5 : half + 35]
         exact = template[known] @ np.linalg.solve(dense, noise[known])
         energy = template[known] @ np.linalg.solve(dense, template[known])
         assert (template * solved).sum() == pytest.approx(exact, rel=0.02, abs=0.02 * float(energy) ** 0.5)
@@ -142,11 +142,11 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
     inside = (np.abs(along.real) < 10.0) & (np.abs(along.imag) < 1.0)
     slot = inside.reshape(SHAPE[0], finer, SHAPE[1], finer).mean(axis=(1, 3))
     grid = grid_of(SHAPE)
-    whole = np.fft.rfft2(slot, grid)
+    views = transformed(slot, grid), halved(slot, grid)
     scores: dict[bool, list[float]] = {False: [], True: []}
     kinds = bank(1), spectra(grid, 1), worths(np.ones((GRID, GRID // 2 + 1), np.float32), 1)
     for template, spectrum_of, worth in zip(*kinds, strict=True):
-        field = response(halved(whole) if template.coarse else whole, spectrum_of, SHAPE)
+        field = response(views[template.coarse], spectrum_of, SHAPE, not any(template.halves))
         scores[template.slot].append(float(field.max()) / worth.energy**0.5)
     discs, slots = max(scores[False]), max(scores[True])
     depth = 7.5 / slots
