@@ -12,7 +12,7 @@ from synthetic_study import THRESHOLD, SetUp, Study, Tables, study_record, study
 
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record, record_text
-from harness.evaluation.study.result import StudyResult, difference, evaluate_study, validity_of
+from harness.evaluation.study.result import StudyResult, conditions_of, difference, evaluate_study, validity_of
 
 FACTS: dict[str, Any] = {
     "source": {
@@ -166,6 +166,15 @@ class TestValidity:
         swept = {**FACTS, "sweep": {"source.target.damage.kind": ["blind", "dent"], "source.camera.unit_seed": [1, 2]}}
         other = dict(validity_of(result.record, result.limits, [one.chance for one in result.set_ups], swept))[missing]
         assert not any("all are" in sentence or "one unit" in sentence for sentence in other)
+
+    def test_conditions_begin_with_the_damage_and_the_sizes_that_do_not_vary(self):
+        gouges = {"kind": "gouge", "per_board": 5, "length_mm": [60, 60], "width_mm": [10, 10], "depth_mm": [0.5, 7]}
+        facts = {"source": {"target": {"name": "drawn", "damage": gouges}}}
+        assert conditions_of(facts) == "gouges 60 mm long, 10 mm wide"
+        assert conditions_of({**facts, "sweep": {"source.target.damage.width_mm": [[5, 5], [9, 9]]}}).endswith(
+            "mm long"
+        )
+        assert conditions_of({**facts, "sweep": {"source.target.damage.kind": ["gouge", "slot"]}}) == ""
 
 
 def test_set_ups_that_lack_a_board_are_not_paired(study):

@@ -26,7 +26,7 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
     gap = " or ".join(f"{one:g} mm" for one in gaps)
     behind = f", {gap} before another surface" if gaps else ""
     target = facts["source"]["target"].get("name", "target")
-    target = {"drawn": "board with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
+    target = {"drawn": "target with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
     words = f"{', '.join(names)} at {distance} from a {target}{behind}. Not to scale."
     return Markup(
         template("scene.html").render(words=words, camera=named, distance=distance, target="target", behind=gap)

@@ -268,6 +268,7 @@ def study_html(
 ) -> str:
     """Return the page as text; see `write_study_report`."""
     limits, rows = result.limits, study.study_tables(result)
+    inspections = [limit.record.inspected for limit in limits]
     groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
     shown = with_room(result.set_ups)
     inspected = [one.limit for one in shown if one.limit.inspections]
@@ -310,7 +311,8 @@ def study_html(
             }
             for name, group in groups.items()
         ],
-        has_depths=any(depth_varies(limit.record.inspected.depth_mm) for limit in limits),
+        has_depths=any(seen.limit_of != "depth" and depth_varies(seen.depth_mm) for seen in inspections),
+        size_of=" or ".join(dict.fromkeys(seen.size_of for seen in inspections)),
         surfaces=table(study.SURFACES),
         surface_notes=_surface_notes(result),
         judged=any(limit.false_calls is not None for limit in limits),

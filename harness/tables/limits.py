@@ -59,7 +59,7 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
-OF = "what these sizes are: the diameter (of long damage its width or length), or the depth where all have one"
+OF = "what these sizes are: the diameter (of long damage its width or length), or the depth where only that differs"
 EFFECT = "variance of a90 with boards as units over that with damages as units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (

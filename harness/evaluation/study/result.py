@@ -117,7 +117,15 @@ KINDS = {
     "through": "holes drilled through",
     "blind": "holes with a flat bottom",
     "dent": "spherical dents",
+    "slot": "slots",
+    "gouge": "gouges",
+    "pressed_dent": "pressed dents",
+    "pressed_bump": "pressed bumps",
+    "corrosion": "patches of corrosion",
+    "chip": "chips at an edge",
+    "protrusion": "protrusions",
 }
+SIZES = {"diameter_mm": "in diameter", "length_mm": "long", "width_mm": "wide", "depth_mm": "deep"}
 TESTS_THE_HARNESS = ("oracle", "blind")
 """Detectors whose limits say something of the harness only."""
 NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
@@ -236,13 +244,29 @@ def _sizes_miss_the_rise(limit: SetUpLimit) -> tuple[tuple[bool, str], ...]:
     )
 
 
+def _one_kind(facts: Mapping[str, Any]) -> str:
+    """The kind of all damage drawn; empty where nothing is drawn or an axis varies the damage."""
+    kind = facts.get("source", {}).get("target", {}).get("damage", {}).get("kind", "")
+    varied = any("source.target.damage.kind".startswith(axis) for axis in facts.get("sweep") or {})
+    return kind if kind in KINDS and not varied else ""
+
+
+def _damage_words(facts: Mapping[str, Any]) -> str:
+    """All damage as ``gouges 60 mm long, 10 mm wide``: its kind, and the sizes that are the same everywhere."""
+    kind, sweep = _one_kind(facts), facts.get("sweep") or {}
+    if not kind:
+        return ""
+    damage = facts["source"]["target"]["damage"]
+    ranges = {name: damage.get(name) for name in SIZES if f"source.target.damage.{name}" not in sweep}
+    same = [f"{ends[0]:g} mm {SIZES[name]}" for name, ends in ranges.items() if ends and ends[0] == ends[1]]
+    return f"{KINDS[kind]} {', '.join(same)}".strip()
+
+
 def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Name the subjects that no number of this study speaks of."""
     source, sweep = facts.get("source", {}), facts.get("sweep") or {}
     target = source.get("target", {})
-    kind = target.get("damage", {}).get("kind", "")
-    swept = any("source.target.damage.kind".startswith(axis) for axis in sweep)
-    only = f": all are {KINDS[kind]}" if kind in KINDS and not swept else ""
+    only = f": all are {KINDS[kind]}" if (kind := _one_kind(facts)) else ""
     controls = any(limit.record.detector in TESTS_THE_HARNESS for limit in limits)
     one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
     one_unit &= all(limit.record.units == 1 for limit in limits)
@@ -282,9 +306,9 @@ CONDITIONS = (
 
 
 def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -> str:
-    """Return what all set-ups of a study have in common, in one line, and whether damage was out of view or lost with
-    failed trials; empty where nothing is known."""
-    said: list[str] = []
+    """Return what all set-ups of a study have in common, its damage first, in one line, and whether damage was out of
+    view or lost with failed trials; empty where nothing is known."""
+    said = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
         for key in path.split("."):
