@@ -68,6 +68,8 @@ def test_a_sweep_leaves_all_its_files(finished):
         "provenance.json",
         "report.html",
         "runs.parquet",
+        "set_ups.csv",
+        "set_ups.parquet",
         "summary.csv",
         "trials.parquet",
     }

@@ -63,7 +63,7 @@ def test_a_mixed_list_is_refused(tmp_path: Path) -> None:
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
     assert f"{tmp_path}: is empty" in refusal(tmp_path, lens=plane.LENS)
     (tmp_path / "depth").mkdir()
-    assert "no depth picture" in refusal(tmp_path, lens=plane.LENS)
+    assert "depth: is empty" in refusal(tmp_path, lens=plane.LENS)
 
 
 def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ independent, so sums over parts of a capture add up. Not as in a frame: amplitud
 that of z (in frames their correlation is 0.1 at most); a pixel without a range has, in all its frames, the reason that
 its mean has; variance of second order (2.5 % at most) is put on the centre's noise. tests/validation/at_once.py
 measures the accuracy: the variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven)
-and 0.017 (listed).
+and 0.017 (listed). Far behind a hole, where light is dim, the variance of means of 8 frames is 13 to 15 % less than
+that of single frames' means (standard error 3 %); the cause is not known.
 """
 
 from __future__ import annotations
