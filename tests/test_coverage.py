@@ -45,6 +45,15 @@ def test_a_patch_has_the_size_whose_strength_is_needed() -> None:
         found.wanted_mm(20.0)
 
 
+def test_hits_that_do_not_follow_the_predicted_signal_are_told() -> None:
+    some = damages(400, 5.0)
+    assert findable(some).doubt == ""
+    # every third damage is missed whatever its signal, as a steep one may be whose surroundings are cropped
+    lost = np.where(np.arange(400) % 3 == 0, 0, some.hits)
+    told = findable(Damages("depth", some.size_mm, some.seen, some.strength, lost, some.inspections)).doubt
+    assert told.startswith("what is found depends on more than the predicted signal")
+
+
 def test_too_few_damages_teach_nothing() -> None:
     some = damages(30, 5.0)
     blind = Seen(np.full(30, np.inf), some.seen.cosine, some.seen.range_m)

@@ -20,6 +20,9 @@ SIZES = 400
 """Sizes between the smallest and the largest inspected, in equal ratios, at which a patch is asked."""
 BEYOND_DEG = 3.0
 """Angle by which a patch may be steeper than every damage that was inspected."""
+LOOSE = 2.0
+"""d' found nine times in ten over d' found half the time, beyond which hits do not follow d': a threshold of 4.6 and
+noise of 1 make 1.28."""
 FEWEST = 20
 """Damages without which nothing is learnt."""
 
@@ -62,14 +65,15 @@ class Damages:
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law by which damage shows and is found. ``index``: d' found nine times in ten; ``scatter``: root mean square of
-    the logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and least cosine, ``steepest``, of
-    the ``damages`` inspected."""
+    """Law by which damage shows and is found. ``index``: d' found nine times in ten, ``index_50`` half the time;
+    ``scatter``: root mean square of the logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and
+    least cosine, ``steepest``, of the ``damages`` inspected."""
 
     size_of: str
     coefficients: np.ndarray
     scatter: float
     index: float
+    index_50: float
     sizes_mm: tuple[float, float]
     steepest: float
     damages: int
@@ -80,6 +84,17 @@ class Findable:
         return (
             f"Learnt from {self.damages} damages, whose strength scatters by {100 * self.scatter:.0f} % about what "
             f"size, angle and distance say; found nine times in ten from a d' of {self.index:.3g} on."
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Return why the limits are rough; empty where hits follow the predicted d' about as well as noise allows."""
+        if self.index <= LOOSE * self.index_50:
+            return ""
+        return (
+            "what is found depends on more than the predicted signal: damage is found half the time from a d' of "
+            f"{self.index_50:.3g} on, but nine times in ten from {self.index:.3g} on only (noise alone makes 1.3 times "
+            "as much). Limits are rough and may be far too large: run a study in these poses before you rely on them"
         )
 
     def wanted_mm(self, size_mm: float | None) -> float:
@@ -121,7 +136,7 @@ def findable(damages: Damages) -> Findable:
     hits, inspections = (each[judged].astype(int) for each in (damages.hits, damages.inspections))
     each = np.repeat(np.arange(len(hits)), inspections)
     hit = np.concatenate([np.arange(n) < k for n, k in zip(inspections, hits, strict=True)])
-    weights, needed = np.ones(len(hits)), np.nan
+    weights, needed, half = np.ones(len(hits)), np.nan, np.nan
     for _ in range(2):
         root = np.sqrt(weights)
         coefficients = np.linalg.lstsq(features * root[:, None], strength * root, rcond=None)[0]
@@ -129,10 +144,10 @@ def findable(damages: Damages) -> Findable:
         scatter = float(np.sqrt((weights * (strength - fitted) ** 2).sum() / weights.sum()))
         index = np.exp(fitted - noise)
         fit = fit_hit_miss(index[each], hit, link="probit", log_size=True, inspections=each)
-        needed = fit.curve.size_at(POD)
+        needed, half = fit.curve.size_at(POD), fit.curve.size_at(0.5)
         weights = 1 / (1 + np.log(index / needed) ** 2)  # damages found now and then decide the limit
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
-    return Findable(damages.size_of, coefficients, scatter, needed, sizes_mm, float(cosine.min()), len(hits))
+    return Findable(damages.size_of, coefficients, scatter, needed, half, sizes_mm, float(cosine.min()), len(hits))
 
 
 def in_turn(patches: Patches, found: Sequence[np.ndarray], given: int, further: int) -> list[tuple[int, float, float]]:

@@ -54,6 +54,7 @@ def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: fl
 def warnings_of(found: Findable, seen: Mapping[Any, Seen]) -> list[str]:
     """Return what makes the figures unreliable, in sentences."""
     said = ["damage of one size shows with very different strength: limits are rough"] if found.scatter > 0.5 else []
+    said += [found.doubt] if found.doubt else []
     if unseen := sum(bool(np.isinf(each.deviation_m).all()) for each in seen.values()):
         said.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
     return said
