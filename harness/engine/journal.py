@@ -33,7 +33,7 @@ NOTHING = "null"  # stands in the place of the record of a trial that is not don
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
 
-class _Place(NamedTuple):
+class _Location(NamedTuple):
     """The place of an entry: segment, first byte and length of its line; and its state."""
 
     segment: str
@@ -50,7 +50,7 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.damaged: list[str] = []
-        self._places: dict[str, _Place] = {}
+        self._places: dict[str, _Location] = {}
         self._read_to: dict[str, int] = {}
         self._own: Path | None = None
         self._is_read = False
@@ -111,7 +111,7 @@ class Journal:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise explained(error, self.folder) from error
-        self._remember(key, _Place(self._own.name, start, len(line), entry.state))
+        self._remember(key, _Location(self._own.name, start, len(line), entry.state))
         self._read_to[self._own.name] = start + len(line)
 
     def sync(self) -> None:
@@ -129,7 +129,7 @@ class Journal:
             for name in sorted(filter(SEGMENT_NAME.fullmatch, os.listdir(self.folder))):
                 self._read_segment(self.folder / name)
 
-    def _known(self) -> dict[str, _Place]:
+    def _known(self) -> dict[str, _Location]:
         if not self._is_read:
             self.refresh()
         return self._places
@@ -149,7 +149,7 @@ class Journal:
                     if found is None:
                         self.damaged.append(f"{path}: byte {start}")
                     else:
-                        self._remember(found[0], _Place(path.name, start, len(line), found[1].state))
+                        self._remember(found[0], _Location(path.name, start, len(line), found[1].state))
                     start += len(line)
                 if line and path.name not in self._read_to:
                     self.damaged.append(f"{path}: byte {start}")  # torn, or being written now
@@ -166,7 +166,7 @@ class Journal:
             self.damaged.append(str(path))
         return version == JOURNAL_VERSION
 
-    def _remember(self, key: str, place: _Place) -> None:
+    def _remember(self, key: str, place: _Location) -> None:
         """A later entry takes the place of an earlier one, unless only the earlier trial is done."""
         before = self._places.get(key)
         if before is None or before.state != "done" or place.state == "done":
