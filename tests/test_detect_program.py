@@ -200,7 +200,7 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
     row, *others = rows_of(tmp_path / "out" / "findings.csv")
-    # too little noise for a threshold of the cloud's own: rounding gives some scores above the fallback of 5
+    # rounding is all the noise: few peaks set the threshold, and up to four false calls are stated as possible
     assert float(row["score"]) > 100 and all(float(other["score"]) < 10 for other in others) and len(others) < 5
     assert row["u_px"] == "" and row["volume_mm3"] == ""
     # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to a part of the hole.
@@ -211,7 +211,7 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
     said = capsys.readouterr().out
-    assert said.startswith("warning: the capture cannot set its own threshold") and "single points" in said
+    assert "1.0 false calls expected, 95 % interval 0.03 to 4.0" in said and "single points" in said
 
 
 def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
